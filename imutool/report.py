@@ -29,6 +29,7 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
+    "audit": "imutool.diagnosis.audit.audit:AuditReport",
     "clean": "imutool.cleaning.first_pass:CleaningReport",
     "conversion": "imutool.cli.convert:Conversion",
     "debias": "imutool.cli.debias:DebiasSummary",

@@ -128,8 +128,8 @@ def load(path: Path, rate_hz: float) -> Model:
         if _needs_channel(variables):
             kept.append(effect.equation)
         else:
-            for sensor in effect.sensors:
-                parts[sensor].append(_of_size_one(effect, theta, sensor))
+            for acted_on in (sensor for sensor in SENSORS if sensor in effect.sensors):
+                parts[acted_on].append(_of_size_one(effect, theta, acted_on))
     for sensor in SENSORS:
         part = _matrix(file, sensor)
         if part is not None:
@@ -159,7 +159,7 @@ def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     if entry.name in DRIFTS:
         fixed = (replace(parameter, fixed_in_training=_value(entry, "tau")) for parameter in effect.parameters[3:])
         effect = replace(effect, parameters=(*effect.parameters[:3], *fixed))
-    for sensor in effect.sensors:
+    for sensor in (sensor for sensor in SENSORS if sensor in effect.sensors):
         form = linear_form(effect, sensor)
         names = [effect.parameters[k].name for k in form.free]
         theta, std = (np.array([value(entry, name) for name in names]) for value in (_value, _std))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis import summarize
+from imutool.diagnosis.audit.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
@@ -35,13 +36,13 @@ from imutool.diagnosis.reference.coverage import (
     without_unusable,
 )
 from imutool.diagnosis.reference.errors import reference_caveat, reference_errors, turned_reference
-from imutool.diagnosis.result import Closer, Diagnosis, Finding, Located
+from imutool.diagnosis.result import Diagnosis, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
+from imutool.diagnosis.signals.compared_signals import with_signals
 from imutool.diagnosis.to_physics_file import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
-from imutool.mcap_io.fields import others, read_field
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
 from imutool.recording import Recording
 from imutool.sensor import catalogue
@@ -76,15 +77,16 @@ def diagnose(
     if signals and (sim is None or len(reals) != 1):
         raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
     report(0, 4, "reading")
-    signal_fields = [] if sim is None else [(name, read_field(reals[0], name), read_field(sim, name)) for name in signals]
+    if sim is not None and not all(_has_imu(log) for log in (reals[0], sim)):
+        return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
     logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     simulated = None if sim is None else read_log(sim, imu=imu)
-    sim_findings: tuple[Finding, ...] = ()
+    sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
+        another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
         sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
-    another = [ANOTHER_MOTION] if sim is not None and simulated is None else []
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
@@ -107,9 +109,8 @@ def diagnose(
     caveat = reference_caveat(recordings) if simulated is None else ""
     tried = tuple(dict.fromkeys(log.remark for log in logs_read if log.remark))
     diagnosis = _with_reference(diagnosis, wrong, wrong_at, (*another, *left_out, *diagnosis.remarks, *tried), caveat)
-    for signal, real, simulated_field in signal_fields:
-        report(3, 4, signal)
-        diagnosis = _with_signal(diagnosis, diagnose_signal(real, simulated_field, others(reals[0], signal), signal, settings))
+    if sim is not None and len(reals) == 1 and (simulated is not None or signals):
+        diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
     report(4, 4, "")
     return diagnosis
 
@@ -122,8 +123,13 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis))
     except ImutoolError as error:
         why = f"How much closer it comes is computed, not simulated again: {error}"
-        return replace(diagnosis, remarks=(*diagnosis.remarks, why))
+        return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
+
+
+def _has_imu(path: Location) -> bool:
+    with Log(path) as log:
+        return bool(log.imu_topics)
 
 
 def _with_reference(
@@ -132,21 +138,6 @@ def _with_reference(
     """Adds errors of the reference, with the remarks on it."""
     findings, located = (*wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
     return replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
-
-
-def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:
-    """Adds the diagnosis of another signal."""
-    signal = added.signal
-    return replace(
-        diagnosis,
-        located=(*diagnosis.located, *added.located),
-        findings=(*diagnosis.findings, *added.findings),
-        not_identifiable=(*diagnosis.not_identifiable, *added.not_identifiable),
-        unexplained={**diagnosis.unexplained, signal: added.unexplained},
-        closer={**diagnosis.closer, signal: Closer.computed(added.closer, added.unexplained.noise_floor)},
-        remarks=(*diagnosis.remarks, *added.remarks),
-        signals={**diagnosis.signals, signal: added.traces},
-    )
 
 
 def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:

@@ -5,15 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from imutool.location import Location
 from imutool.recording import Poses
-from imutool.report import Report, Section
+from imutool.report import UNSET, Report, Section, UnsetType
 from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
@@ -153,6 +154,30 @@ class Bias(Section, frozen=True):
     accel: tuple[float, ...] | None
 
 
+class Compared(Section, frozen=True):
+    """One figure before the physics was added, and after."""
+
+    figure: str
+    before: float
+    after: float
+    unit: str
+
+
+class ClosedLoop(Section, frozen=True):
+    """What is left when the physics that was found is simulated.
+
+    Attributes:
+        log: the new simulation.
+        mismatch: whether a second diagnosis still finds a difference; `findings` are its names.
+        compared: figures before and after: misfit by signal, band and time, integrated rotation and path, the user's metric.
+    """
+
+    log: str
+    mismatch: bool
+    findings: tuple[str, ...]
+    compared: tuple[Compared, ...]
+
+
 class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     """Findings of a diagnosis as JSON (`imutool.diagnosis/1`).
 
@@ -172,6 +197,7 @@ class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     unexplained: Mapping[str, Number | bool | dict[str, Number]]
     closer: Mapping[str, Closer]
     remarks: tuple[str, ...]
+    closed: ClosedLoop | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +248,13 @@ class Diagnosis:
     traces: tuple[Traces, ...] = ()
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
     caveat: str = ""
+    closed: ClosedLoop | None = None
+
+    @classmethod
+    def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:
+        """A diagnosis to which only other signals are added."""
+        bias = np.full((len(reals), 6), np.nan)
+        return cls(tuple(map(str, reals)), str(sim), (), (), bias, (), {})
 
     @property
     def mismatch(self) -> bool:
@@ -244,6 +277,7 @@ class Diagnosis:
             unexplained=_unexplained(self.unexplained),
             closer=self.closer,
             remarks=self.remarks,
+            closed=UNSET if self.closed is None else self.closed,
         )
 
 

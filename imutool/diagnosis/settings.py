@@ -124,6 +124,8 @@ class SignalSettings(Settings, frozen=True):
     least_edge: Share = 0.05  # of the sample rate
     most_edge: Share = 0.3  # of the sample rate
     same_grid: Share = 0.01  # relative difference of two LSBs that are one
+    motion_band_hz: Positive = 15.0  # of the motion of joints: above, accelerations are noise
+    motion_band_share: Share = 0.15  # of the sample rate, for slower logs
     copy_correlation: Share = 0.98  # of another channel, above which it is a copy of the signal
 
 

@@ -191,7 +191,7 @@ def finding_of(
         share = 0.0
     return Finding(
         effect=effect.name,
-        signal=signal if len(named) == 1 else "both",
+        signal=signal if len(named) == 1 else "both" if named == list(SENSORS) else pairs[0].name,
         share=share,
         p_value=selected.p_value,
         false_discovery_rate=selected.false_discovery_rate,

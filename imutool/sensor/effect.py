@@ -27,7 +27,7 @@ from jaxtyping import Float64
 from imutool.errors import DataError
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import Signals
-from imutool.units import AXES, Sensor
+from imutool.units import AXES
 
 Kind = Literal["catalogue", "driven", "unknown"]
 Three = tuple[float, float, float]
@@ -108,7 +108,7 @@ class Effect:
 
     name: str
     stage: Stage
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[str, ...]  # gyro, accel, or the names of another signal's columns
     equation: str
     parameters: tuple[Parameter, ...]
     observable_if: str
@@ -185,7 +185,10 @@ def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.nd
     return samples.gyro - ideal.gyro, samples.accel - ideal.accel
 
 
-WITHIN_STAGE = {"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2}
+WITHIN_STAGE = {
+    **{"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2},
+    **{"actuator_gain": 1, "actuator_dead_band": 2, "torque_saturation": 2},  # between what the motion needs and the command
+}
 Acting = Sequence[tuple[Effect, Theta]]
 
 

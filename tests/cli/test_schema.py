@@ -36,6 +36,7 @@ LINES: dict[str, Sequence[str]] = {
     "view": ["view", "{}/flight_2.mcap", "--html", "out.html"],
     "vio": ["vio", "{}/flight_2.mcap", "--model", "static", "--duration", "6", "--no-bias-states"],
     "simulate": ["simulate", "{}/flight_2.mcap", "sim.mcap", "--noise", "bmi160"],
+    "audit": ["audit", "{}/flight_2.mcap"],
     "models": ["models"],
     "fleet-info": ["fleet", "info", "{}/flight_1.mcap", "out"],
     "fleet-diagnose": ["fleet", "diagnose", "{}/flight_1.mcap", "out", "--no-search"],

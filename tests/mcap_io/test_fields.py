@@ -16,7 +16,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from imutool.diagnosis.signal_diagnosis import diagnose_signal
+from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.fields import numeric_fields, others, read_field
@@ -369,7 +370,8 @@ def test_signals_of_two_logs_are_diagnosed(tmp_path: Path, write_pair: Callable[
     """The whole way: an odometry twist with a gain, a joint that comes late, each beside a simulation at another rate."""
     real, sim = (write_pair(which, tmp_path / f"{which}.mcap") for which in ("real", "sim"))
     for signal, effect, value in (("/odom.twist.twist.linear.x", "gain", 1.08), ("/joint_states.position[1]", "delay", 0.03)):
-        d = diagnose_signal(read_field(real, signal), read_field(sim, signal), others(real, signal), signal)
+        pair = SignalPair.of_fields(read_field(real, signal), read_field(sim, signal), signal)
+        d = diagnose_signal(pair, others(real, signal))
         (one,) = d.findings
         assert (one.effect, one.signal) == (effect, signal)
         estimate = one.parameters[effect]

@@ -16,8 +16,9 @@ from jaxtyping import Float64
 from scipy.signal import lfilter
 
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
-from imutool.diagnosis.signal_alignment import AlignedSignal, IdealSignal, Samples, SignalSamples
+from imutool.diagnosis.signals.alignment import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
+from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 
 CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
 WIDTHS = (0.05, 0.15, 0.4, 0.8)  # of a dead band, over the signal's standard deviation
@@ -46,10 +47,14 @@ def _effect(
 # ── the effects ──
 
 
-def offset(size: float, unit: str) -> Effect:
-    """A constant: part of every fit, and no finding on its own."""
-    numbers = (Parameter("offset", unit, 10.0 * size),)
-    return _effect("offset", Stage.SENSOR, "y += offset", numbers, lambda s, theta: s.but(s.y + theta[0]), [np.zeros(1)])
+def offset(signal: AlignedSignal, k: int) -> Effect:
+    """A constant of one column: part of every fit."""
+    numbers = (Parameter("offset", signal.units[k], 10.0 * float(np.ptp(signal.real[:, k]))),)
+    return replace(
+        _effect("offset", Stage.SENSOR, "y += offset", numbers, lambda s, theta: s.with_added(k, theta[0]), [np.zeros(1)]),
+        variant=signal.names[k] if signal.columns > 1 else "",
+        sensors=(signal.names[k],) if signal.columns > 1 else (),
+    )
 
 
 def delay(lag_s: float, step_s: float) -> Effect:
@@ -61,12 +66,12 @@ def delay(lag_s: float, step_s: float) -> Effect:
 
 def delay_step_s(signal: AlignedSignal) -> float:
     """A delay that moves the signal by `MOVED` of its size."""
-    return MOVED * float(signal.sampled.x.std()) / float(signal.sampled.dx.std())
+    return MOVED * float(np.min(signal.sampled.x.std(axis=0) / signal.sampled.dx.std(axis=0)))
 
 
 def named(signal: AlignedSignal) -> Iterator[Effect]:
     """The catalogue of effects that any signal can have."""
-    unit, size, slope = signal.unit, float(signal.sampled.x.std()), float(signal.sampled.dx.std())
+    unit, size, slope = signal.units[0], float(signal.sampled.x.std()), float(signal.sampled.dx.std())
     yield delay(signal.lag_s, delay_step_s(signal))
     yield _effect(
         "low_pass",
@@ -95,7 +100,7 @@ def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
     e = np.exp(-a)
     b = [1.0 - (1.0 - e) / a, (1.0 - e) / a - e]
     first = ideal.fine[0]
-    return replace(ideal, fine=np.asarray(lfilter(b, [1.0, -e], ideal.fine - first) + first))
+    return replace(ideal, fine=np.asarray(lfilter(b, [1.0, -e], ideal.fine - first, axis=0) + first))
 
 
 def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
@@ -152,7 +157,7 @@ def _drifts(signal: AlignedSignal, size: float, unit: str) -> Iterator[Effect]:
     first, last = float(signal.stamp_s[0]), float(signal.stamp_s[-1])
     middle, length = 0.5 * (first + last), last - first
     rate = (Parameter("rate", f"{unit}/s" if unit else "1/s", size / length),)
-    yield _effect("drift", Stage.SENSOR, "y += rate t", rate, lambda s, theta: s.but(s.y + theta[0] * (s.stamp_s - middle)))
+    yield _effect("drift", Stage.SENSOR, "y += rate t", rate, lambda s, theta: s.with_added(0, theta[0] * (s.stamp_s - middle)))
     yield _curve("drift", "catalogue", "t", "s", signal.stamp_s, KNOTS, size, unit)
 
 
@@ -165,8 +170,9 @@ class SignalCurve(SplineCurve):
     Bends are small, so that ends without data go straight on.
     """
 
-    def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"]) -> None:
+    def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"], column: int = 0) -> None:
         super().__init__(variable, unit, inner)
+        self.column = column
         self.count = len(inner) + 2
 
     @property
@@ -181,62 +187,76 @@ class SignalCurve(SplineCurve):
 
     def __call__(self, samples: SignalSamples, theta: Theta) -> SignalSamples:
         """The signal with the curve on it."""
-        of = {"x": samples.x, "dx/dt": samples.dx, "t": samples.stamp_s}[self.variable]
-        return samples.but(samples.y + self.basis(of) @ theta)
+        of = variables_of(samples, self.column)[self.variable]
+        return samples.with_added(self.column, self.basis(of) @ theta)
 
 
-def _curve(name: str, kind: Kind, variable: str, of: str, values: Samples, knots: int, size: float, unit: str) -> Effect:
-    curve = SignalCurve(variable, of, np.linspace(values.min(), values.max(), knots - 2))
+def variables_of(samples: SignalSamples, k: int) -> dict[str, Samples]:
+    """What a column may be a function of: its ideal value and rate, time, and the state."""
+    return {"x": samples.x[:, k], "dx/dt": samples.dx[:, k], "t": samples.stamp_s, **samples.state}
+
+
+def _curve(
+    name: str, kind: Kind, variable: str, of: str, values: Samples, knots: int, size: float, unit: str, column: int = 0
+) -> Effect:
+    curve = SignalCurve(variable, of, np.linspace(values.min(), values.max(), knots - 2), column)
     numbers = tuple(Parameter(f"c{j}", unit, share * size) for j, share in enumerate(curve.plausible))
     text, starts = f"y += curve({variable})", [np.zeros(knots)] if kind == "catalogue" else None
     return _effect(name, Stage.SENSOR, text, numbers, curve, starts, kind=kind, variable=variable, variant=f"curve({variable})")
 
 
-def unknown(signal: AlignedSignal) -> Iterator[Effect]:
-    """A smooth curve of the simulated signal, of its derivative, of time."""
-    sampled, unit = signal.sampled, signal.unit
-    size = float(sampled.x.std())
-    variables = (
-        ("x", unit, sampled.x, KNOTS),
-        ("dx/dt", f"{unit}/s", sampled.dx, KNOTS),
-        ("t", "s", signal.stamp_s, KNOTS_OF_TIME),
-    )
-    for variable, of, values, knots in variables:
-        if np.ptp(values) > 0:
-            yield _curve("unknown", "unknown", variable, of, values, knots, size, unit)
+def unknown(signal: AlignedSignal, k: int) -> Iterator[Effect]:
+    """Smooth curves of signal, derivative, time and state, in one column."""
+    sampled, unit = signal.sampled, signal.units[k]
+    size = float(sampled.x[:, k].std())
+    units = {"x": unit, "dx/dt": f"{unit}/s", "t": "s"}
+    for variable, values in variables_of(sampled, k).items():
+        if np.ptp(values) > 0 and not variable.startswith(("R", "v")):
+            knots = KNOTS_OF_TIME if variable == "t" else KNOTS
+            curve = _curve("unknown", "unknown", variable, units.get(variable, ""), values, knots, size, unit, k)
+            yield on_column(curve, signal, k)
+
+
+def on_column(effect: Effect, signal: AlignedSignal, k: int) -> Effect:
+    """The effect with the name of its column, where there are several."""
+    if signal.columns == 1:
+        return effect
+    name = signal.names[k]
+    return replace(effect, sensors=(name,), variant=f"{name}:{effect.variant}")
 
 
 class _Driven:
     """+ gain times a channel, some time earlier."""
 
-    def __init__(self, channel: str, mean: float) -> None:
-        self.channel, self.mean = channel, mean
+    def __init__(self, channel: str, mean: float, column: int) -> None:
+        self.channel, self.mean, self.column = channel, mean, column
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         t_s, values = s.channels[self.channel]
-        return s.but(s.y + theta[0] * (np.interp(s.stamp_s - theta[1], t_s, values) - self.mean))
+        return s.with_added(self.column, theta[0] * (np.interp(s.stamp_s - theta[1], t_s, values) - self.mean))
 
 
-def driven(signal: AlignedSignal) -> Iterator[Effect]:
-    """Effects driven by each other channel, but for copies of the signal."""
-    size, real = float(signal.sampled.x.std()), signal.real[:, 0]
+def driven(signal: AlignedSignal, k: int) -> Iterator[Effect]:
+    """Effects on a column driven by each other channel, but for copies of a column."""
+    size, real = float(signal.sampled.x[:, k].std()), signal.real
     for name, (t_s, values) in sorted(signal.ideal.channels.items()):
         channel = np.interp(signal.stamp_s, t_s, values)
         spread = float(channel.std())
-        if (
-            not spread > 1e-12 * max(1.0, float(np.abs(channel).max()))
-            or abs(float(np.corrcoef(channel, real)[0, 1])) > signal.settings.signal.copy_correlation
-        ):
+        if name in signal.names or not spread > 1e-12 * max(1.0, float(np.abs(channel).max())):
             continue
-        numbers = (Parameter("gain", f"{signal.unit or '1'} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
-        yield _effect(
+        if any(abs(float(np.corrcoef(channel, own)[0, 1])) > signal.settings.signal.copy_correlation for own in real.T):
+            continue
+        unit = signal.units[k] or "1"
+        numbers = (Parameter("gain", f"{unit} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
+        effect = _effect(
             "driven",
             Stage.SENSOR,
             f"y += gain ({name}(t - lag) - mean)",
             numbers,
-            _Driven(name, float(channel.mean())),
+            _Driven(name, float(channel.mean()), k),
             [np.array([0.0, lag]) for lag in LAGS_S],
             kind="driven",
             variable=name,
             variant=name,
         )
+        yield on_column(effect, signal, k)

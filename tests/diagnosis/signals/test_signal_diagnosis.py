@@ -7,13 +7,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
-from imutool.diagnosis.signal_diagnosis import SignalDiagnosis, diagnose_signal
+from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 
 START_NS = 1_700_000_000_000_000_000
 RATE_HZ, SIM_HZ, DURATION_S, NOISE = 80.0, 100.0, 60.0, 0.02
 OFFSET = 0.3
+NAME = "/odom.v"
 SURE = 4.0  # standard deviations within which the planted value lies: 1 in 16 000 outside, in some thirty checks
 CENTER = 5.0  # of the channel that drives
 
@@ -75,7 +77,11 @@ def pair(
 
 
 def diagnosed(plant: Plant, seed: int = 0, **options: object) -> SignalDiagnosis:
-    return diagnose_signal(*pair(plant, seed, **options), "/odom.v")  # type: ignore[arg-type]  # the options are pair's own
+    return compared(*pair(plant, seed, **options))  # type: ignore[arg-type]  # the options are pair's own
+
+
+def compared(real: Fields, sim: Fields, others: Mapping[str, Fields]) -> SignalDiagnosis:
+    return diagnose_signal(SignalPair.of_fields(real, sim, NAME), others)
 
 
 def nothing(x: Motion, t: np.ndarray, current: np.ndarray) -> np.ndarray:
@@ -122,9 +128,9 @@ def test_a_single_effect_is_found_by_name_and_size(which: str) -> None:
     assert names(d) == {effect}
     within(d, effect, expected)
     assert d.findings[0].share > 0.9
-    assert d.unexplained.white
-    assert d.closer.rms_after < 1.1 * NOISE
-    assert d.closer.rms_before > 1.2 * NOISE
+    assert d.unexplained[NAME].white
+    assert d.closer[NAME].rms_after < 1.1 * NOISE
+    assert d.closer[NAME].rms_before > 1.2 * NOISE
     assert [place.signal for place in d.located] == ["/odom.v"]
 
 
@@ -152,7 +158,7 @@ def test_steps_of_the_values_are_found_unless_the_simulation_has_them_too() -> N
     assert names(d) == {"quantization"}
     within(d, "quantization", {"lsb": 0.05})
     real, sim, others = pair(nothing, after=lambda y: np.round(y / 0.05) * 0.05)
-    same = diagnose_signal(real, Fields(sim.t_ns, np.round(sim.values / 0.05) * 0.05), others, "/odom.v")
+    same = compared(real, Fields(sim.t_ns, np.round(sim.values / 0.05) * 0.05), others)
     assert "quantization" not in names(same)
 
 
@@ -212,15 +218,15 @@ def test_nothing_is_found_where_only_noise_and_a_constant_differ(seed: int) -> N
     d = diagnosed(nothing, seed, sim_noise=NOISE * (seed % 3) / 2.0, sim_hz=(60.0, 100.0, 150.0)[seed % 3])
     assert d.findings == ()
     assert d.located == ()
-    assert d.unexplained.white
-    assert abs(d.offset.value - OFFSET) < 0.005
-    assert d.unexplained.rms == pytest.approx(NOISE, rel=0.25)
+    assert d.unexplained[NAME].white
+    assert abs(d.offset[NAME].value - OFFSET) < 0.005
+    assert d.unexplained[NAME].rms == pytest.approx(NOISE, rel=0.25)
 
 
 def test_an_offset_alone_is_no_news_but_told() -> None:
     d = diagnosed(lambda x, t, c: x(t) + 4.0)
     assert d.findings == ()
-    assert abs(d.offset.value - 4.0 - OFFSET) < SURE * d.offset.std
+    assert abs(d.offset[NAME].value - 4.0 - OFFSET) < SURE * d.offset[NAME].std
 
 
 @pytest.mark.parametrize("clock_s", [1234.567, -98_765.4])
@@ -245,10 +251,10 @@ def test_a_misfit_is_placed_where_it_is() -> None:
     d = diagnosed(nothing, after=lambda y: np.minimum(y, LIMIT))
     (place,) = d.located
     assert "its value above" in place.regime
-    inside = np.zeros(len(d.traces.t_s), bool)
+    inside = np.zeros(len(d.traces[NAME].t_s), bool)
     for begin, end in place.intervals_s:
-        inside |= (d.traces.t_s >= begin) & (d.traces.t_s < end)
-    clipped = d.traces.real >= LIMIT
+        inside |= (d.traces[NAME].t_s >= begin) & (d.traces[NAME].t_s < end)
+    clipped = d.traces[NAME].real >= LIMIT
     assert clipped[inside].mean() > 2.0 * clipped.mean()
     assert (clipped & inside).sum() > 0.9 * clipped.sum()
 
@@ -256,7 +262,7 @@ def test_a_misfit_is_placed_where_it_is() -> None:
 def test_a_copy_of_the_signal_drives_nothing() -> None:
     real, sim, _ = pair(lambda x, t, c: x(t) + 0.02 * c)
     copies = {"/odom/filtered.v": Fields(real.t_ns, 0.5 * real.values)}
-    assert "driven" not in names(diagnose_signal(real, sim, copies, "/odom.v"))
+    assert "driven" not in names(compared(real, sim, copies))
 
 
 @pytest.mark.parametrize("which", ["short", "few", "constant recording", "constant simulation", "nan", "apart", "unlike"])
@@ -278,7 +284,7 @@ def test_what_cannot_be_compared_is_refused_with_what_to_do(which: str) -> None:
     else:
         sim = Fields(sim.t_ns, np.random.default_rng(1).normal(size=len(sim)))
     with pytest.raises(DataError) as raised:
-        diagnose_signal(real, sim, others, "/odom.v")
+        compared(real, sim, others)
     assert raised.value.where == "/odom.v"
     assert raised.value.fix
     assert raised.value.expected
@@ -288,8 +294,6 @@ def test_gaps_of_either_are_left_out() -> None:
     real, sim, others = pair(SINGLE["gain"][0])
     t, t_sim = (one.t_ns - real.t_ns[0] for one in (real, sim))
     keep, there = (t < 20e9) | (t > 23e9), (t_sim < 40e9) | (t_sim > 42e9)
-    d = diagnose_signal(
-        Fields(real.t_ns[keep], real.values[keep]), Fields(sim.t_ns[there], sim.values[there]), others, "/odom.v"
-    )
+    d = compared(Fields(real.t_ns[keep], real.values[keep]), Fields(sim.t_ns[there], sim.values[there]), others)
     assert names(d) == {"gain"}
     within(d, "gain", {"gain": 1.05})

@@ -1,0 +1,137 @@
+"""Arms of two hinges in MuJoCo for blind cases, with and without what is left out.
+
+Both follow one course by computed torque with the simulation's own model. A log holds angles, velocities and the commanded
+efforts. What is left out is MuJoCo's own (`frictionloss`, `damping`, `armature`, a mass) or is put on by hand, at every step.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+STEP_S, EACH, SETTLING_S = 0.001, 5, 2.0  # integrated at 1 kHz, recorded at 200 Hz
+ANGLE_NOISE, VELOCITY_NOISE, EFFORT_NOISE = 2e-5, 5e-4, 0.004  # rad, rad/s, of the efforts' size
+BANDWIDTH = 9.0  # rad/s of the controller
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Two links: lengths (m), masses (kg), damping (N m s/rad) of both arms alike."""
+
+    lengths: tuple[float, float]
+    masses: tuple[float, float]
+    damping: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Physics of the real arm alone, by joint.
+
+    `unnamed` is a torque of angle and velocity.
+    """
+
+    coulomb: tuple[float, float] = (0.0, 0.0)
+    viscous: tuple[float, float] = (0.0, 0.0)
+    stribeck: tuple[tuple[float, float], ...] = ((0.0, 1.0), (0.0, 1.0))
+    rotor: tuple[float, float] = (0.0, 0.0)
+    ripple: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
+    payload: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    delay_s: float = 0.0
+    gain: tuple[float, float] = (1.0, 1.0)
+    dead_band: tuple[float, float] = (0.0, 0.0)
+    limit: tuple[float, float] = (1e9, 1e9)
+    encoder: tuple[float, float] = (0.0, 0.0)
+    eccentric: tuple[tuple[float, float], ...] = ((0.0, 0.0), (0.0, 0.0))
+    unnamed: Callable[[Any, Any], Any] | None = field(default=None, compare=False)
+
+
+def xml(arm: Arm, left_out: LeftOut | None = None) -> str:
+    """The arm in MuJoCo; its axes are level, x is along the links where the angles are zero."""
+    own = left_out or LeftOut()
+    joints = [
+        f'<joint name="j{k}" type="hinge" axis="0 -1 0" damping="{arm.damping[k] + own.viscous[k]}"'
+        f' frictionloss="{own.coulomb[k]}" solreffriction="{2.2 * STEP_S} 1" armature="{own.rotor[k]}"/>'
+        for k in range(2)
+    ]
+    links = [
+        f'<geom type="capsule" fromto="0 0 0 {length} 0 0" size="0.03" mass="{mass}"/>'
+        for length, mass in zip(arm.lengths, arm.masses, strict=True)
+    ]
+    mass, x, z = own.payload
+    load = f'<geom type="sphere" size="0.001" pos="{x} 0 {z}" mass="{mass}"/>' if mass else ""
+    return f"""<mujoco>
+  <option timestep="{STEP_S}" gravity="0 0 -9.81" integrator="implicitfast"><flag contact="disable"/></option>
+  <worldbody><body pos="0 0 1">{joints[0]}{links[0]}
+    <body pos="{arm.lengths[0]} 0 0">{joints[1]}{links[1]}{load}</body></body></worldbody>
+  <actuator><motor joint="j0"/><motor joint="j1"/></actuator></mujoco>"""
+
+
+def moved(
+    arm: Arm, left_out: LeftOut | None, course: Mapping[str, Float64[np.ndarray, "_ 2"]], noise: np.random.Generator
+) -> tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 6"]]:
+    """Times (s) and rows of angles, velocities and efforts along a course."""
+    import mujoco  # type: ignore[import-untyped]  # it has no stubs
+
+    own = left_out or LeftOut()
+    body, plan = (mujoco.MjModel.from_xml_string(xml(arm, own_physics)) for own_physics in (left_out, None))
+    data, model = mujoco.MjData(body), mujoco.MjData(plan)
+    data.qpos[:] = course["q"][0]
+    waiting = deque([np.zeros(2)] * round(own.delay_s / STEP_S))
+    rows, times = [], []
+    for k in range(len(course["q"])):
+        angle = data.qpos + np.array(own.encoder)
+        angle += np.array([a * np.sin(q) + b * np.cos(q) for (a, b), q in zip(own.eccentric, data.qpos, strict=True)])
+        model.qpos[:], model.qvel[:] = angle, data.qvel
+        error, slope = course["q"][k] - angle, course["dq"][k] - data.qvel
+        model.qacc[:] = course["ddq"][k] + BANDWIDTH**2 * error + 2.0 * BANDWIDTH * slope
+        mujoco.mj_inverse(plan, model)
+        command = model.qfrc_inverse.copy()
+        if k % EACH == 0:
+            rows.append(np.concatenate([angle, data.qvel, command]))
+            times.append(k * STEP_S)
+        waiting.append(command)
+        data.ctrl[:] = _acting(waiting.popleft(), own)
+        data.qfrc_applied[:] = _forces(data.qpos, data.qvel, own)
+        mujoco.mj_step(body, data)
+    return _noisy(np.array(times), np.array(rows), noise)
+
+
+def _noisy(
+    t_s: Float64[np.ndarray, " _"], rows: Float64[np.ndarray, "_ 6"], noise: np.random.Generator
+) -> tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 6"]]:
+    kept = t_s >= SETTLING_S
+    rows = rows[kept]
+    std = np.concatenate([[ANGLE_NOISE] * 2, [VELOCITY_NOISE] * 2, EFFORT_NOISE * rows[:, 4:].std(axis=0)])
+    return t_s[kept], rows + std * noise.normal(size=rows.shape)
+
+
+def _acting(command: Float64[np.ndarray, " 2"], own: LeftOut) -> Float64[np.ndarray, " 2"]:
+    command = command - np.clip(command, -np.array(own.dead_band), np.array(own.dead_band))
+    return np.asarray(np.clip(np.array(own.gain) * command, -np.array(own.limit), np.array(own.limit)))
+
+
+def _forces(q: Any, dq: Any, own: LeftOut) -> Float64[np.ndarray, " 2"]:
+    out = np.zeros(2)
+    for k in range(2):
+        level, slow = own.stribeck[k]
+        sine, cosine, per_turn = own.ripple[k]
+        out[k] -= level * np.exp(-((dq[k] / slow) ** 2)) * np.tanh(dq[k] / 1e-3)
+        out[k] -= sine * np.sin(per_turn * q[k]) + cosine * np.cos(per_turn * q[k])
+    return out if own.unnamed is None else out - own.unnamed(q, dq)
+
+
+def course(rng: np.random.Generator, duration_s: float) -> dict[str, Float64[np.ndarray, "_ 2"]]:
+    """Sums of five sines for each joint, with their derivatives."""
+    t = np.arange(round((duration_s + SETTLING_S) / STEP_S)) * STEP_S
+    out = {name: np.zeros((len(t), 2)) for name in ("q", "dq", "ddq")}
+    for k in range(2):
+        w, phase = 2.0 * np.pi * np.geomspace(0.08, 0.9, 5) * rng.uniform(0.85, 1.15, 5), rng.uniform(0.0, 2.0 * np.pi, 5)
+        size = rng.uniform(0.9, 1.3) / np.sqrt(w / w[0]) / 1.4
+        for order, name in enumerate(("q", "dq", "ddq")):
+            out[name][:, k] = (size * w**order * np.sin(np.outer(t, w) + phase + 0.5 * np.pi * order)).sum(axis=1)
+    return out

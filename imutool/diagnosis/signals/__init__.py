@@ -1,0 +1,1 @@
+"""Diagnosis of signals that are no IMU: joints, wheels, fields, pressures, positions."""

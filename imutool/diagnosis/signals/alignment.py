@@ -1,0 +1,299 @@
+"""Any other signal of a log, aligned with its simulation: one clock, no simulation noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.signal import correlate, correlation_lags
+
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks, Variables, split
+from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
+from imutool.diagnosis.signals.ideal_signal import (
+    ENDS_S,
+    SignalPair,
+    at_recorded_motion,
+    band_hz,
+    from_simulation,
+    state_on,
+)
+from imutool.errors import DataError
+from imutool.inertial.stationary import white_noise
+from imutool.mcap_io.fields import Fields
+from imutool.recording import seconds
+from imutool.sensor.effect import SignalState
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics
+from imutool.sensor.robot_effects.scale import Scale, moved
+from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
+
+MOVES = 1e-9  # of its largest value, below which a signal is constant
+Column = Float64[np.ndarray, "_"]
+STATE_WORDS = {"dq": "speed of joint {}", "ddq": "acceleration of joint {}", "speed": "speed"}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AlignedSignal(AlignedLog):
+    """Recorded columns with the ideal signal.
+
+    `lag_s` is how much later the recording follows at first sight, `sim_density` the density of the simulation's own noise, by
+    column.
+    """
+
+    ideal: IdealSignal
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    kind: str
+    lag_s: float
+    sim_density: Float64[np.ndarray, " k"]
+    shares_epoch: bool
+
+    exact, denoised = True, False
+
+    @property
+    def bias_std(self) -> Float64[np.ndarray, " k"]:
+        """The offset is an effect, which acts before saturation."""
+        return np.full(self.columns, 1e-9)
+
+    def state(self) -> SignalState:
+        """The ideal signal, to be sampled at the stamps."""
+        return SignalState(self.ideal, self.stamp_s, self.stamp_s)
+
+    def blocks(self, samples: SignalSamples) -> Blocks:
+        """All columns."""
+        return ((0, samples.y),)
+
+    @property
+    def signals(self) -> Mapping[str, slice]:
+        """Each column by its name."""
+        return {name: slice(k, k + 1) for k, name in enumerate(self.names)}
+
+    def unit_of(self, signal: str) -> str:
+        """Unit of a column."""
+        return self.units[self.names.index(signal)]
+
+    def variables(self) -> Variables:
+        """Values, rates of change, the state, time and the channels of the log."""
+        sampled, out = self.sampled, {}
+        for k, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            of = "its" if self.columns == 1 else f"{name.rpartition('.')[2]}'s"
+            x = sampled.x[:, k]
+            out[f"{of} value"] = unit, x
+            out[f"{of} size"] = unit, np.abs(x - np.median(x))
+            out[f"{of} rate of change"] = f"{unit}/s", np.abs(sampled.dx[:, k])
+        out["time"] = "s", self.stamp_s
+        out |= {
+            STATE_WORDS.get(name.rstrip("0123456789"), "{}").format(name[-1]): ("", np.abs(values))
+            for name, values in sampled.state.items()
+            if name.rstrip("0123456789") in STATE_WORDS
+        }
+        channels = self.ideal.channels.items()
+        return out | {name: ("", np.interp(self.stamp_s, at_s, values)) for name, (at_s, values) in channels}
+
+    def recorded(self) -> tuple[IdealSignal, SignalSamples]:
+        """The ideal signal, and its samples with the recorded columns as their value."""
+        return self.ideal, self.sampled.but(self.real)
+
+    @cached_property
+    def sampled(self) -> SignalSamples:
+        """The ideal signal at the stamps."""
+        return self.ideal.sample(self.stamp_s, self.stamp_s)
+
+    def scale(self) -> Scale:
+        """Sizes from which effects take their plausible parameters."""
+        sampled, relation = self.sampled, self.ideal.relation
+        size, slope = (tuple(np.maximum(v.std(axis=0), 1e-12).tolist()) for v in (sampled.x, sampled.dx))
+        state = {name: moved(values) for name, values in sampled.state.items()} | {
+            name: moved(values) for name, (_, values) in self.ideal.channels.items()
+        }
+        for k, name in enumerate(name for name in sampled.state if name.startswith("v")):
+            state[f"noise{k}"] = float(white_noise(sampled.state[name][:, None])[0])
+        dynamics = relation if isinstance(relation, Dynamics) else None
+        duration_s = float(self.stamp_s[-1] - self.stamp_s[0])
+        return Scale(self.names, self.units, size, slope, self.lag_s, duration_s, state, dynamics)
+
+
+def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSettings) -> AlignedSignal:
+    """Align columns with their simulation, in seconds from the first sample.
+
+    Raises:
+        DataError: constant, too short or too few, or nothing alike in the two.
+    """
+    for k, name in enumerate(pair.names):
+        for t_ns, values, what in ((pair.real_ns, pair.real, "recording"), (pair.sim_ns, pair.sim, "simulation")):
+            _check(t_ns, values[:, k], what, name, settings.signal)
+    start_ns = int(pair.real_ns[0])
+    channels = {other: (seconds(fields.t_ns, start_ns), fields.values) for other, fields in others.items() if len(fields) > 1}
+    channels |= {
+        name: (seconds(pair.real_ns, start_ns), pair.real[:, k]) for k, name in enumerate(pair.names) if pair.sim_state
+    }
+    if pair.sim_state:
+        ideal, density = at_recorded_motion(pair, channels, settings)
+        end_s = ideal.start_s + len(ideal.fine) / ideal.rate_hz
+        t_real = seconds(pair.real_ns, start_ns)
+        rows = np.flatnonzero((t_real > ideal.start_s + ENDS_S) & (t_real < end_s - ENDS_S))
+        band = band_hz(ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
+        return _aligned(pair, ideal, rows, t_real, density, settings, band_hz=band)
+    t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
+    lag_s, aligned_s = _lag(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
+    if aligned_s is not None:
+        t_sim, lag_s = t_sim - aligned_s, 0.0
+    period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))
+    early, late = min(0.0, lag_s), max(0.0, lag_s)
+    rows = np.flatnonzero((t_real - late >= t_sim[0]) & (t_real - early <= t_sim[-1]))
+    rate_hz = settings.signal.oversampling / min(period_sim, period_real)
+    ideal, density = from_simulation(t_sim, pair.sim, period_sim, rate_hz, settings)
+    ideal = replace(ideal, channels=channels, state=state_on(ideal, pair.state, start_ns))
+    signal = _aligned(
+        pair,
+        ideal,
+        rows,
+        t_real,
+        density,
+        settings,
+        lag_s=lag_s,
+        aligned_s=0.0 if aligned_s is None else aligned_s,
+        shares_epoch=aligned_s is None,
+    )
+    step, usable = np.diff(t_sim), np.ones(len(signal.stamp_s), bool)
+    for gap in np.flatnonzero(step > max(settings.split.gap_periods * period_sim, 0.1)):  # what was never simulated
+        usable &= (signal.stamp_s < t_sim[gap] + early - settings.split.margin_s) | (
+            signal.stamp_s > t_sim[gap + 1] + late + settings.split.margin_s
+        )
+    return replace(signal, fitted=signal.fitted & usable, held_out=signal.held_out & usable)
+
+
+def _aligned(
+    pair: SignalPair,
+    ideal: IdealSignal,
+    rows: Int64[np.ndarray, " r"],
+    t_real: Column,
+    density: Float64[np.ndarray, " k"],
+    settings: DiagnoseSettings,
+    *,
+    lag_s: float = 0.0,
+    aligned_s: float = 0.0,
+    shares_epoch: bool = True,
+    band_hz: float | None = None,
+) -> AlignedSignal:
+    """Recorded rows with their ideal signal.
+
+    Raises:
+        DataError: too few rows.
+    """
+    _refuse_little(t_real[rows], pair.name, settings.signal)
+    part = slice(int(rows[0]), int(rows[-1]) + 1)
+    held_out, usable = split(t_real[part], settings.split)
+    return AlignedSignal(
+        pair.name,
+        t_real[part],
+        pair.real[part],
+        usable & ~held_out,
+        usable & held_out,
+        aligned_s=aligned_s,
+        band_hz=band_hz,
+        start_ns=int(pair.real_ns[0]),
+        ideal=ideal,
+        names=pair.names,
+        units=pair.units,
+        kind=pair.kind,
+        lag_s=lag_s,
+        sim_density=density,
+        shares_epoch=shares_epoch,
+        settings=settings,
+    )
+
+
+def _refuse_little(t_s: Column, name: str, settings: SignalSettings) -> None:
+    """Refuses a short time.
+
+    Raises:
+        DataError: less than the settings say.
+    """
+    shared_s = float(t_s[-1] - t_s[0]) if len(t_s) > 1 else 0.0
+    if shared_s < settings.least_s or len(t_s) < settings.least_samples:
+        raise DataError(
+            f"{shared_s:.1f} s and {len(t_s)} samples of {name} are shared with the simulation",
+            where=name,
+            expected=f"at least {settings.least_s:g} s and {settings.least_samples} samples",
+            fix="Give logs of the same time, or longer ones",
+        )
+
+
+def _check(t_ns: Int64[np.ndarray, " n"], values: Column, what: str, name: str, settings: SignalSettings) -> None:
+    """Refuses what holds nothing to compare.
+
+    Raises:
+        DataError: too short, not finite, stamps that do not increase, constant.
+    """
+    length = float(t_ns[-1] - t_ns[0]) * 1e-9 if len(t_ns) else 0.0
+    if length < settings.least_s or len(t_ns) < settings.least_samples:
+        raise DataError(
+            f"the {what} has {len(t_ns)} samples of {name} in {length:.1f} s",
+            where=name,
+            expected=f"at least {settings.least_s:g} s and {settings.least_samples} samples",
+            fix="Give a longer log",
+        )
+    if not np.isfinite(values).all() or (np.diff(t_ns) <= 0).any():
+        raise DataError(
+            f"the {what} of {name} has values that are not finite, or stamps that do not increase",
+            where=name,
+            expected="finite values and increasing stamps",
+            fix="Cut the log where it is sound",
+        )
+    if np.ptp(values) <= MOVES * float(np.abs(values).max()):
+        why = "the sensor may be dead or not connected" if what == "recording" else "it may not be simulated at all"
+        raise DataError(
+            f"{name} is {values[0]:g} throughout the {what}",
+            where=name,
+            expected="a signal that varies",
+            fix=f"Choose another field: {why}",
+        )
+
+
+def _lag(
+    t_real: Column,
+    real: Float64[np.ndarray, "_ k"],
+    t_sim: Column,
+    sim: Float64[np.ndarray, "_ k"],
+    names: Sequence[str],
+    settings: DiagnoseSettings,
+) -> tuple[float, float | None]:
+    """Lag (s) of the recording at first sight, and the clock shift (s) if no epoch is shared.
+
+    Raises:
+        DataError: nowhere are the two alike.
+    """
+    own = settings.signal
+    a, b = (
+        np.stack([_smooth(t_s, column, own.align_hz) for column in values.T]) for t_s, values in ((t_real, real), (t_sim, sim))
+    )
+    if len(names) > 1:  # columns of one size each, so that none decides for all
+        size = np.maximum(b.std(axis=1, keepdims=True), 1e-300)
+        a, b = a / size, b / size
+    total = np.sum([correlate(x, y, mode="full") for x, y in zip(a, b, strict=True)], axis=0)
+    correlation = total / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
+    lags = correlation_lags(a.shape[1], b.shape[1]) / own.align_hz + float(t_real[0] - t_sim[0])
+    shared = min(t_real[-1], t_sim[-1]) - max(t_real[0], t_sim[0])
+    length = min(t_real[-1] - t_real[0], t_sim[-1] - t_sim[0])
+    near = np.abs(lags) <= settings.alignment.farthest_s
+    if shared > max(own.least_s, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > own.least_correlation:
+        return float(lags[near][np.argmax(np.abs(correlation[near]))]), None
+    best = int(np.argmax(correlation))
+    if correlation[best] < own.least_correlation:
+        raise DataError(
+            f"recording and simulation of {names[0]} are not alike (correlation {correlation[best]:.2f} at best)",
+            where=names[0],
+            expected="one motion",
+            fix="Simulate what was recorded, or choose another field",
+        )
+    return 0.0, -float(lags[best])
+
+
+def _smooth(t_s: Column, values: Column, rate_hz: float) -> Float64[np.ndarray, " _"]:
+    """On an even clock, without its mean."""
+    at = np.arange(t_s[0], t_s[-1], 1.0 / rate_hz)
+    even = np.interp(at, t_s, values)
+    return np.asarray(even - even.mean())

@@ -1,0 +1,174 @@
+"""Ideal signals: simulated columns without noise, or a relation at the recorded motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.interpolate import make_interp_spline
+from scipy.signal import firwin, welch
+
+from imutool.diagnosis.estimation.alignment import wiener_filter
+from imutool.diagnosis.estimation.whitening import Band
+from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
+from imutool.errors import DataError
+from imutool.mcap_io.fields import Fields
+from imutool.recording import seconds
+from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamics, identified
+from imutool.sensor.robot_effects.signal_samples import IdealSignal
+from imutool.sensor.robot_effects.wheel import WheelRelation
+
+MOST_FINE = 20_000_000  # samples
+WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
+STEP_ROUNDS = 3
+ENDS_S = 0.5  # of a motion, where its derivatives are not known
+Column = Float64[np.ndarray, "_"]
+
+
+@dataclass(frozen=True, eq=False)
+class SignalPair:
+    """Columns of a recording and of its simulation that are compared together.
+
+    `kind` chooses the effects. `state` is what the columns depend on in the recording (`q0`, `R00`, `speed`), and `sim_state`
+    the same in the simulation, from which the relation between the two is learnt. Columns that follow from the state by such
+    a relation are compared at the recorded motion, whatever the simulated one is.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    real_ns: Int64[np.ndarray, " n"]
+    real: Float64[np.ndarray, "n k"]
+    sim_ns: Int64[np.ndarray, " m"]
+    sim: Float64[np.ndarray, "m k"]
+    kind: str = "number"
+    state: Mapping[str, Fields] = field(default_factory=dict)
+    sim_state: Mapping[str, Fields] = field(default_factory=dict)
+
+    @classmethod
+    def of_fields(cls, real: Fields, sim: Fields, name: str) -> SignalPair:
+        """One plain number."""
+        columns = (values.values[:, None] for values in (real, sim))
+        return cls(name, (name,), (real.unit or sim.unit,), real.t_ns, next(columns), sim.t_ns, next(columns))
+
+
+def at_recorded_motion(
+    pair: SignalPair, channels: Mapping[str, tuple[Column, Column]], settings: DiagnoseSettings
+) -> tuple[IdealSignal, Float64[np.ndarray, " k"]]:
+    """The simulated relation at the recorded state, and the density of its error.
+
+    Raises:
+        DataError: the columns of the simulation do not follow from its state.
+    """
+    sim_s, _, sim_state = motion(pair.sim_state, settings)
+    own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
+    inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
+    ahead_s, relation, simulated = 0.0, None, dict[str, Column]()
+    for _ in range(STEP_ROUNDS):  # a simulator holds its efforts for a step, so they come half a step before their motion
+        simulated = {name: np.interp(own_s[inside] + ahead_s, sim_s, values) for name, values in sim_state.items()}
+        relation = RELATIONS[pair.kind](simulated, pair.sim[inside])
+        if relation is None:
+            raise DataError(
+                f"the {pair.kind} of {pair.name} do not follow from the motion in the simulation",
+                where=pair.name,
+                expected="efforts of an arm, or speeds of wheels, by the simulation's own motion",
+                fix="Record positions and velocities of all joints",
+            )
+        ahead_s += _ahead_s(relation(simulated), pair.sim[inside], own_s[inside])
+    assert relation is not None
+    left = pair.sim[inside] - relation(simulated)
+    t_s, rate_hz, state = motion(pair.state, settings)
+    first_s = float(seconds(next(iter(pair.state.values())).t_ns[:1], int(pair.real_ns[0]))[0])
+    ideal = IdealSignal(float(t_s[0]) + first_s - ahead_s, rate_hz, relation(state), channels, state, relation)
+    return ideal, 2.0 * float(np.median(np.diff(own_s))) * left.var(axis=0)
+
+
+def _ahead_s(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], t_s: Float64[np.ndarray, " n"]) -> float:
+    """Time (s) by which columns come before what follows from a motion."""
+    slope = np.gradient(x, t_s, axis=0) / y.std(axis=0)
+    return float(((y - x) / y.std(axis=0) * slope).sum() / max(float((slope**2).sum()), 1e-300))
+
+
+def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Column, float, dict[str, Column]]:
+    """State on an even clock (s from its first sample), slow enough to be differentiated.
+
+    Raises:
+        DataError: too few samples, or gaps.
+    """
+    first = next(iter(fields.values()))
+    t_s = seconds(first.t_ns, int(first.t_ns[0]))
+    rate_hz = 1.0 / float(np.median(np.diff(t_s)))
+    at_s = np.arange(int((t_s[-1] - t_s[0]) * rate_hz) + 1) / rate_hz
+    even = np.stack([np.interp(at_s, t_s, own.values) for own in fields.values()], axis=1)
+    cutoff_hz = WIDER * band_hz(rate_hz, settings.signal)
+    slow = Band(firwin(2 * round(FILTER_PERIODS * rate_hz / cutoff_hz) + 1, cutoff_hz, fs=rate_hz), 1)
+    line = even[0] + np.outer(at_s / at_s[-1], even[-1] - even[0])  # beyond its ends a filter sees zeros
+    out = dict(zip(fields, (line + slow(even - line)).T, strict=True))
+    unfiltered = {f"v{name[2:]}": column for name, column in zip(fields, even.T, strict=True) if name.startswith("dq")}
+    for name in list(out):
+        if name.startswith("q") and f"d{name}" not in out:
+            out[f"d{name}"] = _slope(at_s, out[name])
+    for name in [name for name in out if name.startswith("dq")]:
+        out[f"d{name}"] = _slope(at_s, out[name])
+        out[f"v{name[2:]}"] = unfiltered.get(f"v{name[2:]}", out[name])  # a filter moves the time at which friction turns
+    return at_s, rate_hz, out
+
+
+def band_hz(rate_hz: float, settings: SignalSettings) -> float:
+    """Frequency up to which a motion is compared: above, its accelerations are noise."""
+    return min(settings.motion_band_hz, settings.motion_band_share * rate_hz)
+
+
+def _slope(t_s: Column, values: Column) -> Column:
+    """Derivative along a spline of fifth degree."""
+    return np.asarray(make_interp_spline(t_s, values, k=5)(t_s, 1))
+
+
+def _wheels(state: Mapping[str, Column], columns: Float64[np.ndarray, "_ k"]) -> WheelRelation | None:
+    speeds = np.stack(list(state.values()), axis=1)
+    weights, *_ = np.linalg.lstsq(speeds, columns, rcond=None)
+    left = (columns - speeds @ weights).std(axis=0)
+    return WheelRelation(weights) if (left < WELL_DETERMINED * columns.std(axis=0)).all() else None
+
+
+RELATIONS: Mapping[str, Callable[[Any, Any], Dynamics | WheelRelation | None]] = {"efforts": identified, "wheels": _wheels}
+
+
+def state_on(ideal: IdealSignal, state: Mapping[str, Fields], start_ns: int) -> dict[str, Column]:
+    """State of the recording on the clock of the ideal signal."""
+    at_s = ideal.start_s + np.arange(len(ideal.fine)) / ideal.rate_hz
+    return {name: np.interp(at_s, seconds(own.t_ns, start_ns), own.values) for name, own in state.items()}
+
+
+def from_simulation(
+    t_sim: Column, values: Float64[np.ndarray, "_ k"], period_sim: float, rate_hz: float, settings: DiagnoseSettings
+) -> tuple[IdealSignal, Float64[np.ndarray, " k"]]:
+    """The simulation without white noise on a fine clock, and the density of that noise."""
+    t_even = t_sim[0] + period_sim * np.arange(int((t_sim[-1] - t_sim[0]) / period_sim) + 1)
+    rate_hz = min(rate_hz, MOST_FINE / (t_even[-1] - t_even[0]))
+    t_fine = t_even[0] + np.arange(int((t_even[-1] - t_even[0]) * rate_hz) + 1) / rate_hz
+    fine, density = [], []
+    for column in values.T:
+        even, jumps = _resampled(t_sim, column, t_even), _jumps(column)
+        f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(settings.noise.segment_samples, len(even)), average="median")
+        top = (f_hz >= settings.signal.noise_band / period_sim) & (f_hz <= settings.signal.noise_band_end / period_sim)
+        clean = wiener_filter(even, settings.alignment)
+        fine.append(np.interp(t_fine, t_even, clean) if jumps else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine)))
+        density.append(float(np.median(power[top])))
+    return IdealSignal(float(t_fine[0]), rate_hz, np.stack(fine, axis=1), {}), np.array(density)
+
+
+def _resampled(t_s: Column, values: Column, at_s: Column) -> Column:
+    """On other times: along splines, or straight lines where a signal jumps."""
+    return np.interp(at_s, t_s, values) if _jumps(values) else np.asarray(make_interp_spline(t_s, values, k=3)(at_s))
+
+
+def _jumps(values: Column) -> bool:
+    """Whether a signal holds still for most samples, as a command does.
+
+    A spline would ring about its steps.
+    """
+    return float((np.diff(values) == 0.0).mean()) > 0.5

@@ -1,0 +1,85 @@
+"""Actuator of a joint: delay, gain, dead band and limit of its effort.
+
+The log holds the commanded effort u; what acts is u some time later, less and limited (Slotine and Li, Applied Nonlinear
+Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over the gain, plus what the actuator kept back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples
+
+PLAUSIBLE_S, MOVED = 0.05, 0.005
+WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
+LIMITS = (1.0, 1.5, 2.0)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What the actuator keeps back of a command: all within `width`, or what is above `limit`."""
+
+    joint: int
+    name: str
+    limits: bool
+
+    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        u: Samples = s.channel(self.name)
+        inside = np.clip(u, -theta[0], theta[0])
+        return s.with_added(self.joint, u - inside if self.limits else inside)
+
+
+def _delayed(taken_s: Samples, theta: Theta) -> Samples:
+    return np.asarray(taken_s + theta[0])
+
+
+def effects(scale: Scale) -> Iterator[Effect]:
+    """Delay of all joints; gain, dead band and limit of each."""
+    step = MOVED * min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))
+    yield scale.effect(
+        "actuator_delay",
+        scale.columns,
+        "the effort acts `delay` after it is commanded",
+        (Parameter("delay", "s", PLAUSIBLE_S, step=step),),
+        _delayed,
+        "the effort varies",
+        stage=Stage.CLOCK,
+        starts=[np.zeros(1), np.array([0.02]), np.array([0.06])],
+    )
+    for k in scale.columns:
+        yield from _of_joint(scale, k)
+
+
+def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
+    size, unit = scale.size[k], scale.units[k]
+
+    def gain(s: SignalSamples, theta: Theta) -> SignalSamples:
+        return s.with_column(k, s.y[:, k] / theta[0])
+
+    yield scale.effect(
+        "actuator_gain",
+        (k,),
+        "acting effort = gain commanded effort",
+        (Parameter("gain", "-", 0.3, null_value=1.0),),
+        gain,
+        "the effort varies",
+        starts=[np.ones(1)],
+    )
+    for name, limits, shares, text in (
+        ("actuator_dead_band", False, WIDTHS, "a command within +-width does nothing, and beyond it loses as much"),
+        ("torque_saturation", True, LIMITS, "a command beyond +-limit acts as the limit"),
+    ):
+        yield scale.effect(
+            name,
+            (k,),
+            text,
+            (Parameter("limit" if limits else "width", unit, size, positive=True, step=0.01),),
+            _Kept(k, scale.names[k], limits),
+            "the effort goes beyond the limit" if limits else "the effort goes through zero",
+            starts=[np.array([share * size]) for share in shares],
+        )

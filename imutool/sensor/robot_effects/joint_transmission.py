@@ -1,0 +1,171 @@
+"""Transmission and encoder of a joint: ripple, offset, eccentricity, backlash, compliance.
+
+A gear's torque ripples with its angle (Ghorbel, Gandhi, Alpeter, On the kinematic error in harmonic drive gears, 2001); an
+eccentric encoder disc reads q + a sin(q) + b cos(q); play and a spring lie between motor and link (Nordin and Gutman,
+Controlling mechanical systems with backlash, Automatica 38, 2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
+
+MOST_TEETH, LEAST_TURNS = 120.0, 3.0  # ripples a turn that are tried, and how many of them the motion has to show
+STARTS = 2
+BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
+PLAUSIBLE_RAD = 0.05
+
+
+# ── in the effort ──
+
+
+@dataclass(frozen=True)
+class _Ripple:
+    joint: int
+
+    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        angle = theta[2] * s.state[f"q{self.joint}"]
+        return s.with_added(self.joint, theta[0] * np.sin(angle) + theta[1] * np.cos(angle))
+
+    def grid(self, q: Samples) -> Float64[np.ndarray, " _"]:
+        """Ripples a turn, as close as the range of the angle tells them apart."""
+        turn = max(float(np.ptp(q)), 1e-9)
+        return np.arange(max(2.0, LEAST_TURNS * 2.0 * np.pi / turn), MOST_TEETH, 1.0 / turn)
+
+    def starts(self, ideal: IdealSignal, real: Any) -> list[Theta]:
+        """The strongest ripples of what smooth terms leave."""
+        s = ideal.sample(real.stamp_s, real.stamp_s)
+        q, dq, ddq = (s.state[f"{kind}{self.joint}"] for kind in ("q", "dq", "ddq"))
+        smooth = np.stack(
+            [np.ones(len(q)), q, dq, np.sign(dq), ddq, np.sin(q), np.cos(q), s.x[:, self.joint], s.dx[:, self.joint]], axis=1
+        )
+        left = real.y[:, self.joint] - s.x[:, self.joint]
+        left = left - smooth @ np.linalg.lstsq(smooth, left, rcond=None)[0]
+        grid = self.grid(q)
+        if not len(grid):
+            return [np.array([0.0, 0.0, 2.0])]
+        bins = np.unique(np.floor(q * BINS_A_RADIAN).astype(int), return_inverse=True)[1]
+        angle, sums = np.bincount(bins, q) / np.bincount(bins), np.bincount(bins, left)
+        waves = np.exp(1j * np.outer(grid, angle)) @ sums * 2.0 / len(q)
+        best = np.argsort(-np.abs(waves))[:STARTS]
+        return [np.array([waves[b].imag, waves[b].real, grid[b]]) for b in best]
+
+
+# ── in the angle that the encoder reads: the motion itself is another ──
+
+
+@dataclass(frozen=True)
+class _Angle:
+    joint: int
+    eccentric: bool
+
+    def __call__(self, ideal: IdealSignal, theta: Theta) -> IdealSignal:
+        q, dq, ddq = (ideal.state[f"{kind}{self.joint}"] for kind in ("q", "dq", "ddq"))
+        if not self.eccentric:
+            return ideal.with_state(**{f"q{self.joint}": q - theta[0]})
+        error, slope = theta[0] * np.sin(q) + theta[1] * np.cos(q), theta[0] * np.cos(q) - theta[1] * np.sin(q)
+        changed = {"q": q - error, "dq": dq * (1.0 - slope), "ddq": ddq * (1.0 - slope) + dq**2 * error}
+        return ideal.with_state(**{f"{kind}{self.joint}": values for kind, values in changed.items()})
+
+
+def effects(scale: Scale) -> Iterator[Effect]:
+    """Ripple, encoder offset and eccentricity of each joint, in its effort."""
+    for k in scale.columns:
+        size, ripple = 0.5 * scale.size[k], _Ripple(k)
+        waves = (Parameter("sine", scale.units[k], size), Parameter("cosine", scale.units[k], size))
+        per_turn = Parameter("per_turn", "1/turn", MOST_TEETH, step=0.02, null_value=0.0)
+        yield Effect(
+            "gear_ripple",
+            Stage.SENSOR,
+            *_on(scale, k),
+            "effort += sine sin(per_turn q) + cosine cos(per_turn q)",
+            (*waves, per_turn),
+            "the joint turns through several ripples",
+            ripple,
+            linear=False,
+            starts=ripple.starts,
+            alternatives=_trials,
+            variant=scale.names[k] if len(scale.names) > 1 else "",
+        )
+        if scale.dynamics is None:
+            continue
+        yield scale.effect(
+            "encoder_offset",
+            (k,),
+            "the angle read = angle + offset",
+            (Parameter("offset", "rad", PLAUSIBLE_RAD),),
+            _Angle(k, eccentric=False),
+            "gravity or the other joints depend on the angle",
+            stage=Stage.MOUNT,
+            starts=[np.zeros(1)],
+        )
+        yield scale.effect(
+            "eccentricity",
+            (k,),
+            "the angle read = angle + sine sin(angle) + cosine cos(angle)",
+            (Parameter("sine", "rad", PLAUSIBLE_RAD), Parameter("cosine", "rad", PLAUSIBLE_RAD)),
+            _Angle(k, eccentric=True),
+            "the joint turns through most of a circle",
+            stage=Stage.MOUNT,
+            starts=[np.zeros(2)],
+        )
+
+
+def _on(scale: Scale, k: int) -> tuple[Any]:
+    return (() if len(scale.names) == 1 else (scale.names[k],),)
+
+
+def _trials(_: Any) -> int:
+    return round(MOST_TEETH)
+
+
+# ── in the position ──
+
+
+def play(x: Samples, width: float) -> Samples:
+    """Backlash operator: the output rests until the input has crossed the gap."""
+    out, now, half = np.empty(len(x)), float(x[0]), 0.5 * width
+    for i, value in enumerate(x.tolist()):
+        now = min(max(now, value - half), value + half)
+        out[i] = now
+    return out
+
+
+def position_effects(scale: Scale) -> Iterator[Effect]:
+    """Backlash, compliance and eccentricity of a joint whose position alone is compared."""
+    size = scale.size[0]
+    yield scale.effect(
+        "backlash",
+        (0,),
+        "the position rests until the drive has crossed the gap",
+        (Parameter("gap", scale.units[0], size, positive=True, step=0.02),),
+        lambda s, theta: s.with_column(0, play(s.y[:, 0], theta[0])),
+        "the joint turns both ways",
+        starts=[np.array([share * size]) for share in (0.02, 0.1, 0.4)],
+    )
+    waves = (Parameter("sine", scale.units[0], PLAUSIBLE_RAD), Parameter("cosine", scale.units[0], PLAUSIBLE_RAD))
+    yield scale.effect(
+        "eccentricity",
+        (0,),
+        "position += sine sin(position) + cosine cos(position)",
+        waves,
+        lambda s, theta: s.with_added(0, theta[0] * np.sin(s.x[:, 0]) + theta[1] * np.cos(s.x[:, 0])),
+        "the joint turns through most of a circle",
+    )
+    if "effort" in scale.state:
+        yield scale.effect(
+            "compliance",
+            (0,),
+            "position -= effort compliance",
+            (Parameter("compliance", "rad/(N m)", 0.5 * size / scale.state["effort"]),),
+            lambda s, theta: s.with_added(0, -theta[0] * s.state["effort"]),
+            "the effort varies otherwise than the position",
+        )

@@ -1,0 +1,89 @@
+"""Magnetometer: soft iron, misalignment and declination; a constant is hard iron.
+
+m = S R m_0 + h with S symmetric (Gebre-Egziabher and others, Calibration of strapdown magnetometers in the magnetic field
+domain, J. Aerospace Eng. 19, 2006); the declination turns the field about the vertical of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import SignalSamples, Values
+from imutool.units import AXES
+
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _soft(s: SignalSamples, theta: Theta) -> SignalSamples:
+    S = np.eye(3)
+    for value, (i, j) in zip(theta, PAIRS, strict=True):
+        S[i, j] += value
+        S[j, i] = S[i, j]
+    return s.but(s.y @ S)
+
+
+def _misaligned(s: SignalSamples, theta: Theta) -> SignalSamples:
+    return s.but(s.y @ Rotation.from_rotvec(theta).as_matrix())
+
+
+def attitude(s: SignalSamples) -> Values:
+    """R_wb at the samples, from the state."""
+    return np.asarray(np.stack([s.state[f"R{i}{j}"] for i in range(3) for j in range(3)], axis=1).reshape(-1, 3, 3))
+
+
+def _declined(s: SignalSamples, theta: Theta) -> SignalSamples:
+    R = attitude(s)
+    field = np.einsum("nij,nj->ni", R, s.y) @ Rotation.from_rotvec([0.0, 0.0, theta[0]]).as_matrix().T
+    return s.but(np.einsum("nji,nj->ni", R, field))
+
+
+def effects(scale: Scale) -> Iterator[Effect]:
+    """Soft iron, misalignment, and with an attitude the declination."""
+    entries = tuple(Parameter(AXES[i] + AXES[j], "-", 0.1) for i, j in PAIRS)
+    yield scale.effect(
+        "soft_iron",
+        scale.columns,
+        "field = S field, S symmetric",
+        entries,
+        _soft,
+        "it turns about two axes",
+        starts=[np.zeros(6)],
+    )
+    yield scale.effect(
+        "magnetometer_misalignment",
+        scale.columns,
+        "field = R^T field",
+        tuple(Parameter(axis, "rad", 0.2) for axis in AXES),
+        _misaligned,
+        "it turns about two axes",
+        starts=[np.zeros(3)],
+    )
+    if "R00" in scale.state:
+        yield scale.effect(
+            "declination",
+            scale.columns,
+            "the field of the world is turned about its vertical",
+            (Parameter("angle", "rad", 0.3),),
+            _declined,
+            "it rolls or pitches as well as it turns",
+            starts=[np.zeros(1)],
+        )
+    yield delay(scale, "delay")
+
+
+def delay(scale: Scale, name: str) -> Effect:
+    """A delay of all columns together."""
+    step = 0.005 * min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))
+    starts = [np.zeros(1)] if abs(scale.lag_s) < 1e-9 else [np.zeros(1), np.array([scale.lag_s])]
+    text, needs = "y(t) = x(t - delay)", "it moves"
+    number = (Parameter("delay", "s", max(0.2, abs(scale.lag_s)), step=step),)
+    return scale.effect(name, scale.columns, text, number, _late, needs, stage=Stage.CLOCK, starts=starts)
+
+
+def _late(taken_s: np.ndarray, theta: Theta) -> np.ndarray:
+    return np.asarray(taken_s - theta[0])

@@ -1,0 +1,63 @@
+"""Sizes of a signal, from which its effects take their plausible parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Names, units and sizes of a signal's columns.
+
+    `names` are TOPIC.field; `size` and `slope` (per second) are standard deviations, `lag_s` the lag at first sight,
+    `duration_s` the length of the log. `state` has the standard deviation of each state, `dynamics` is the relation of an
+    arm's efforts to its motion, where the simulation showed one.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    size: tuple[float, ...]
+    slope: tuple[float, ...]
+    lag_s: float
+    duration_s: float
+    state: Mapping[str, float]
+    dynamics: Dynamics | None = None
+
+    @property
+    def columns(self) -> range:
+        """Indices of the columns."""
+        return range(len(self.names))
+
+    def effect(
+        self,
+        name: str,
+        columns: tuple[int, ...] | range,
+        equation: str,
+        parameters: tuple[Parameter, ...],
+        forward: Callable[[Any, Theta], Any],
+        observable_if: str,
+        *,
+        stage: Stage = Stage.SENSOR,
+        starts: list[Theta] | None = None,
+        variant: str = "",
+        **more: Any,
+    ) -> Effect:
+        """Effect on some columns; linear without `starts`."""
+        sensors = () if len(self.names) == 1 else tuple(self.names[k] for k in columns)
+        label = ",".join([*(sensors if len(columns) < len(self.names) else ()), *([variant] if variant else [])])
+        given = None if starts is None else lambda ideal, real: starts
+        return Effect(
+            name, stage, sensors, equation, parameters, observable_if, forward, starts is None, given, variant=label, **more
+        )
+
+
+def moved(values: Any) -> float:
+    """Standard deviation of a state, or a tiny number for a constant one."""
+    return max(float(np.std(values)), 1e-12)
