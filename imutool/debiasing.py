@@ -21,10 +21,10 @@ from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.fitness import Fitness
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log
 from imutool.bias_start.stretches import Sieve
+from imutool.bias_start.verdict import Fitness
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
@@ -242,9 +242,9 @@ def _debias(
         for topic in topics:
             name, survey = given.get(topic, default), surveys.get(topic)
             chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
-            fits[topic] = fitness_in_log(log, topic, chosen, start, survey).report(chosen, topic, force=options.force)
             derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
+            fits[topic] = fitness_in_log(log, topic, chosen, start, survey).report(models[topic], topic, force=options.force)
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
 
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}

@@ -18,9 +18,10 @@ from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.fitness import Fitness, judge
+from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
+from imutool.bias_start.verdict import Fitness
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location
@@ -206,7 +207,7 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     name, chosen, start = _model_and_start(recording, model, init, smooth)
     about = recording.metadata.get("imutool", {})
-    fitness = judge(chosen, start, [relative_samples(recording.imu)], about).report(chosen, recording.name, force=force)
+    fitness = judge(chosen, start, [relative_samples(recording.imu)], about).report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
     return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
 

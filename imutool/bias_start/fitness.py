@@ -13,11 +13,9 @@ The thresholds come from `tests/bench/fit.py`: pieces of the training logs of th
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -26,12 +24,10 @@ from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.errors import ModelError
+from imutool.bias_start.verdict import Fitness
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
-
-Verdict = Literal["fits", "doubtful", "unfit"]
 
 CHECKED_S = 120.0  # of a log that the check reads
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
@@ -48,33 +44,6 @@ MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs u
 MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
 STUDENT = 7.0  # degrees of freedom of the innovations' likelihood, so that one jolt does not decide
 GRAVITY_RANGE = (0.8, 1.2)  # of the mean specific force to gravity; a sensor in g has 0.1
-
-logger = logging.getLogger(__name__)
-
-
-class Fitness(NamedTuple):
-    """Verdict on a model for a log, and the reasons."""
-
-    verdict: Verdict
-    reasons: tuple[str, ...]
-
-    def report(self, model: BiasModel, where: str, *, force: bool) -> Fitness:
-        """Warn of a doubtful model, refuse an unfit one.
-
-        Raises:
-            ModelError: it is unfit, and `force` is not given.
-        """
-        name, reasons = str(model.card.get("name", model.method)), "; ".join(self.reasons)
-        if self.verdict == "unfit" and not force:
-            raise ModelError(
-                f"the model {name!r} does not fit this log: {reasons}",
-                where=where,
-                expected="a model of this very sensor",
-                fix="Give `model=static` or a model trained on logs of this sensor, or use it all the same with `force`",
-            )
-        if self.verdict != "fits":
-            logger.warning("%s: the model %s is %s here: %s", where, name, self.verdict, reasons)
-        return self
 
 
 @dataclass(frozen=True)

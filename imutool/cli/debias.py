@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imutool.bias_start.verdict import Fitness
 from imutool.cli.app import HTML, LOG, LOST, RRD, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
@@ -88,7 +90,7 @@ def debias(
         _say(report, summary)
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
-            _draw(to_location(target or source), list(report.starts), report_to, overwrite)
+            _draw(to_location(target or source), report.fits, report_to, overwrite)
         if not json_only:
             say(f"Report: {report_to}")
     raise typer.Exit(LOST if report.lossy else 0)
@@ -109,13 +111,6 @@ class StretchEntry(Section, frozen=True):
     step_s: float
 
 
-class Fit(Section, frozen=True):
-    """Verdict on a model for a log, `fits`, `doubtful` or `unfit`, and its reasons."""
-
-    verdict: Literal["fits", "doubtful", "unfit"]
-    reasons: list[str]
-
-
 class DebiasedImu(Section, frozen=True):
     """Model and start bias of an IMU (gyro rad/s, accel m/s²) with its standard deviation."""
 
@@ -124,7 +119,7 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
-    fit: Fit
+    fit: Fitness
     left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
     stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
@@ -161,7 +156,7 @@ def _summary(
             start.rest[:3].tolist(),
             start.rest[3:].tolist(),
             start.std.tolist(),
-            Fit(report.fits[topic].verdict, list(report.fits[topic].reasons)),
+            report.fits[topic],
             report.sieves[topic].left_out or UNSET,
             [StretchEntry(*stretch) for stretch in report.sieves[topic].clock.stretches] or UNSET,
         )
@@ -188,8 +183,7 @@ def _say(report: DebiasReport, summary: DebiasSummary) -> None:
         gyro = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias)
         accel = ", ".join(f"{b:+.4f}" for b in imu.accel_bias)
         say(f"{topic}: {imu.model}, start bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
-        verdict = "fits" if imu.fit.verdict == "fits" else f"is {imu.fit.verdict}"
-        say(f"{topic}: the model {verdict}: {imu.fit.reasons[0]}")
+        say(f"{topic}: {imu.fit.sentence('the model')}")
     counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
     say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
     verified = summary.verified
@@ -212,12 +206,14 @@ def _watching(
     return live_view(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
 
 
-def _draw(log: Location, topics: Sequence[str], page: Path, overwrite: bool) -> None:
+def _draw(log: Location, fits: Mapping[str, Fitness], page: Path, overwrite: bool) -> None:
     """Write a page about the debiased log; of several IMUs each has its topic as name."""
     from imutool.viewing.html.report import name_by_topic, write_page
     from imutool.viewing.model.runs import load
 
-    write_page(name_by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
+    shown = [load(log, imu=topic) for topic in fits]
+    shown = [replace(run, notes=(*run.notes, fit.sentence("The model"))) for run, fit in zip(shown, fits.values(), strict=True)]
+    write_page(name_by_topic(shown, list(fits)), page, overwrite=overwrite)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

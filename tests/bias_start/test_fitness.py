@@ -13,8 +13,9 @@ from imutool.bias import linear, static
 from imutool.bias.io import save
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import auto
-from imutool.bias_start.fitness import Fitness, judge
+from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
+from imutool.bias_start.verdict import Fitness
 from imutool.errors import ModelError
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
@@ -54,7 +55,7 @@ def test_the_sensor_itself_fits(model: BiasModel, recording: Recording) -> None:
 
 def test_another_name_is_doubtful_however_well_it_agrees(model: BiasModel, recording: Recording) -> None:
     found = judged(model, recording.imu, MADE_FOR | {"sensor": "another"})
-    assert found == ("doubtful", ("the model was made for the sensor made up, the log is of another",))
+    assert found == Fitness("doubtful", ("the model was made for the sensor made up, the log is of another",))
 
 
 TAMPERED = {
@@ -91,7 +92,7 @@ def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
     assert not Path(words[1]).exists()
     report = imutool.debias(words[0], words[1], model=words[2], force=True)
     assert report.fits["/imu0"].verdict == "unfit"
-    assert "is unfit here" in caplog.text
+    assert "the model own is unfit: " in caplog.text
     doubtful = imutool.debias(replace(recording, metadata={"imutool": {"sensor": "another"}}), model)
     assert doubtful.fitness.verdict == "doubtful"
-    assert "is doubtful here" in caplog.text
+    assert "the model own is doubtful: " in caplog.text
