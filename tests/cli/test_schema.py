@@ -34,6 +34,7 @@ LINES: dict[str, Sequence[str]] = {
     "train": ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
     "evaluate": ["evaluate", "{}/flight_2.mcap", "--model", "static", "--zupt"],
     "view": ["view", "{}/flight_2.mcap", "--html", "out.html"],
+    "live": ["live", "--from", "{}/flight_2.mcap", "--speed", "100", "--no-view"],
     "vio": ["vio", "{}/flight_2.mcap", "--model", "static", "--duration", "6", "--no-bias-states"],
     "simulate": ["simulate", "{}/flight_2.mcap", "sim.mcap", "--noise", "bmi160"],
     "audit": ["audit", "{}/flight_2.mcap"],
