@@ -5,6 +5,7 @@ A matrix of three columns `gyro` becomes the columns `gyro[0]`, `gyro[1]`, `gyro
 
 from __future__ import annotations
 
+import csv
 import re
 import zipfile
 from collections.abc import Callable, Iterator
@@ -118,14 +119,23 @@ def _is_number(text: str) -> bool:
 
 
 def _load_csv(path: Path, columns: Columns) -> None:
-    lines = [line for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines() if line.strip()]
+    read_csv(path.read_text(encoding="utf-8-sig", errors="replace"), columns, path)
+
+
+def read_csv(text: str, columns: Columns, path: Path) -> None:
+    """Add the columns of a table of text; `path` is its address for messages.
+
+    Raises:
+        DataError: a line is too long for a table.
+    """
+    lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
     delimiter = _delimiter(lines)
     first = next((n for n, line in enumerate(lines) if sum(map(_is_number, line.split(delimiter))) >= 4), len(lines))
-    rows = [line.split(delimiter) for line in lines[first:]]
+    rows = _fields(lines[first:], delimiter)
     width = max(map(len, rows), default=0)
-    names = [name.strip().strip('"') for name in lines[first - 1].lstrip("# ").split(delimiter)] if first else []
+    names = _distinct([name.strip().strip('"') for name in lines[first - 1].lstrip("# ").split(delimiter)]) if first else []
     if len(names) != width:
         names = [f"column {number}" for number in range(1, width + 1)]
     whole = [row for row in rows if len(row) == width]
@@ -138,6 +148,28 @@ def _load_csv(path: Path, columns: Columns) -> None:
             columns.remarks.notes.append(f"{name}: decimal commas are read as points")
         if (values := _numbers(texts)) is not None:
             columns.values[name], columns.texts[name] = values, texts
+
+
+def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:
+    """Fields of each line; in quotes the delimiter is text."""
+    if delimiter is not None and any('"' in line for line in lines[:20]):
+        return list(csv.reader(lines, delimiter=delimiter))
+    return [line.split(delimiter) for line in lines]
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Names of columns; one that repeats stands below the last that does not, as in a bag's messages written as a table.
+
+    `angular_velocity,x,y,z,linear_acceleration,x,y,z` has `angular_velocity.x`, `linear_acceleration.x`, ....
+    """
+    above, distinct = "", []
+    for text in names:
+        if names.count(text) > 1:
+            distinct.append(f"{above}.{text}" if above else text)
+        else:
+            above = text
+            distinct.append(text)
+    return distinct
 
 
 def _numbers(texts: list[str]) -> np.ndarray | None:

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from imutool.errors import ConfigError
+from imutool.recording.message_log import KINDS
 
 from ._table_files import Columns
 
@@ -45,6 +46,22 @@ UNITS = {
 }
 
 
+Entries = dict[str, str | list[str]]  # of a map
+RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
+    "time": "synced/time",
+    "time_unit": "s",
+    "gyro": [f"synced/gyro_uncalib[{axis}]" for axis in range(3)],
+    "gyro_unit": "rad/s",
+    "accel": [f"synced/acce[{axis}]" for axis in range(3)],
+    "accel_unit": "m/s^2",
+}
+RONIN_POSES: Entries = {  # by the visual-inertial estimate of a second phone
+    "position": [f"pose/tango_pos[{axis}]" for axis in range(3)],
+    "quaternion_wxyz": [f"pose/tango_ori[{axis}]" for axis in range(4)],
+    "pose_kind": "estimate",
+}
+
+
 class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Map of a table's columns; a column named `-ax` counts with the opposite sign."""
 
@@ -65,6 +82,7 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     position: list[str] = []
     quaternion_wxyz: list[str] = []
     rotation_matrix: str = ""
+    pose_kind: str = "truth"
 
 
 def read_map(path: Path) -> TableMap:
@@ -82,6 +100,8 @@ def read_map(path: Path) -> TableMap:
     for name, units in (("time", TIME_NS), ("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         if (unit := getattr(table, f"{name}_unit")) not in units:
             raise ConfigError(f"{name}_unit is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
+    if table.pose_kind not in KINDS:
+        raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
     for name in ("gyro", "accel"):
         if len(getattr(table, name)) != 3:
             raise ConfigError(f"{name} names {len(getattr(table, name))} columns", where=path, expected="three: x, y, z")
@@ -91,7 +111,7 @@ def read_map(path: Path) -> TableMap:
 class Proposal(msgspec.Struct):
     """Map as far as a table shows it, what is open, and why."""
 
-    entries: dict[str, str | list[str]]
+    entries: Entries
     open: list[str]
     reasons: list[str]
 
@@ -113,14 +133,17 @@ class Proposal(msgspec.Struct):
 def propose(columns: Columns) -> Proposal:
     """Map that names, units and magnitudes of the columns suggest."""
     proposal = Proposal({}, [], [])
-    names = {column: _split(column) for column in columns.values}
+    if {"synced/time", "synced/gyro_uncalib[0]", "synced/acce[0]"} <= columns.values.keys():
+        poses = RONIN_POSES if {"pose/tango_pos[0]", "pose/tango_ori[3]"} <= columns.values.keys() else {}
+        return Proposal({**RONIN, **poses}, [], ["its arrays are those of RoNIN"])
+    names = {column: split_name(column) for column in columns.values}
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
     return proposal
 
 
-def _split(column: str) -> tuple[str, str]:
+def split_name(column: str) -> tuple[str, str]:
     """Name in lower case with underscores, and the unit in brackets or at the end."""
     text = column.strip().lower()
     bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)

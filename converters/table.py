@@ -72,7 +72,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
         path.name,
         imus={table.topic: imu},
         poses=poses,
-        kinds=dict.fromkeys(poses, "truth"),
+        kinds=dict.fromkeys(poses, table.pose_kind),
         scalars=_scalars(columns, used, gyro_ns, remarks),
         metadata={"imutool": {"format": "table", "sequence": sequence.name}, "imutool/map": _described(table)},
         remarks=remarks,
@@ -171,7 +171,8 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
     kept = in_order(t_ns, np.concatenate([p, q_wxyz], axis=1), "/ground_truth/pose")
     remarks.notes.extend(kept.notes)
-    return {"/ground_truth/pose": Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
+    topic = "/ground_truth/pose" if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
+    return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
 
 
 def _quaternions(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 4"]:

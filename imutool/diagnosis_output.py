@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from imutool.viewing.model.run_data import RunData
 
 FINDINGS, EFFECT, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
+CLOSED = "closed.html"
 FILES = (FINDINGS, EFFECT, REPORT, LOG, VIEW)
 DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
 NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
@@ -74,6 +75,13 @@ def write(
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(partial)
     return remarks
+
+
+def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
+    """Write findings.json with the closed loop, and the page of the second diagnosis."""
+    (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
+    if find_spec("matplotlib") is not None:
+        _page(again, folder / CLOSED)
 
 
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:

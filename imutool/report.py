@@ -29,6 +29,8 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 
 # by name, the module and the type: imported when its schema is asked for, so that --help stays light
 REPORTS = {
+    "catalog": "imutool.cli.fleet_view:CatalogReport",
+    "audit": "imutool.diagnosis.audit.audit:AuditReport",
     "clean": "imutool.cleaning.first_pass:CleaningReport",
     "conversion": "imutool.cli.convert:Conversion",
     "debias": "imutool.cli.debias:DebiasSummary",
@@ -40,6 +42,7 @@ REPORTS = {
     "fleet-diagnosis": "imutool.fleet.robots:FleetDiagnosis",
     "info": "imutool.log_info.report:LogInfo",
     "infos": "imutool.log_info.report:LogInfos",
+    "live": "imutool.cli.live:LiveReport",
     "models": "imutool.cli.shipped:Models",
     "repair": "imutool.cli.repair:Repair",
     "score": "imutool.blind_cases.cases:OpenedCase",

@@ -23,9 +23,11 @@ MODULES = (
     "clean",
     "evaluate",
     "view",
+    "live",
     "simulate",
     "diagnose",
     "fleet",
+    "fleet_view",
     "shipped",
 )
 REPEAT_S = 0.01

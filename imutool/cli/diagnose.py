@@ -1,20 +1,37 @@
-"""`imutool diagnose`."""
+"""`imutool diagnose`, and `imutool audit` of a simulator alone."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, Written, app
+from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import logger, progress, say, table, write_json
+from imutool.errors import ConfigError
 
 if TYPE_CHECKING:
     from imutool.diagnosis.result import Diagnosis
     from imutool.viewing.model.run_data import RunData
 
 FOLDER = Written(files=("findings.json", "physics.toml", "report.html", "log.html", "view.rrd"))
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--output", metavar="DIR", help="Folder for findings.json, physics.toml, report.html, log.html and view.rrd."
+    ),
+    FOLDER,
+]
+Close = Annotated[
+    bool, typer.Option("--close", help="Simulate again with physics.toml (DIR/closed.mcap), diagnose again, and compare.")
+]
+Metric = Annotated[
+    Path | None, typer.Option(metavar="SCRIPT", help="Your figure for --close: python SCRIPT REAL SIM prints a number.")
+]
 
 
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
@@ -31,13 +48,9 @@ def diagnose(
     signal: Annotated[
         list[str] | None, typer.Option(metavar="TOPIC.field", help="Also compare this field of both logs. Repeatable.")
     ] = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="DIR", help="Folder for findings.json, physics.toml, report.html, log.html and view.rrd."
-        ),
-        FOLDER,
-    ] = None,
+    folder: Folder = None,
+    close: Close = False,
+    metric: Metric = None,
     config: Annotated[
         Path | None,
         typer.Option(metavar="FILE.toml", help="Settings; imutool.diagnosis.settings.DiagnoseSettings lists them."),
@@ -65,6 +78,8 @@ def diagnose(
     def look(findings: Path) -> list[RunData]:
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
+    if close and (folder is None or len(reals) != 1):
+        raise ConfigError("`close` needs one recording and a folder", where="close", fix="Give one REAL, and `folder`")
     settings = load_settings(DiagnoseSettings, config, set_ or ())
     if folder is not None:
         diagnosis_output.refuse(folder, overwrite=overwrite)
@@ -74,9 +89,32 @@ def diagnose(
             tell(0, 1, "writing")
             for remark in diagnosis_output.write(diagnosis, folder, logs=look, overwrite=overwrite):
                 logger.warning("%s", remark)
+            if close:
+                settled = partial(run, reals, imu=imu, truth=truth, settings=settings)
+                diagnosis = _closed(diagnosis, settled, sim, folder, metric, overwrite)
     if write_json(diagnosis.report, json_to, overwrite=overwrite):
         return
     _say(diagnosis, folder)
+
+
+def _closed(
+    first: Diagnosis, again: Callable[[Path], Diagnosis], sim: Path | None, folder: Path, metric: Path | None, overwrite: bool
+) -> Diagnosis:
+    """Diagnosis with the closed loop: its physics simulated along the given simulation, or along the recording's poses."""
+    from dataclasses import replace
+
+    from imutool import diagnosis_output
+    from imutool.diagnosis.closed_loop import LOG, closed_loop, script_metric
+    from imutool.sensor.simulate import simulate
+
+    real, log = Path(first.real[0]), folder / LOG
+    source = sim or real
+    simulate(source, log, physics=folder / diagnosis_output.EFFECT, overwrite=overwrite)
+    second = again(log)
+    figure = None if metric is None else script_metric(metric, real)
+    done = replace(first, closed=closed_loop(first, second, log, metric=figure, before=sim))
+    diagnosis_output.write_closed(done, second, folder)
+    return done
 
 
 def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
@@ -90,5 +128,43 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
         table(findings_table(diagnosis), keys=1)
     for line in [*below(diagnosis), *notes(diagnosis)]:
         say(line)
+    if diagnosis.closed is not None:
+        from imutool.diagnosis.closed_loop import table as closed_table
+
+        left = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
+        answer = f"{left} is still missing" if diagnosis.closed.mismatch else "nothing is missing"
+        say(f"Simulated again with physics.toml and diagnosed again: {answer}.")
+        table(closed_table(diagnosis.closed), keys=1)
     if folder is not None:
         say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")
+
+
+@app.command(epilog="Example: [bold]imutool audit sim.mcap --real real.mcap --noise adis16448[/]")
+def audit(
+    sim: Annotated[Path, typer.Argument(metavar="SIM", help="A simulation: a log with an IMU and the poses of its body.")],
+    real: Annotated[
+        Path | None, typer.Option(metavar="REAL", help="A recording of the sensor, for noise, digits, limits and lever arm.")
+    ] = None,
+    noise: Annotated[
+        str, typer.Option(metavar="NAME|FILE.toml", help="Its noise: adis16448, bmi160, or a TOML file.")
+    ] = "none",
+    imu: Imu = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find what a simulator's IMU does wrong by itself.
+
+    Gravity, frame, axes, transport term, point, timing, noise, digits and limits, each with its equation and the report of a
+    simulator that had it.
+    """
+    from imutool.diagnosis.audit.audit import audit as run
+    from imutool.diagnosis.audit.audit import lines
+
+    with progress("Auditing", verbose, quiet) as tell:
+        tell(0, 1, "reading")
+        report = run(sim, real, noise=noise, imu=imu)
+    if not write_json(report, json_to, overwrite=overwrite):
+        for line in lines(report):
+            say(with_flags(line))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.diagnosis import summarize
+from imutool.diagnosis.audit.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
@@ -81,11 +82,11 @@ def diagnose(
     logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     simulated = None if sim is None else read_log(sim, imu=imu)
-    sim_findings: tuple[Finding, ...] = ()
+    sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
+        another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
         sim_findings, simulated = diagnose([sim], imu=imu, settings=settings).findings, None
-    another = [ANOTHER_MOTION] if sim is not None and simulated is None else []
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
@@ -122,7 +123,7 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis))
     except ImutoolError as error:
         why = f"How much closer it comes is computed, not simulated again: {error}"
-        return replace(diagnosis, remarks=(*diagnosis.remarks, why))
+        return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64
 
 from imutool.location import Location
 from imutool.recording import Poses
-from imutool.report import Report, Section
+from imutool.report import UNSET, Report, Section, UnsetType
 from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
@@ -156,6 +156,30 @@ class Bias(Section, frozen=True):
     accel: tuple[float, ...] | None
 
 
+class Compared(Section, frozen=True):
+    """One figure before the physics was added, and after."""
+
+    figure: str
+    before: float
+    after: float
+    unit: str
+
+
+class ClosedLoop(Section, frozen=True):
+    """What is left when the physics that was found is simulated.
+
+    Attributes:
+        log: the new simulation.
+        mismatch: whether a second diagnosis still finds a difference; `findings` are its names.
+        compared: figures before and after: misfit by signal, band and time, integrated rotation and path, the user's metric.
+    """
+
+    log: str
+    mismatch: bool
+    findings: tuple[str, ...]
+    compared: tuple[Compared, ...]
+
+
 class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     """Findings of a diagnosis as JSON (`imutool.diagnosis/1`).
 
@@ -175,6 +199,7 @@ class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     unexplained: Mapping[str, Number | bool | dict[str, Number]]
     closer: Mapping[str, Closer]
     remarks: tuple[str, ...]
+    closed: ClosedLoop | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +250,7 @@ class Diagnosis:
     traces: tuple[Traces, ...] = ()
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
     caveat: str = ""
+    closed: ClosedLoop | None = None
 
     @classmethod
     def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:
@@ -253,6 +279,7 @@ class Diagnosis:
             unexplained=_unexplained(self.unexplained),
             closer=self.closer,
             remarks=self.remarks,
+            closed=UNSET if self.closed is None else self.closed,
         )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 
 from imutool.errors import DataError
 from imutool.recording import Imu
+from imutool.recording.sensor_delay import sensor_delay
 
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
@@ -62,11 +63,20 @@ def joined(
     t, knots = (rates.t_ns[inside] - start).astype(float), (forces.t_ns - start).astype(float)
     accel_there = np.stack([np.interp(t, knots, column) for column in forces.values.T], axis=1)
     rate_hz = [1e9 / float(np.median(np.diff(c.t_ns))) for c in (rates, forces)]
-    delay_ms = float(np.median(rates.t_ns[inside] - forces.t_ns[after[inside] - 1])) * 1e-6
     notes.append(
         f"{name}: gyro at {rate_hz[0]:.1f} Hz and accelerometer at {rate_hz[1]:.1f} Hz became one IMU on the gyro's stamps, "
-        f"the accelerometer interpolated; a gyro sample follows an accelerometer sample by {delay_ms:.2f} ms"
+        f"the accelerometer interpolated; {_delay_sentence(rates, forces)}"
     )
     if not inside.all():
         notes.append(f"{name}: {int((~inside).sum())} gyro samples have no accelerometer sample near them")
     return Imu(rates.t_ns[inside], rates.values[inside], accel_there), notes
+
+
+def _delay_sentence(rates: Cleaned, forces: Cleaned) -> str:
+    """Delay between the sensors, as the motion shows it."""
+    delay = sensor_delay(rates.t_ns, rates.values, forces.t_ns, forces.values)
+    if delay is None:
+        return "the motion does not show the delay between them"
+    side = "later" if delay.seconds > 0 else "earlier"
+    size = f"{abs(delay.seconds) * 1e3:.1f} ms {side} than the gyro's (standard deviation {delay.std_s * 1e3:.1f} ms)"
+    return f"by the motion the accelerometer's stamps are {size}, which is not corrected"

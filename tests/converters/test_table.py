@@ -221,3 +221,44 @@ def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
     recording = read(tmp_path / "out.mcap")
     assert len(recording.imu) == 5645
     assert list(recording.truths) == ["/ground_truth/pose"]
+
+
+def test_hdf5_of_ronin_gives_the_uncorrected_rates_and_an_estimate(convert, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs imutool[tables]")
+    seconds = 1000.0 + np.arange(COUNT) * 0.005
+    with h5py.File(tmp_path / "data.hdf5", "w") as file:
+        arrays = {"time": seconds, "gyro": GYRO + 1.0, "gyro_uncalib": GYRO, "acce": ACCEL, "linacce": ACCEL, "grav": ACCEL}
+        for name, values in arrays.items():
+            file[f"synced/{name}"] = values
+        file["pose/tango_pos"] = np.zeros((COUNT, 3))
+        file["pose/tango_ori"] = np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
+    done = convert(tmp_path / "data.hdf5", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    recording = read(tmp_path / "out.mcap", truth="/estimate/pose")
+    assert np.array_equal(recording.imu.gyro, GYRO)
+    assert np.array_equal(recording.imu.accel, ACCEL)
+    assert len(recording.truths["/estimate/pose"]) == COUNT
+    assert not read(tmp_path / "out.mcap").truths
+
+
+def test_messages_written_as_a_table_keep_the_names_of_their_fields(convert, tmp_path):
+    """Blackbird's layout: x, y, z repeat below angular_velocity and linear_acceleration."""
+    names = "rosbagTimestamp,header,seq,stamp,secs,nsecs,frame_id,orientation,x,y,z,w,orientation_covariance,"
+    names += "angular_velocity,x,y,z,angular_velocity_covariance,linear_acceleration,x,y,z,linear_acceleration_covariance"
+    rows = []
+    for n, (t, w, a) in enumerate(zip(T_NS.tolist(), GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        vectors = [f'"[0, 0]",,{v[0]!r},{v[1]!r},{v[2]!r}' for v in (w, a)]
+        rows.append(f'{t},,{n},,{t // 10**9},{t % 10**9},body,,0.0,0.0,0.0,1.0,{",".join(vectors)},"[0, 0]"')
+    (tmp_path / "imu.csv").write_text("\n".join([names, *rows]) + "\n")
+    done = convert(tmp_path / "imu.csv", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    same(tmp_path / "out.mcap")
+
+
+def test_rows_of_another_width_are_losses(convert, tmp_path):
+    path = write_csv(tmp_path / "log.csv", CERTAIN, arrays())
+    path.write_text(path.read_text() + "1,2,3\n")
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "1 rows do not have 7 fields and are left out" in done.stderr
+    same(tmp_path / "out.mcap")

@@ -1,4 +1,4 @@
-"""Blind cases of robots: an arm, a vehicle on wheels or in flight, with one effect, two, an unnamed one, or none."""
+"""Blind cases of robots: an arm, a vehicle on wheels, or one in flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vehicles for blind cases: one on two wheels, and one that flies with magnetometer, barometer, GNSS and a range."""
+"""Vehicles for blind cases: one on two wheels, and one that flies with four sensors."""
 
 from __future__ import annotations
 

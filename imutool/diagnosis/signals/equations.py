@@ -40,7 +40,7 @@ SCALED: Mapping[str, tuple[Form, str]] = {
 
 
 def channels(samples: SignalSamples, k: int) -> dict[str, Samples]:
-    """What a term may be made of: the state, or the ideal value, its rate and other channels, by name."""
+    """Channels of a term by name: the state, or the ideal value, its rate and others."""
     if "q0" in samples.state:
         named = {
             (kind, name.removeprefix(kind)): name for name in samples.state for kind in ("ddq", "dq", "q") if _is(name, kind)

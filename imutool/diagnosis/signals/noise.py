@@ -79,7 +79,7 @@ def _density(
 
 
 def rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]:
-    """Residual of a smooth function of signals, derivatives, state and time: noise, or what is sharp."""
+    """Residual of a smooth function of signal, state and time: noise, or what is sharp."""
     ideal, k = pair.ideal, np.arange(len(pair.ideal.fine))
     at = (pair.stamp_s - pair.lag_s - ideal.start_s) * ideal.rate_hz
     derivatives = [ideal.fine]

@@ -85,11 +85,7 @@ def page(logs: Sequence[RunData]) -> str:
 
 
 def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = False) -> None:
-    """Write the page.
-
-    Raises:
-        ConfigError: as `page`, or the file exists (without `overwrite`) or cannot be written.
-    """
+    """Write the page (ConfigError: as `page`, or the file exists or cannot be written)."""
     with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
         target.write(page(logs).encode())
 
@@ -129,11 +125,7 @@ def name_by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunDat
 
 
 def check_target(path: Location, *, overwrite: bool = False) -> None:
-    """Check before the work that a page can be written.
-
-    Raises:
-        ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
-    """
+    """Check before the work that a page can be written (ConfigError: no matplotlib, or a bad target)."""
     require_matplotlib()
     Target(path, overwrite=overwrite).abandon()
 

@@ -128,24 +128,28 @@ class _Finding(msgspec.Struct):
     driver: str = ""
 
 
-class _Diagnosis(msgspec.Struct):
-    schema: Literal["imutool.diagnosis/1"]
+class _Diagnosis(msgspec.Struct, tag_field="schema", tag=SCHEMA):
     real: list[str]
     located: list[_Located] = []
     findings: list[_Finding] = []
 
 
+class _Unit(msgspec.Struct, tag_field="schema", tag="imutool.unit/1"):
+    diagnosis: _Diagnosis | None = None
+
+
 def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[list[Event], list[str]]:
     """Events of the located findings of a log (by file name), and notes on the others.
 
-    Times of a place count from the start of its log, or of the first where it names none. What is located without a time acts
-    everywhere. Of a place with more stretches than are ever shown, the longest.
+    `folder` is of a diagnosis, or the file that a fleet's diagnosis writes for one log. Times of a place count from the start
+    of its log, or of the first where it names none. What is located without a time acts everywhere. Of a place with more
+    stretches than are ever shown, the longest.
 
     Raises:
         ConfigError: the folder holds no diagnosis, or it cannot be read.
         DataError: its findings.json is not one.
     """
-    diagnosis = _read(folder / FINDINGS)
+    diagnosis = _read(folder if folder.is_file() else folder / FINDINGS)
     first = diagnosis.real[0] if diagnosis.real else "no log"
     here = [place for place in diagnosis.located if Path(place.log or first).name == log]
     if Path(first).name != log and not here:
@@ -190,6 +194,7 @@ def _read(path: Path) -> _Diagnosis:
     if len(raw) > MAX_BYTES:
         raise DataError(f"is longer than {MAX_BYTES} bytes", where=path, expected="the findings of one diagnosis")
     try:
-        return msgspec.json.decode(raw, type=_Diagnosis)
+        report = msgspec.json.decode(raw, type=_Diagnosis | _Unit)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"is no diagnosis ({error})", where=path, expected=f"JSON of {SCHEMA}") from error
+    return report if isinstance(report, _Diagnosis) else report.diagnosis or _Diagnosis([])

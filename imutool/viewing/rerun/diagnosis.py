@@ -36,11 +36,7 @@ UNSEEN_TEXTS = ("unseen by any fit from here", "seen again from here")
 
 
 def save(d: Diagnosis, path: Path, *, overwrite: bool = False) -> None:
-    """Write the .rrd file.
-
-    Raises:
-        ConfigError: Rerun is not installed, or the file exists (without `overwrite`) or cannot be written.
-    """
+    """Write the .rrd file (ConfigError: no Rerun, or the file exists or cannot be written)."""
     with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
         target.write(rrd(d))
 

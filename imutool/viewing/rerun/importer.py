@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 if TYPE_CHECKING:
+    from imutool.location import Location
     from imutool.mcap_io.log import Log
     from imutool.viewing.model.run_data import RunData
 
@@ -64,7 +65,7 @@ def rrd(path: Path, target: Target | None = None) -> bytes | None:
         ConfigError: Rerun is not installed, or the file cannot be opened.
         LogError, DataError: nothing in the log is sound, or its IMU has fewer than two samples.
     """
-    data = _load(path)
+    data = load_first_imu(path)
     if data is None:
         return None
     from imutool.viewing.rerun import layout, scene, sdk
@@ -89,8 +90,12 @@ def _is_mcap(path: Path) -> bool:
         return False
 
 
-def _load(path: Path) -> RunData | None:
-    """Data of the first IMU of a log; None without an IMU."""
+def load_first_imu(path: Location, findings: Path | None = None) -> RunData | None:
+    """Data of the first IMU of a log, with the events of a diagnosis in `findings`; None without an IMU.
+
+    Raises:
+        ConfigError, LogError, DataError: as `imutool.viewing.model.runs.load`.
+    """
     from imutool.errors import LogError
     from imutool.mcap_io.log import Log
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
@@ -105,7 +110,7 @@ def _load(path: Path) -> RunData | None:
         return None
     from imutool.viewing.model.runs import load
 
-    return load(path, models=() if model is None else [model], imu=imu)
+    return load(path, models=() if model is None else [model], imu=imu, findings=findings)
 
 
 def _imu_and_model(log: Log) -> tuple[str | None, str | None]:
@@ -119,8 +124,7 @@ def _imu_and_model(log: Log) -> tuple[str | None, str | None]:
     imu = log.imu_topics[0]
     if any(topic.metadata.get(DERIVED_KEY) == imu for topic in log.with_schema((schemas.IMU,))):
         return imu, None
-    about = dict(log.metadata_records()).get(METADATA, {})
-    return imu, shipped_for(about.get("sensor"), about.get("dataset"))
+    return imu, next(iter(shipped_for(dict(log.metadata_records()).get(METADATA, {}))), None)
 
 
 if __name__ == "__main__":

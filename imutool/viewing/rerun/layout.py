@@ -53,6 +53,45 @@ def live_blueprint(scopes: Mapping[str, Scope], boxes: Mapping[str, Box] | None 
     return plots.frame(views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0))
 
 
+def fleet_blueprint() -> rrb.Blueprint:
+    """Layout for any log of a fleet: paths and errors beside tabs of signals, biases, events and reports."""
+    import rerun.blueprint as rrb
+
+    paths = rrb.Spatial3DView(
+        origin="/world",
+        contents=["/world/gt/**", "/world/debiased/**"],  # raw leaves for kilometres
+        name="Paths",
+        background=BACKGROUND,
+        time_ranges=plots.visible_until_cursor(),
+    )
+    titles = {kind: f"{kind.capitalize()} error ({errors.UNITS[kind]})" for kind in errors.KINDS}
+    own = [plot([f"/error/{kind}/debiased"], title, "debiased", legend=False) for kind, title in titles.items()]
+    both = [
+        plot([f"/error/{kind}/{role}" for role in ("raw", "debiased")], title, "raw orange, debiased blue")
+        for kind, title in titles.items()
+    ]
+    axes = "x red, y green, z blue"
+    signals = [
+        plot([f"/imu/{kind}/{role}" for role in ("raw", "debiased")], title, f"{axes}; debiased bold, raw pale")
+        for kind, title in tabs.TITLES.items()
+    ]
+    biases = [
+        plot([f"/bias/{kind}/{of}" for of in ("sigma", "estimated", "true")], title, f"{axes}; ±3σ thin")
+        for kind, title in tabs.BIAS_TITLES.items()
+    ]
+    lanes = rrb.StateTimelineView(origin="/events", name="When", time_view=plots.whole_time_axis())
+    right = rrb.Tabs(
+        rrb.Vertical(*signals, name="Signals"),
+        rrb.Vertical(*biases, name="Bias"),
+        rrb.Vertical(*both, name="Errors"),
+        rrb.Vertical(lanes, rrb.TextLogView(origin="/events", name="What"), name="Events"),
+        *(rrb.TextDocumentView(origin=f"/{name}", name=name.capitalize()) for name in ("report", "diagnosis")),
+        active_tab=0,
+    )
+    left = rrb.Vertical(paths, *own, row_shares=[ROW_SHARES["paths"], *[ROW_SHARES["error"]] * len(own)])
+    return plots.frame(rrb.Horizontal(left, right, column_shares=[1, 1]), recordings="expanded")
+
+
 def _log_view(data: RunData, scope: Scope, source: bool) -> rrb.Horizontal:
     """One log: paths and total errors on the left, tabs on the right."""
     import rerun.blueprint as rrb

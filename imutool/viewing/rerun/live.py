@@ -57,6 +57,7 @@ def live_view(
             cannot be written.
     """
     require_rerun()
+    layout.live_blueprint({name: ()})  # the first layout takes 0.3 s, in which a stream of samples would have to wait
     live = Live(name)
     if connect_to is not None:
         peer = connect.probe(connect_to)

@@ -22,13 +22,17 @@ LIMIT_FACTOR = 2.0  # axis limit over the models' largest error, rounded up, whe
 CAMERA_OFFSET = np.array([-0.7, -0.7, 0.5])  # camera position from the centre of the scene, in scene diagonals
 
 
-def frame(content: Any, play_state: Literal["following"] | None = "following") -> rrb.Blueprint:
-    """Blueprint around views and containers: side panels collapsed, `elapsed` as the timeline."""
+def frame(
+    content: Any,
+    play_state: Literal["following"] | None = "following",
+    recordings: Literal["collapsed", "expanded"] = "collapsed",
+) -> rrb.Blueprint:
+    """Blueprint around views and containers: `elapsed` as the timeline, the list of recordings on the left, all else folded."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(
         content,
-        rrb.BlueprintPanel(state="collapsed"),
+        rrb.BlueprintPanel(state=recordings),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=ELAPSED, play_state=play_state),
         auto_layout=False,

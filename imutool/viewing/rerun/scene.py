@@ -40,11 +40,7 @@ def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True,
 
 
 def send(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True) -> None:
-    """Send the layout, then log all entities.
-
-    Raises:
-        ConfigError: Rerun is not installed.
-    """
+    """Send the layout, then log all entities (ConfigError: Rerun is not installed)."""
     to.send_blueprint(layout.blueprint(logs, source=source))
     log(logs, to, source=source)
 

@@ -46,14 +46,32 @@ def site(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = N
     Raises:
         ConfigError: no log, Rerun is not installed, or its program does not run.
     """
+    files = _page(recording_name(logs), RECORDING, "" if at_s is None else str(nanoseconds(at_s)))
+    return {**files, RECORDING: rrd(logs, source=source)}
+
+
+def catalog_site(title: str, urls: Sequence[str], origin: str) -> dict[str, bytes]:
+    """Files of a web page that shows segments of a catalog on this machine, which listens at `origin`.
+
+    Raises:
+        ConfigError: Rerun is not installed, or its program does not run.
+    """
+    return _page(title, " ".join(urls), policy=policy_with(origin))
+
+
+def policy_with(origin: str) -> str:
+    """Policy of a page that may also ask a catalog at `origin`."""
+    return POLICY.replace("connect-src 'self'", f"connect-src 'self' {origin}")
+
+
+def _page(title: str, recordings: str, at_ns: str = "", policy: str = POLICY) -> dict[str, bytes]:
+    """Page and viewer, for recordings separated by spaces."""
     require_rerun()
     folder = Path(__file__).parent / "site"
-    values = {"$POLICY": POLICY, "$TITLE": recording_name(logs), "$RECORDING": RECORDING}
-    values["$AT_NS"] = "" if at_s is None else str(nanoseconds(at_s))
     page = (folder / PAGE).read_text(encoding="utf-8")
-    for name, value in values.items():
+    for name, value in {"$POLICY": policy, "$TITLE": title, "$RECORDING": recordings, "$AT_NS": at_ns}.items():
         page = page.replace(name, html.escape(value))
-    return {PAGE: page.encode(), START: (folder / START).read_bytes(), **viewer_files(), RECORDING: rrd(logs, source=source)}
+    return {PAGE: page.encode(), START: (folder / START).read_bytes(), **viewer_files()}
 
 
 def viewer_files() -> dict[str, bytes]:
@@ -87,6 +105,7 @@ class Server:
 
     def __init__(self, port: int | None = None) -> None:
         self._files: Mapping[str, bytes] = {}
+        self.policy = POLICY
         handler = _handler(self)
         self.moved = ""
         try:
@@ -147,7 +166,7 @@ def _handler(server: Server) -> type[http.server.BaseHTTPRequestHandler]:
             self.send_response(200 if content is not None else 404)
             self.send_header("Content-Length", str(len(content or b"")))
             self.send_header("Content-Type", TYPES[Path(name or PAGE).suffix] if content is not None else "text/plain")
-            self.send_header("Content-Security-Policy", POLICY)
+            self.send_header("Content-Security-Policy", server.policy)
             self.send_header("X-Content-Type-Options", "nosniff")
             self.send_header("Cross-Origin-Resource-Policy", "same-origin")
             self.send_header("Cache-Control", "no-store")

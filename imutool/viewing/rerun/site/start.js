@@ -58,7 +58,7 @@ async function start() {
   const asked = new URLSearchParams(location.search);
   await wasm_bindgen({ module_or_path: "re_viewer_bg.wasm" });
   const handle = new wasm_bindgen.WebHandle({
-    url: [new URL(canvas.dataset.recording, document.baseURI).href],
+    url: canvas.dataset.recording.split(" ").map((url) => new URL(url, document.baseURI).href),
     hide_welcome_screen: true,
     enable_history: false,
     notebook: false,

@@ -1,0 +1,267 @@
+"""Folder or zip with a table for each sensor: Sensor Logger, phyphox, KITTI raw OXTS.
+
+Sensor Logger and phyphox record an accelerometer with gravity, or acceleration and gravity apart, in tables of their own. The
+layouts are those of github.com/tszheichoi/awesome-sensor-logger (UNITS.md, COORDINATES.md) and of phyphox's export. OXTS lies
+in `oxts/data/*.txt`, 30 numbers a file, as the development kit of KITTI raw describes them.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.errors import DataError
+from imutool.geometry import quaternion
+from imutool.recording import Imu, Poses, Scalars
+from imutool.recording.message_log import MessageLog, Remarks
+from imutool.recording.two_sensors import in_order, joined
+
+from . import Sequence
+from ._archive import is_zip, list_members, read_bounded, refusing
+from ._files import find_folders, name
+from ._table_files import Columns, read_csv
+from ._table_map import STANDARD_GRAVITY, split_name
+
+GENERAL = True
+IMU_TOPIC = "/imu0"
+GYRO = "gyroscope", "gyroscopeuncalibrated"  # tables by falling preference, names without spaces in lower case
+ACCEL = "totalacceleration", "accelerometeruncalibrated"
+OXTS = re.compile(r"(.*/)?oxts/data/\d+\.txt")
+OXTS_TIMES = "oxts/timestamps.txt"
+EARTH_M = 6_378_137.0
+NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+LEAST_GRAVITY, MOST_IN_G = 0.5, 2.0  # median lengths, in m/s² of nothing but motion, and of readings in g
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Text files of a folder or zip, by their names."""
+
+    names: list[str]
+    load: Callable[[str], bytes]
+
+    def text(self, wanted: str) -> str:
+        """Content of a file."""
+        return self.load(wanted).decode("utf-8-sig", "replace")
+
+    def tables(self) -> dict[str, str]:
+        """Files of sensors by their plain names: `linearaccelerometer` for `Linear Accelerometer.csv`."""
+        found = {}
+        for path in sorted(self.names):
+            folder, _, file = path.rpartition("/")
+            if file.lower().endswith(".csv") and folder.rpartition("/")[2] != "meta":
+                found[re.sub(r"[^a-z]", "", file[:-4].lower())] = path
+        return found
+
+
+def sequences(source: Path) -> list[Sequence]:
+    """The zip, or the folders, with tables of a gyroscope and an accelerometer, or with OXTS."""
+    if source.is_file() and is_zip(source):
+        return [Sequence(name(source), source)] if zipfile.is_zipfile(source) and _is_mine(source) else []
+    return find_folders(source, _is_mine)
+
+
+def recognises(sequence: Sequence) -> bool:
+    """Whether a sequence has such tables: always, as only these are listed."""
+    return True
+
+
+def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
+    """Message log of the tables.
+
+    Raises:
+        DataError: a table is damaged, or the acceleration has no gravity in it.
+    """
+    files, remarks = _files(sequence.path), Remarks()
+    is_oxts = any(map(OXTS.fullmatch, files.names))
+    imu, poses, scalars = (_oxts if is_oxts else _phone)(files, sequence.path, remarks)
+    return MessageLog(
+        sequence.name,
+        sequence.path.name,
+        imus={IMU_TOPIC: imu},
+        poses=poses,
+        kinds=dict.fromkeys(poses, "estimate"),
+        scalars=scalars,
+        metadata={"imutool": {"format": "sensor_tables", "sequence": sequence.name}},
+        remarks=remarks,
+    )
+
+
+def read(source: Path) -> Iterator[MessageLog]:
+    """Message logs of all sequences of the source, one after the other."""
+    return map(read_sequence, sequences(source))
+
+
+def _is_mine(path: Path) -> bool:
+    files = _files(path)
+    tables = files.tables()
+    return any(map(OXTS.fullmatch, files.names)) or (
+        any(table in tables for table in GYRO) and any(table in tables for table in (*ACCEL, "accelerometer"))
+    )
+
+
+def _files(path: Path) -> _Files:
+    """Files of a zip, or of a folder, in which KITTI's lie two levels deeper."""
+    if path.is_file():
+        return _Files([*list_members(path).sizes], partial(_member, path))
+    found = [*path.glob("*.csv"), *path.glob("meta/*.csv"), *path.glob("oxts/*.txt"), *path.glob("oxts/data/*.txt")]
+    return _Files([file.relative_to(path).as_posix() for file in found], lambda wanted: (path / wanted).read_bytes())
+
+
+def _member(path: Path, wanted: str) -> bytes:
+    with refusing(path), zipfile.ZipFile(path) as archive, archive.open(wanted) as file:
+        return read_bounded(file.read, f"{path}/{wanted}", wanted)
+
+
+def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str, Poses], dict[str, Scalars]]:
+    """IMU and further sensors of a phone."""
+    tables = files.tables()
+    clock = _clock(files)
+    gyro_table = next(table for table in GYRO if table in tables)
+    gyro_ns, gyro = _vector(files, tables[gyro_table], clock, where, remarks)
+    accel_ns, accel, used = _acceleration(files, tables, clock, where, remarks)
+    level = float(np.median(np.linalg.norm(accel, axis=1)))
+    if LEAST_GRAVITY < level < MOST_IN_G:
+        accel = accel * STANDARD_GRAVITY
+        remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
+    elif level <= LEAST_GRAVITY:
+        fix = "Record the acceleration with gravity, or gravity too"
+        raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=fix)
+    if _is_ios(files):
+        accel = -accel
+        remarks.notes.append("the phone is of Apple, whose accelerometer reads -g upwards: its sign was turned")
+    remarks.notes.append(f"gyro from {tables[gyro_table]}, accel from {' + '.join(tables[table] for table in used)}")
+    imu, notes = joined(gyro_ns, gyro, accel_ns, accel, IMU_TOPIC)
+    remarks.notes.extend(notes)
+    scalars: dict[str, Scalars] = {}
+    for table, path in tables.items():
+        if table not in (gyro_table, *used):
+            scalars |= _others(files, path, clock, where, remarks)
+    return imu, {}, scalars
+
+
+def _acceleration(
+    files: _Files, tables: Mapping[str, str], clock: list[tuple[float, int]], where: Path, remarks: Remarks
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], tuple[str, ...]]:
+    """Acceleration with gravity, and the tables it is from."""
+    for table in ACCEL:
+        if table in tables:
+            return *_vector(files, tables[table], clock, where, remarks), (table,)
+    t_ns, accel = _vector(files, tables["accelerometer"], clock, where, remarks)
+    if "gravity" not in tables:
+        return t_ns, accel, ("accelerometer",)
+    other_ns, gravity = _vector(files, tables["gravity"], clock, where, remarks)
+    start = t_ns[0]
+    t, knots = (t_ns - start).astype(float), (other_ns - start).astype(float)
+    whole = accel + np.stack([np.interp(t, knots, column) for column in gravity.T], axis=1)
+    return t_ns, whole, ("accelerometer", "gravity")
+
+
+def _is_ios(files: _Files) -> bool:
+    """Whether Sensor Logger recorded on iOS without standardised frames."""
+    path = files.tables().get("metadata")
+    if path is None:
+        return False
+    names, _, values = files.text(path).strip().partition("\n")
+    stated = dict(zip(names.strip().split(","), values.split(","), strict=False))
+    return stated.get("platform", "").lower() == "ios" and stated.get("standardisation", "").lower() != "true"
+
+
+def _clock(files: _Files) -> list[tuple[float, int]]:
+    """Experiment times (s) at which phyphox started, with the system time (ns) of each."""
+    path = next((path for path in files.names if path.endswith("meta/time.csv")), None)
+    rows = [] if path is None else [row.replace('"', "").split(",") for row in files.text(path).splitlines()]
+    return [(float(row[1]), round(float(row[2]) * 1e9)) for row in rows if row[0] == "START" and len(row) > 2]
+
+
+def _columns(
+    files: _Files, path: str, clock: list[tuple[float, int]], where: Path, remarks: Remarks
+) -> tuple[Int64[np.ndarray, " n"], dict[str, tuple[Float64[np.ndarray, " n"], str]]]:
+    """Times of a table, and its other columns with their units, by plain names."""
+    columns = Columns(remarks=remarks)
+    read_csv(files.text(path), columns, Path(f"{where}/{path}"))
+    named = {split_name(column): column for column in columns.values}
+    times = next((key for key in named if key[0] == "time"), None)
+    if times is None:
+        raise DataError("has no column `time`", where=f"{where}/{path}", expected=f"one of {', '.join(columns.values)}")
+    t = columns.values[named[times]]
+    if times[1]:
+        t_ns = np.rint(t.astype(float) * NS[times[1]]).astype(np.int64)
+        for start, system_ns in clock:
+            later = t >= start
+            t_ns[later] = system_ns + np.rint((t[later] - start) * 1e9).astype(np.int64)
+    else:
+        t_ns = t.astype(np.int64)
+    rest = {key: column for key, column in named.items() if key[0] not in ("time", "seconds_elapsed")}
+    return t_ns, {key[0]: (columns.values[column].astype(float), key[1]) for key, column in rest.items()}
+
+
+def _vector(
+    files: _Files, path: str, clock: list[tuple[float, int]], where: Path, remarks: Remarks
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Times and x, y, z of a sensor."""
+    t_ns, columns = _columns(files, path, clock, where, remarks)
+    axes = [[values for key, (values, _) in columns.items() if re.fullmatch(rf"(.*_)?{axis}", key)] for axis in "xyz"]
+    if any(len(found) != 1 for found in axes):
+        raise DataError("has no three columns x, y, z", where=f"{where}/{path}", expected=", ".join(columns))
+    kept = in_order(t_ns, np.stack([found[0] for found in axes], axis=1), path)
+    remarks.notes.extend(kept.notes)
+    return kept.t_ns, kept.values
+
+
+def _others(files: _Files, path: str, clock: list[tuple[float, int]], where: Path, remarks: Remarks) -> dict[str, Scalars]:
+    """Columns of a further sensor; a table without numbers or time is a loss."""
+    folder = re.sub(r"[^A-Za-z0-9_]+", "_", Path(path).stem).strip("_")
+    try:
+        t_ns, columns = _columns(files, path, clock, where, Remarks())
+    except DataError as error:
+        if folder.lower() != "metadata":
+            remarks.losses.append(f"{path} is left out: it {error.what}")
+        return {}
+    scalars = {}
+    for key, (values, unit) in columns.items():
+        kept = in_order(t_ns, values[:, None], path)
+        if len(kept.t_ns):
+            scalars[f"/{folder}/{key}"] = Scalars(kept.t_ns, kept.values, unit)
+    return scalars
+
+
+def _oxts(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str, Poses], dict[str, Scalars]]:
+    """IMU of OXTS in the axes of the car (x forward, y left, z up), and its poses by GNSS and INS: east, north, up."""
+    times = next((path for path in files.names if path.endswith(OXTS_TIMES)), None)
+    if times is None:
+        raise DataError("is missing", where=f"{where}/{OXTS_TIMES}", expected="a time for each file of OXTS")
+    texts = [line.strip() for line in files.text(times).splitlines() if line.strip()]
+    paths = sorted(path for path in files.names if OXTS.fullmatch(path))
+    rows = [files.text(path).split() for path in paths]
+    if len(texts) != len(rows) or any(len(row) < 23 for row in rows):
+        raise DataError(f"has {len(texts)} times and {len(rows)} files", where=where, expected="as many, of 30 numbers each")
+    try:
+        t_ns = np.array([text.replace(" ", "T") for text in texts], "datetime64[ns]").astype(np.int64)
+        values = np.array([row[:23] for row in rows], np.float64)
+    except ValueError as error:
+        raise DataError(f"holds no numbers ({error})", where=where) from error
+    kept = in_order(t_ns, values, times)
+    remarks.notes.extend(kept.notes)
+    values = kept.values
+    latitude, longitude = np.deg2rad(values[:, 0]), np.deg2rad(values[:, 1])
+    scale = EARTH_M * np.cos(latitude[0])
+    east, north = scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2))
+    p = np.stack([east - east[0], north - north[0], values[:, 2] - values[0, 2]], axis=1)
+    poses = Poses(kept.t_ns, p, _from_roll_pitch_yaw(values[:, 3:6]))
+    remarks.notes.append("/oxts/pose is an estimate of GNSS and this IMU")
+    return Imu(kept.t_ns, values[:, 17:20], values[:, 11:14]), {"/oxts/pose": poses}, {}
+
+
+def _from_roll_pitch_yaw(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of Rz(yaw) Ry(pitch) Rx(roll)."""
+    from scipy.spatial.transform import Rotation
+
+    return quaternion.unit(Rotation.from_euler("ZYX", angles[:, ::-1]).as_quat()[:, [3, 0, 1, 2]])

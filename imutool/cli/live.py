@@ -1,0 +1,105 @@
+"""`imutool live`."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from imutool.cli.app import RRD, Imu, Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.terminal import err, log_to_stderr, plain, say, tell_warning, write_json
+from imutool.report import Report
+from imutool.viewing import Output
+from imutool.viewing.stream.session import StreamStatistics
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imutool.viewing.rerun.live import Live
+    from imutool.viewing.stream.sources import Sample
+
+FROM_HELP = "A log at its own speed, stdin (JSON lines), udp://HOST:PORT, or rosbridge://HOST:PORT/TOPIC."
+MODEL_HELP = "Model file, a name that ships, or static: the bias at rest in the first two seconds."
+
+
+class LiveReport(Report, frozen=True, tag="imutool.live/1"):
+    """Report of `imutool live`: source, model, statistics of the stream, and outputs."""
+
+    source: str
+    model: str
+    stream: StreamStatistics
+    shown: list[Output]
+
+
+@app.command(epilog="Example: [bold]imutool live --from udp://127.0.0.1:5005 --model m.safetensors[/]")
+def live(
+    source: Annotated[str, typer.Option("--from", metavar="SOURCE", help=FROM_HELP, show_default=False)],
+    model: Annotated[str, typer.Option(help=MODEL_HELP)] = "static",
+    imu: Imu = None,
+    speed: Annotated[float, typer.Option(min=0.01, help="Speed of a log, times its own.")] = 1.0,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="End after this time; else at the end or at Ctrl-C.")] = None,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help="Show in a running viewer: HOST:PORT.")] = None,
+    save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save what is shown to a file."), RRD] = None,
+    no_view: Annotated[bool, typer.Option("--no-view", help="Show nothing; with --print, for another program.")] = False,
+    to_stdout: Annotated[bool, typer.Option("--print", help="Print each debiased sample as a line of JSON.")] = False,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Debias a stream of samples as it comes, show it, and measure the delay.
+
+    A sample is a line of JSON: t_ns (or t_s), gyro in rad/s, accel in m/s², each of three numbers.
+    """
+    from imutool.api.models import load_model
+    from imutool.viewing.stream.session import run
+    from imutool.viewing.stream.sources import Malformed, open_source
+
+    log_to_stderr(verbose, quiet)
+    malformed = Malformed()
+    found = load_model(model)
+    samples = open_source(source, malformed, imu=imu, speed=speed)
+    with _view(source, connect, save, overwrite) if not no_view else nullcontext() as show:
+        stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds)
+    shown = [] if show is None else show.shown
+    if malformed.count:
+        tell_warning(f"{malformed.count} messages hold no sample, the first: {malformed.first}")
+    if not write_json(LiveReport(source, model, stream, shown), json_to, overwrite=overwrite):
+        for line in _lines(stream, shown):
+            err.print(plain(line), highlight=False, soft_wrap=True) if to_stdout else say(line)
+
+
+def _view(source: str, connect: str | None, save: Path | None, overwrite: bool) -> AbstractContextManager[Live]:
+    from imutool.viewing.rerun.live import live_view
+
+    return live_view("live", connect_to=connect, save=save, instead=Path("live.rrd"), overwrite=overwrite)
+
+
+def _print(found: Sample, rate: np.ndarray, force: np.ndarray) -> None:
+    """Print one debiased sample."""
+    line = {"t_ns": found.stamp_ns, "gyro": rate.tolist(), "accel": force.tolist()}
+    sys.stdout.write(f"{msgspec.json.encode(line).decode()}\n")
+    sys.stdout.flush()
+
+
+def _lines(stream: StreamStatistics, shown: list[Output]) -> list[str]:
+    """Summary of a stream."""
+    lines = [f"{stream.samples} samples in {stream.seconds:.1f} s ({stream.rate_hz:.0f} Hz); start: {stream.start}"]
+    if stream.delay_ms is not None:
+        delay = stream.delay_ms
+        lines.append(
+            f"delay from arrival to the corrected sample: {delay.median:.2f} ms, 99 % within {delay.p99:.2f} ms, "
+            f"at most {delay.max:.2f} ms"
+        )
+    counts = {
+        "gaps": stream.gaps,
+        "samples out of order": stream.out_of_order,
+        "samples without a measurement": stream.not_measured,
+    }
+    counts["samples not shown, because the viewer did not keep up"] = stream.not_shown
+    lines += [", ".join(f"{count} {what}" for what, count in counts.items() if count)] if any(counts.values()) else []
+    return [*lines, *(output.said for output in shown)]

@@ -1,0 +1,1 @@
+"""Audit of a simulator's IMU: what it does wrong by itself."""

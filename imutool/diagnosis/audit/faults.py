@@ -1,0 +1,127 @@
+"""Faults of simulated IMUs: equation, sentence, and the report of a simulator that had it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from imutool.diagnosis.result import Estimate
+from imutool.report import Section
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Fault of a simulator: what it does, as an equation, and where it was reported."""
+
+    sentence: str
+    equation: str
+    source: str
+
+
+GITHUB = "https://github.com"
+FAULTS: Mapping[str, Fault] = {
+    "coordinate_acceleration": Fault(
+        "reads the acceleration without gravity, not the specific force",
+        "accel = R_wb^T a_w",
+        f"{GITHUB}/ros-simulation/gazebo_ros_pkgs/issues/468",
+    ),
+    "gravity_doubled": Fault(
+        "holds gravity twice", "accel = R_wb^T (a_w - 2 g_w)", f"{GITHUB}/cra-ros-pkg/robot_localization/pull/946"
+    ),
+    "gravity_sign": Fault(
+        "holds gravity with the wrong sign: at rest it reads g down",
+        "accel = R_wb^T (a_w + g_w)",
+        f"{GITHUB}/Field-Robotics-Japan/UnitySensors/issues/116",
+    ),
+    "gravity_only": Fault(
+        "holds gravity alone, no acceleration", "accel = -R_wb^T g_w", f"{GITHUB}/gazebosim/gz-sim/issues/2974"
+    ),
+    "transport_term": Fault(
+        "is the derivative of the velocity in the body frame, without the transport term omega x v",
+        "accel = d(R_wb^T v_w)/dt - R_wb^T g_w",
+        f"{GITHUB}/isaac-sim/IsaacSim/issues/735",
+    ),
+    "lever_arm": Fault(
+        "is that of another point than the one of the poses",
+        "accel += alpha x r + omega x (omega x r)",
+        f"{GITHUB}/isaac-sim/IsaacSim/issues/825",
+    ),
+    "body_centre": Fault(
+        "is that of the body's centre; the recording's sensor sits off it",
+        "accel lacks alpha x r + omega x (omega x r)",
+        f"{GITHUB}/isaac-sim/IsaacLab/pull/619",
+    ),
+    "backward_difference": Fault(
+        "is a backward difference, half a step late",
+        "x(t) = (y(t) - y(t - T)) / T, late by T / 2",
+        f"{GITHUB}/ethz-asl/rotors_simulator/pull/272",
+    ),
+    "step_delay": Fault("comes one step late", "x(t) = x_true(t - T)", f"{GITHUB}/PegasusSimulator/PegasusSimulator/pull/147"),
+    "early_stamps": Fault(
+        "is stamped one step early: with the beginning of the step at whose end it was read",
+        "x(t) = x_true(t + T)",
+        f"{GITHUB}/gazebosim/gazebo-classic/issues/600",
+    ),
+    "world_frame": Fault(
+        "is given in the world frame, not the body's", "x = R_wb x_body", f"{GITHUB}/carla-simulator/carla/pull/2998"
+    ),
+    "left_handed": Fault(
+        "has left-handed axes", "x = P x_body, P a signed permutation, det P < 0", f"{GITHUB}/carla-simulator/carla/issues/4008"
+    ),
+    "permuted_axes": Fault(
+        "has permuted axes",
+        "x = P x_body, P a signed permutation, det P > 0",
+        f"{GITHUB}/fsstudio-team/ZeroSimROSUnity/issues/9",
+    ),
+    "noise_absent": Fault("has no noise", "x = x_true", f"{GITHUB}/PX4/PX4-gazebo-models/pull/33"),
+    "noise_per_sample": Fault(
+        "has the noise of a sample at another rate: its density changed with the rate",
+        "std of a sample = density sqrt(rate)",
+        f"{GITHUB}/microsoft/AirSim/issues/3498",
+    ),
+    "noise_density": Fault(
+        "has another noise density", "density = std of a sample / sqrt(rate)", f"{GITHUB}/PX4/PX4-gazebo-models/pull/81"
+    ),
+    "bias_never_walks": Fault(
+        "has a bias that never walks", "db = walk sqrt(dt) n", f"{GITHUB}/Aceinna/gnss-ins-sim/issues/23"
+    ),
+    "clipping_absent": Fault(
+        "is not clipped at the sensor's limit", "x = min(max(x, -L), L)", f"{GITHUB}/gazebosim/gz-sensors/issues/7"
+    ),
+    "digits_absent": Fault("has no digits", "x = LSB round(x / LSB)", f"{GITHUB}/gazebosim/gz-sensors/issues/7"),
+    "bandwidth_absent": Fault(
+        "has white noise where the sensor's falls with frequency", "x = low-pass(x)", f"{GITHUB}/gazebosim/gz-sensors/issues/7"
+    ),
+    "step_lines": Fault(
+        "shows the physics step as lines in its spectrum",
+        "x += A sin(2 pi f t), f the physics rate or its alias",
+        f"{GITHUB}/gazebosim/gazebo-classic/issues/666",
+    ),
+    "repeated_samples": Fault(
+        "repeats samples: the physics step is longer than the sample period",
+        "x(t) = x(t - T)",
+        f"{GITHUB}/isaac-sim/IsaacLab/issues/7163",
+    ),
+}
+
+
+class FaultFound(Section, frozen=True):
+    """Fault of a simulator in one signal, with its numbers."""
+
+    fault: str
+    signal: str
+    parameters: Mapping[str, Estimate]
+    equation: str
+    source: str
+
+    @property
+    def sentence(self) -> str:
+        """`The accel reads ...`."""
+        both = self.signal == "both"
+        text = FAULTS[self.fault].sentence
+        return f"{'Each of gyro and accel' if both else f'The {self.signal}'} {text}"
+
+
+def found(fault: str, signal: str, **parameters: Estimate) -> FaultFound:
+    """Fault with its equation and source."""
+    return FaultFound(fault, signal, parameters, FAULTS[fault].equation, FAULTS[fault].source)

@@ -1,0 +1,258 @@
+"""Kinematic faults of a simulated IMU: gravity, frame, axes, transport term, point, timing.
+
+The samples are compared with the motion of the simulation's own poses. First the frame (body or world) and the axes (48 signed
+permutations P) of each sensor are chosen by least squares. Then the parts of the specific force are weighed, m and k and c
+being 1, 1 and 0 in a right simulation::
+
+    accel = P (m R^T a_w - k R^T g_w - c omega x v + alpha x r + omega x (omega x r) - tau_a R^T j_w + tau_f omega x f) + b
+    gyro = P (omega - tau_g alpha) + b
+
+tau_a delays the acceleration alone (a difference of velocities), tau_f the attitude in which it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.result import Estimate
+from imutool.errors import DataError
+from imutool.inertial.kinematics import G_W
+from imutool.recording import Recording
+from imutool.sensor.trajectory import smooth_motion
+from imutool.units import AXES
+
+Vectors = Float64[np.ndarray, "n 3"]
+Matrix = Float64[np.ndarray, "3 3"]
+JERK_S = 1e-3  # half of the step of a central difference
+BLOCK_S = 2.0  # of the robust covariance
+MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
+CLEARLY = 0.5  # of the squares of the body frame and its axes, up to which others are chosen
+ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
+CERTAIN = 6.0  # standard deviations
+NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
+LEAST_DELAY = 0.05  # of a sample period: less is rounding
+PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
+LEAST_ARM_M = 5e-3
+LEAST_S = 5.0
+NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """Samples of a log beside the motion of its poses, one row each; world vectors end in _w."""
+
+    t_s: Float64[np.ndarray, " n"]
+    gyro: Vectors
+    accel: Vectors
+    R_wb: Float64[np.ndarray, "n 3 3"]
+    omega: Vectors
+    alpha: Vectors
+    v_w: Vectors
+    a_w: Vectors
+    j_w: Vectors
+    period_s: float
+
+    def to_body(self, x_w: Vectors) -> Vectors:
+        """World vectors in the body frame."""
+        return np.asarray(np.einsum("nji,nj->ni", self.R_wb, x_w))
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicFit:
+    """Fitted model of both sensors: estimates by name, frames, axes and the residual (gyro, accel)."""
+
+    estimates: dict[str, Estimate]
+    world: tuple[bool, bool]
+    axes: tuple[Matrix, Matrix]
+    residual: Float64[np.ndarray, "n 6"]
+
+
+def kinematics(log: Recording) -> Kinematics:
+    """Samples within the longest stretch of a log's poses.
+
+    Raises:
+        DataError: less than five seconds of poses that can be differentiated.
+    """
+    motion, imu = smooth_motion(log.truth), log.imu
+    stretch = max(motion.stretches, key=lambda part: part.duration_s)
+    since_s = (imu.t_ns - motion.start_ns) * 1e-9
+    rows = (since_s > stretch.start_s + JERK_S) & (since_s < stretch.end_s - JERK_S)
+    t_ns = imu.t_ns[rows]
+    if stretch.duration_s < LEAST_S or rows.sum() < LEAST_S / imu.period_s:
+        raise DataError("its poses cover too little", where=log.name, expected=f"{LEAST_S:g} s of poses without a hole")
+    step_ns = round(JERK_S * 1e9)
+    at, before, after = (stretch.trajectory.at(t_ns + shift) for shift in (0, -step_ns, step_ns))
+    R_wb = Rotation.from_quat(at.q_wb_wxyz, scalar_first=True).as_matrix()
+    j_w = (after.a_w - before.a_w) / (2.0 * JERK_S)
+    t_s = np.asarray((t_ns - t_ns[0]) * 1e-9, dtype=np.float64)
+    gyro, accel = imu.gyro[rows], imu.accel[rows]
+    return Kinematics(t_s, gyro, accel, R_wb, at.omega_b, at.alpha_b, at.v_w, at.a_w, j_w, imu.period_s)
+
+
+def kinematic_fit(k: Kinematics) -> KinematicFit:
+    """Frames, axes and parts of the samples that explain them best."""
+    gyro_world, P_gyro = _frame(k, k.gyro, k.omega[:, :, None], free_bias=True)
+    gravity, centripetal = k.to_body(np.tile(-np.asarray(G_W), (len(k.t_s), 1))), -np.cross(k.omega, k.to_body(k.v_w))
+    parts = np.stack([k.to_body(k.a_w), gravity, centripetal], axis=2)
+    accel_world, P_accel = _frame(k, k.accel, parts, free_bias=False)
+    force = k.to_body(k.a_w - G_W)
+    arms = np.stack([np.cross(k.alpha, e) + np.cross(k.omega, np.cross(k.omega, e)) for e in np.eye(3)], axis=2)
+    late = np.stack([-k.to_body(k.j_w), np.cross(k.omega, force)], axis=2)
+    columns = np.concatenate([parts, arms, late], axis=2)
+    if accel_world:  # there neither gravity nor the transport term nor the attitude is anything of its own
+        columns = np.einsum("nij,njp->nip", k.R_wb, columns)
+        columns[:, :, [2, 7]] = 0.0
+    theta, std, left_accel = _solved(k, k.accel @ P_accel, columns, np.array([1.0, 1.0] + [0.0] * 6))
+    estimates = {name: Estimate(float(a), float(s), "-") for name, a, s in zip(NAMES, theta, std, strict=True)}
+    columns = np.stack([k.omega, -k.alpha], axis=2)
+    columns = np.einsum("nij,njp->nip", k.R_wb, columns) if gyro_world else columns
+    theta, std, left_gyro = _solved(k, k.gyro @ P_gyro, columns, np.array([1.0, 0.0]))
+    estimates["scale"], estimates["tau_g"] = (Estimate(float(a), float(s), "-") for a, s in zip(theta, std, strict=True))
+    residual = np.concatenate([left_gyro, left_accel], axis=1)
+    return KinematicFit(estimates, (gyro_world, accel_world), (P_gyro, P_accel), residual)
+
+
+def motion_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
+    """Faults of gravity, frame, axes, transport term, point and timing."""
+    timing = _timing_faults(fit.estimates, k.period_s)
+    return [*_frame_faults(fit), *_force_faults(fit), *timing, *_arm_faults(fit.estimates)]
+
+
+def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
+    arm = {axis: _with_unit(estimates[axis], "m") for axis in AXES}
+    far = np.linalg.norm([r.value for r in arm.values()]) > LEAST_ARM_M
+    return [found("lever_arm", "accel", **arm)] if far and any(_clear(r) for r in arm.values()) else []
+
+
+def _frame_faults(fit: KinematicFit) -> list[FaultFound]:
+    flipped = any(np.linalg.det(P) < 0.0 for P in fit.axes)
+    turned = tuple(not np.array_equal(P, np.eye(3)) for P in fit.axes)
+    name = "left_handed" if flipped else "permuted_axes"
+    return [found("world_frame", signal) for signal in _which(fit.world)] + [found(name, signal) for signal in _which(turned)]
+
+
+def _force_faults(fit: KinematicFit) -> list[FaultFound]:
+    m, k, c = (fit.estimates[name] for name in ("m", "k", "c"))
+    out = []
+    gravity = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
+    for whole, name in gravity.items():
+        if abs(k.value - whole) < NEAR and _clear(k, 1.0):
+            out.append(found(name, "accel", gravity=k))
+    if abs(m.value) < NEAR and _clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
+        out.append(found("gravity_only", "accel", acceleration=m))
+    elif abs(c.value - 1.0) < 2.0 * NEAR and _clear(c):
+        out.append(found("transport_term", "accel", missing=c))
+    return out
+
+
+def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[FaultFound]:
+    """Delays of the gyro, of the acceleration and of its attitude, in sample periods."""
+    gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
+    late = {"gyro": gyro, "accel": accel}
+    steps = {signal: _delay(tau, period_s) for signal, tau in late.items()}
+    together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
+    out = []
+    for name in ("step_delay", "early_stamps"):
+        signals = [signal for signal, kind in steps.items() if kind == name and (signal == "gyro" or together)]
+        if signals:
+            signal = "both" if len(signals) == 2 else signals[0]
+            out.append(found(name, signal, delay=_with_unit(late[signals[0]], "s")))
+    for signal, kind in steps.items():
+        if kind == "backward_difference" and (signal == "gyro" or abs(attitude.value) < 0.5 * abs(accel.value)):
+            tau = late[signal]
+            out.append(found(kind, signal, delay=_with_unit(tau, "s"), step=Estimate(2.0 * tau.value, 2.0 * tau.std, "s")))
+    return out
+
+
+def _delay(tau: Estimate, period_s: float) -> str:
+    """Name of a delay: half a step or less, a whole step, a step early; empty for none or another."""
+    steps = tau.value / period_s if _clear(tau) else 0.0
+    if abs(steps) > WHOLE:
+        return "step_delay" if steps > 0.0 else "early_stamps"
+    return "backward_difference" if LEAST_DELAY <= steps < PART else ""
+
+
+def _which(flags: tuple[bool, ...]) -> list[str]:
+    """Signals that are marked: none, one, or both."""
+    if all(flags):
+        return ["both"]
+    return [signal for signal, flag in zip(("gyro", "accel"), flags, strict=True) if flag]
+
+
+def _clear(estimate: Estimate, ideal: float = 0.0) -> bool:
+    return abs(estimate.value - ideal) > CERTAIN * estimate.std
+
+
+def _with_unit(estimate: Estimate, unit: str) -> Estimate:
+    return Estimate(estimate.value, estimate.std, unit)
+
+
+AXES_ORDERS = product(permutations(range(3)), product((1.0, -1.0), repeat=3))
+PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest axes first
+    (np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in AXES_ORDERS),
+    key=lambda P: float(np.abs(P - np.eye(3)).sum()),
+)
+
+
+def _frame(k: Kinematics, y: Vectors, body: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> tuple[bool, Matrix]:
+    """Whether a signal is in the world frame, and its axes P: the simplest that explains as much as any."""
+    squares: list[tuple[float, int, bool, Matrix]] = []
+    for world, x in ((False, body), (True, np.einsum("nij,njp->nip", k.R_wb, body))):
+        for rank, P in enumerate(PERMUTATIONS):
+            squares.append((_squares(y @ P, x, free_bias=free_bias), rank + len(PERMUTATIONS) * world, world, P))
+    least = min(entry[0] for entry in squares)
+    if least > CLEARLY * squares[0][0]:
+        return False, np.eye(3)
+    chosen = min((entry for entry in squares if entry[0] <= ALIKE * least), key=lambda entry: entry[1])
+    return chosen[2], chosen[3]
+
+
+def _squares(y: Vectors, x: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> float:
+    """Least squares of a signal by its parts: the rate; or acceleration, gravity (0, 1, 2, -1) and transport term."""
+    weights = (
+        [(1.0,)] if x.shape[2] == 1 else [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
+    )
+    flat, target, n = x.reshape(-1, x.shape[2]), y.ravel(), len(y)
+    G, g, s = flat.T @ flat, flat.T @ target, float(target @ target)
+    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
+    best = np.inf
+    for weight in weights:
+        w = np.array(weight)
+        mean = mean_y - mean_x @ w
+        left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
+        best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))
+    return best
+
+
+def _solved(
+    k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"], ideal: Float64[np.ndarray, " p"]
+) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"], Vectors]:
+    """Coefficients with deviations by blocks of two seconds, and the residual; Huber weights against shocks."""
+    p = x.shape[2]
+    A = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2)
+    target = y - x @ ideal
+    size = np.sqrt((A**2).sum(axis=(0, 1)))
+    size[size < 1e-9 * size.max()] = np.inf
+    A = A / size
+    weight = np.ones(len(y))
+    for _ in range(3):
+        H = np.einsum("n,nap,naq->pq", weight, A, A) + 1e-9 * np.eye(p + 3)
+        theta = np.linalg.solve(H, np.einsum("n,nap,na->p", weight, A, target))
+        left = target - A @ theta
+        length = np.sqrt((left**2).sum(axis=1))
+        weight = 1.0 / np.maximum(1.0, length / max(3.0 * float(np.median(length)), 1e-12))
+    block = np.floor(k.t_s / BLOCK_S).astype(int)
+    scores = np.zeros((int(block.max()) + 1, p + 3))
+    np.add.at(scores, block, np.einsum("n,nap,na->np", weight, A, left))
+    half = np.linalg.solve(H, scores.T)
+    std = np.sqrt((half**2).sum(axis=1) * len(scores) / max(len(scores) - 2, 1)) / size
+    unseen = ~np.isfinite(size)
+    std[unseen] = np.inf
+    return ideal + (theta / size)[:p], std[:p], np.asarray(left)

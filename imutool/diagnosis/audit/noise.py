@@ -1,0 +1,191 @@
+"""Faults of a simulated IMU's noise, digits and clock, beside a data sheet or a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.ndimage import median_filter
+from scipy.signal import welch
+from scipy.stats import chi2
+
+from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.estimation.timestamps import grid, limits
+from imutool.diagnosis.result import Estimate
+from imutool.noise.datasheet import Noise
+from imutool.recording import Imu
+from imutool.units import SENSORS, UNITS, Sensor
+
+Six = Float64[np.ndarray, "n 6"]
+ABSENT = 0.02  # of the expected noise: less is none
+ALIKE = 1.35  # factor between two densities that are one: a data sheet is typical
+SAME_SAMPLE = 1.12  # factor between the noise of two samples that was meant to be one
+OTHER_RATE = 1.5  # factor between the rates from which they differ
+OVER_LIMIT = 1.02  # of the recording's limit, from which a reading was not clipped
+FALLS, STEP, WHITE = 0.35, 0.75, 0.75  # of the noise that is left near Nyquist, and from band to band; of white noise
+CONSEQUENCES = {
+    "noise_absent": ("step_lines", "bias_never_walks", "noise_density", "noise_per_sample", "bandwidth_absent"),
+    "repeated_samples": ("step_lines", "noise_density", "noise_per_sample", "bandwidth_absent"),
+    "clipping_absent": ("bandwidth_absent", "noise_density"),
+    "bandwidth_absent": ("noise_density", "noise_per_sample"),
+}
+LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
+LINES_P_VALUE = 1e-9
+LINES_FROM = 0.15  # of the rate: below, motion is left
+SEGMENT = 1024
+REPEATED = 0.08  # of the samples
+WALK_BLOCKS, WALK_P_VALUE, WALK_FACTOR = 8, 1e-4, 4.0  # blocks of a log; the walk has to be so many times the white noise
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Expected noise: density and walk by column, the rate of the recording that shows it, its samples."""
+
+    density: Float64[np.ndarray, "6"]
+    walk: Float64[np.ndarray, "6"]
+    rate_hz: float | None = None
+    samples: Six | None = None
+
+    @classmethod
+    def of_sheet(cls, noise: Noise) -> Expected:
+        """Densities of a data sheet."""
+        density, walk = (
+            np.concatenate([noise.values(f"{sensor}_{kind}") for sensor in SENSORS]) for kind in ("density", "walk")
+        )
+        return cls(density, walk)
+
+    @classmethod
+    def of_recording(cls, imu: Imu) -> Expected:
+        """Density of a recording's samples; how far its bias walks is not known."""
+        samples = np.concatenate([imu.gyro, imu.accel], axis=1)
+        return cls(
+            fast_noise(samples, 1.0 / imu.period_s) * np.sqrt(imu.period_s), np.full(6, np.nan), 1.0 / imu.period_s, samples
+        )
+
+
+def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndarray, " k"]:
+    """White noise of a sample (standard deviation) from the spectrum's median where no body moves."""
+    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
+    return np.asarray(np.sqrt(np.median(power[(f_hz > 0.25 * rate_hz) & (f_hz < 0.48 * rate_hz)], axis=0) * rate_hz / 2.0))
+
+
+def noise_faults(imu: Imu, residual: Six, expected: list[Expected]) -> list[FaultFound]:
+    """Faults of the noise; `residual` is what the motion leaves of the samples."""
+    rate_hz, samples = 1.0 / imu.period_s, np.concatenate([imu.gyro, imu.accel], axis=1)
+    out = [*_lines(residual, rate_hz), *_repeated(samples)]
+    for k, sensor in enumerate(SENSORS):
+        part = slice(3 * k, 3 * k + 3)
+        own = float(np.median(fast_noise(residual[:, part], rate_hz)))
+        for reference in expected:
+            out += _density(sensor, own, rate_hz, float(np.nanmedian(reference.density[part])), reference.rate_hz)
+            out += _walk(sensor, residual[:, part], rate_hz, own, reference.walk[part])
+            if reference.samples is not None and reference.rate_hz is not None:
+                out += _clipping(sensor, samples[:, part], reference.samples[:, part])
+                out += _digits(sensor, samples[:, part], reference.samples[:, part])
+                out += _bandwidth(sensor, residual[:, part], rate_hz, reference.samples[:, part], reference.rate_hz)
+    return [fault for fault in out if not _follows(fault, out)]
+
+
+def _follows(fault: FaultFound, others: list[FaultFound]) -> bool:
+    """Whether a fault is only another side of one that was found."""
+    causes = {name for other in others if other.signal in (fault.signal, "both") for name in (other.fault,)}
+    return any(fault.fault in CONSEQUENCES.get(name, ()) for name in causes)
+
+
+def _density(sensor: Sensor, own: float, rate_hz: float, density: float, real_hz: float | None) -> Iterator[FaultFound]:
+    """Noise absent, of a sample at another rate (or a density taken for a sample's), or of another density."""
+    if not density > 0.0:
+        return
+    expected = density * np.sqrt(rate_hz)
+    ratio = own / expected
+    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(expected, 0.0, UNITS[sensor])}
+    meant = density if real_hz is None else density * np.sqrt(real_hz)  # a sample's, as it was given
+    other_rate = real_hz is None or max(real_hz / rate_hz, rate_hz / real_hz) > OTHER_RATE
+    if ratio < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
+        yield found("noise_absent", sensor, **numbers)
+    elif other_rate and 1.0 / SAME_SAMPLE < own / meant < SAME_SAMPLE:
+        yield found("noise_per_sample", sensor, **numbers)
+    elif not 1.0 / ALIKE < ratio < ALIKE:
+        yield found("noise_density", sensor, **numbers)
+
+
+def _walk(
+    sensor: Sensor, residual: Float64[np.ndarray, "n 3"], rate_hz: float, own: float, walk: Float64[np.ndarray, "3"]
+) -> Iterator[FaultFound]:
+    """A bias that never walks, where the expected walk would stand out of the white noise.
+
+    Neighbouring means over T differ by 2 N² / T + 2/3 K² T in variance, of a density N and a walk K.
+    """
+    count = len(residual) // WALK_BLOCKS
+    T = count / rate_hz
+    white = 2.0 * own**2 / count
+    drift = 2.0 / 3.0 * walk**2 * T
+    if not np.isfinite(walk).all() or not (drift > WALK_FACTOR * white).all():
+        return
+    means = residual[: WALK_BLOCKS * count].reshape(WALK_BLOCKS, count, 3).mean(axis=1)
+    squares = (np.diff(means, axis=0)[::2] ** 2 / (white + drift)).sum()  # every other, which are independent
+    freedom = 3 * len(np.diff(means, axis=0)[::2])
+    if chi2.cdf(squares, freedom) < WALK_P_VALUE:
+        density = float(np.median(walk))
+        yield found("bias_never_walks", sensor, expected_walk=Estimate(density, 0.0, f"{UNITS[sensor]}/s/√Hz"))
+
+
+def _clipping(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
+    """Clipping that the recording has and the simulation lacks."""
+    limit = limits(np.tile(real, 2)).get(sensor)
+    if limit is not None and np.abs(sim).max() > OVER_LIMIT * limit:
+        yield found("clipping_absent", sensor, limit=Estimate(limit, 0.0, UNITS[sensor]))
+
+
+def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.ndarray, "m 3"]) -> Iterator[FaultFound]:
+    """Digits that the recording has and the simulation lacks."""
+    steps = [grid(column) for column in real.T]
+    lsb = float(np.median(steps))
+    if min(steps) > LEAST_LSB * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
+        yield found("digits_absent", sensor, lsb=Estimate(lsb, 1e-3 * lsb, UNITS[sensor]))
+
+
+def _bandwidth(
+    sensor: Sensor, sim: Float64[np.ndarray, "n 3"], sim_hz: float, real: Float64[np.ndarray, "m 3"], real_hz: float
+) -> Iterator[FaultFound]:
+    """White noise near the recording's Nyquist frequency, where the recording's has fallen."""
+    nyquist_hz = min(sim_hz, real_hz) / 2.0
+    (sim_middle, sim_near), (middle, near) = (_left(x, hz, nyquist_hz) for x, hz in ((sim, sim_hz), (real, real_hz)))
+    if sim_middle * sim_near > WHITE and middle * near < FALLS and max(middle, near) < STEP:
+        yield found("bandwidth_absent", sensor, left=Estimate(middle * near, 0.1 * middle * near, "-"))
+
+
+def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
+    """Power that is left from band to band, towards a Nyquist frequency."""
+    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
+    low, middle, near = (float(np.median(power[(f_hz > a * nyquist_hz) & (f_hz < b * nyquist_hz)])) for a, b in BANDS)
+    return middle / max(low, 1e-300), near / max(middle, 1e-300)
+
+
+BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
+
+
+def _lines(residual: Six, rate_hz: float) -> Iterator[FaultFound]:
+    """Lines in the spectrum of what the motion leaves, above the frequencies of a body's motion."""
+    size = min(SEGMENT, len(residual) // 4)
+    for k, sensor in enumerate(SENSORS):
+        x = residual[:, 3 * k : 3 * k + 3]
+        f_hz, power = welch(x, rate_hz, nperseg=size, axis=0)
+        segments = 2.0 * len(x) / size - 1.0
+        freedom = 3.0 * 2.0 * segments * 9.0 / 11.0  # of half-overlapping Hann segments, three axes
+        total = power.sum(axis=1)
+        ratio = total / np.maximum(median_filter(total, 31, mode="nearest"), 1e-300)
+        above = (f_hz > LINES_FROM * rate_hz) & (f_hz < 0.99 * rate_hz / 2.0)
+        logs = chi2.logsf(ratio * freedom, freedom)
+        lines = np.flatnonzero(above & (logs < np.log(LINES_P_VALUE)) & (ratio > 3.0))
+        if len(lines):
+            f = float(f_hz[lines[np.argmax(ratio[lines])]])
+            yield found("step_lines", sensor, f=Estimate(f, rate_hz / size, "Hz"))
+
+
+def _repeated(samples: Six) -> Iterator[FaultFound]:
+    share = float((np.diff(samples, axis=0) == 0.0).all(axis=1).mean())
+    if share > REPEATED and np.ptp(samples, axis=0).max() > 0.0:
+        yield found("repeated_samples", "both", share=Estimate(share, 0.0, "-"))

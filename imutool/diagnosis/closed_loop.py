@@ -1,0 +1,128 @@
+"""Closed loop: simulate with the physics that was found, diagnose again, compare.
+
+recording + simulation ─ diagnose ─> physics.toml ─ simulate ─> closed.mcap ─ diagnose ─> nothing is missing
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.signal import welch
+from scipy.spatial.transform import Rotation
+
+from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis, Traces
+from imutool.diagnosis.wording.quantity import symbol
+from imutool.errors import ConfigError
+from imutool.units import ASCII_UNITS, SENSORS
+
+LOG = "closed.mcap"
+WINDOW_S = 5.0  # over which samples are integrated
+EDGES_HZ = (0.0, 1.0, 5.0, 20.0, np.inf)  # of the bands of the spectrum
+LATE_PARTS = 4  # of a log, for the error over time
+METRIC_S = 600.0  # that a metric may take
+
+
+def closed_loop(
+    first: Diagnosis, again: Diagnosis, log: Path, *, metric: Callable[[Path], float] | None = None, before: Path | None = None
+) -> ClosedLoop:
+    """Figures of a recording and two simulations: the one that was given, and the one with the physics that was found.
+
+    `metric` maps a simulation's log to the user's figure.
+    """
+    compared = [*_compared(first.traces[0], again.traces[0])]
+    if metric is not None and before is not None:
+        compared.append(Compared("metric", metric(before), metric(log), "-"))
+    return ClosedLoop(str(log), again.mismatch, tuple(finding.effect for finding in again.findings), tuple(compared))
+
+
+def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
+    """Metric of a user's script: `python SCRIPT REAL SIM` prints a number on its last line.
+
+    Raises:
+        ConfigError (when called): the script fails, or prints no number.
+    """
+
+    def metric(sim: Path) -> float:
+        words = [sys.executable, str(script), str(real), str(sim)]
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, timeout=METRIC_S, check=False)
+        except subprocess.TimeoutExpired as error:
+            raise ConfigError(f"took longer than {METRIC_S:g} s", where=script, expected="a number") from error
+        printed = done.stdout.strip().splitlines()
+        try:
+            return float(printed[-1]) if done.returncode == 0 else float("")
+        except (IndexError, ValueError) as error:
+            why = (done.stderr.strip().splitlines() or printed or ["nothing"])[-1]
+            what = f"printed no number for {sim.name}: {why}"
+            raise ConfigError(what, where=script, expected="a number on its last line") from error
+
+    return metric
+
+
+def table(loop: ClosedLoop) -> list[list[str]]:
+    """Rows of the comparison, with its header."""
+    rows = [["Figure", "Before", "After", "Unit"]]
+    return rows + [[one.figure, f"{one.before:.3g}", f"{one.after:.3g}", symbol(one.unit) or "–"] for one in loop.compared]
+
+
+def _compared(before: Traces, after: Traces) -> Iterator[Compared]:
+    """Figures of the expected samples with the best constant, over samples that both have."""
+    misfits = [trace.real - trace.before for trace in (before, after)]
+    for k, sensor in enumerate(SENSORS):
+        part, unit = slice(3 * k, 3 * k + 3), ASCII_UNITS[sensor]
+        yield Compared(f"{sensor} rms", _rms(misfits[0][:, part]), _rms(misfits[1][:, part]), unit)
+        bands = [_by_band(misfit[:, part], trace.t_s) for misfit, trace in zip(misfits, (before, after), strict=True)]
+        for name in bands[0]:
+            if name in bands[1]:
+                yield Compared(f"{sensor} rms, {name}", bands[0][name], bands[1][name], unit)
+        parts = [np.array_split(misfit[:, part], LATE_PARTS) for misfit in misfits]
+        for quarter, (a, b) in enumerate(zip(*parts, strict=True), start=1):
+            yield Compared(f"{sensor} rms, quarter {quarter}", _rms(a), _rms(b), unit)
+    drifts = [_integrated(trace) for trace in (before, after)]
+    yield Compared(f"rotation over {WINDOW_S:g} s", drifts[0][0], drifts[1][0], "rad")
+    yield Compared(f"path over {WINDOW_S:g} s", drifts[0][1], drifts[1][1], "m")
+
+
+def _rms(x: Float64[np.ndarray, "n 3"]) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def _by_band(x: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"]) -> Mapping[str, float]:
+    """Root mean square of a misfit in bands of its spectrum."""
+    rate_hz = 1.0 / float(np.median(np.diff(t_s)))
+    f_hz, power = welch(x, rate_hz, nperseg=min(len(x), round(8.0 * rate_hz)), axis=0)
+    out = {}
+    for low, high in pairwise(EDGES_HZ):
+        band = (f_hz >= low) & (f_hz < high)
+        if band.any():
+            name = f"{low:g} to {high:g} Hz" if np.isfinite(high) else f"above {low:g} Hz"
+            out[name] = float(np.sqrt(power[band].sum() * (f_hz[1] - f_hz[0]) / 3.0))
+    return out
+
+
+def _integrated(trace: Traces) -> tuple[float, float]:
+    """Rotation (rad) and displacement (m) by which recorded and expected samples part within windows; root mean squares."""
+    (R_real, p_real), (R_sim, p_sim) = (_window_ends(samples, trace.t_s) for samples in (trace.real, trace.before))
+    angle = (R_real.inv() * R_sim).magnitude()
+    return float(np.sqrt(np.mean(angle**2))), float(np.sqrt(((p_real - p_sim) ** 2).sum(axis=1).mean()))
+
+
+def _window_ends(
+    samples: Float64[np.ndarray, "n 6"], t_s: Float64[np.ndarray, " n"]
+) -> tuple[Rotation, Float64[np.ndarray, "w 3"]]:
+    """Attitude and displacement at the end of each window, from its own start, gravity included."""
+    period_s = float(np.median(np.diff(t_s)))
+    count = min(round(WINDOW_S / period_s), len(t_s))
+    x = samples[: len(t_s) // count * count].reshape(-1, count, 6)
+    R, v, p = Rotation.identity(len(x)), np.zeros((len(x), 3)), np.zeros((len(x), 3))
+    for k in range(count):
+        p = p + v * period_s
+        v = v + R.apply(x[:, k, 3:]) * period_s
+        R = R * Rotation.from_rotvec(x[:, k, :3] * period_s)
+    return R, p

@@ -1,0 +1,1 @@
+"""Streams of samples: sources, debiased one sample at a time, shown live."""

@@ -1,0 +1,296 @@
+"""Debias a live stream one sample at a time, show it, and measure the delay of each sample."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from imutool.bias.model import GAP_S, BiasModel
+from imutool.bias_start.bias_at_rest import auto
+from imutool.bias_start.correction import OnlineDebiaser
+from imutool.bias_start.stretches import measured
+from imutool.debiasing import DebiasedBlock
+from imutool.errors import DataError
+from imutool.mcap_io.topics import ImuBatch
+from imutool.recording import Imu
+from imutool.report import Section
+from imutool.viewing.stream.sources import Malformed, Sample, Samples
+
+START_S = 2.0  # of the stream, from which the start bias is taken
+BATCH_S = 0.1  # shown together
+SWITCH_S = 0.0005  # that the viewer's thread may keep the interpreter: Python's own 5 ms are the whole delay allowed
+SILENT_S = 5.0  # without a sample, before a warning
+MAX_WAITING = 256  # batches: a viewer that does not keep up loses some rather than fill the memory
+MAX_DELAYS = 1 << 20  # of which percentiles are taken: 17 minutes at 1 kHz, then a random choice
+
+logger = logging.getLogger("imutool")
+Corrected = Callable[[Sample, np.ndarray, np.ndarray], None]
+Show = Callable[[DebiasedBlock], None]
+
+
+class Delay(Section, frozen=True):
+    """Delay from the arrival of a sample to its corrected value, in ms, from the end of the start on."""
+
+    median: float
+    p99: float
+    max: float
+
+
+class StreamStatistics(Section, frozen=True):
+    """Statistics of a live stream; `start` says where the start bias comes from."""
+
+    samples: int
+    seconds: float
+    rate_hz: float
+    delay_ms: Delay | None
+    start: str
+    gaps: int
+    out_of_order: int
+    not_measured: int
+    malformed: int
+    not_shown: int
+    gyro_bias: list[float]
+    accel_bias: list[float]
+
+
+def run(
+    source: Samples,
+    model: BiasModel,
+    malformed: Malformed,
+    *,
+    show: Show | None = None,
+    each: Corrected | None = None,
+    seconds: float | None = None,
+) -> StreamStatistics:
+    """Debias a stream until it ends, `seconds` have passed or Ctrl-C; `each` gets every corrected sample.
+
+    The start bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
+    samples until then are corrected late and are not counted in the delay.
+
+    Raises:
+        DataError: an untrained model and no rest at the start, or no samples.
+    """
+    session = _Session(model, each)
+    with _showing(show) as batches:
+        try:
+            for found in _timely(source, seconds):
+                session.add(found, batches)
+        except KeyboardInterrupt:
+            pass
+        session.end(batches)
+    return session.statistics(malformed, batches.lost)
+
+
+def _timely(source: Samples, seconds: float | None) -> Iterator[Sample]:
+    """Samples until the time is up; warns of a silent source once."""
+    began = last = time.perf_counter()
+    warned = False
+    for found in source:
+        now = time.perf_counter()
+        if seconds is not None and now - began > seconds:
+            return
+        if found is not None:
+            last = now
+            yield found
+        elif not warned and now - last > SILENT_S:
+            warned = True
+            logger.warning("The source has sent nothing for %.0f s; still waiting. Ctrl-C ends it", now - last)
+
+
+class _Session:
+    """State of a stream."""
+
+    def __init__(self, model: BiasModel, each: Corrected | None) -> None:
+        self._model, self._each = model, each
+        self._online: OnlineDebiaser | None = None
+        self._how, self._std = "", np.zeros(6)
+        self._first: list[Sample] = []
+        self._batch: list[tuple[Sample, np.ndarray]] = []
+        self._delays: list[float] = []
+        self._random = np.random.default_rng(0)
+        self._begin_ns = self._last_ns = -1
+        self._ready_s = np.inf  # time of arrival from which on delays count: what came before waited for the start
+        self._samples = self._gaps = self._out_of_order = self._not_measured = 0
+        self._bias = np.zeros(6)
+
+    def add(self, found: Sample, batches: _Batches) -> None:
+        """Correct a sample, or keep it until the start bias is known."""
+        self._count(found)
+        if self._online is not None:
+            self._correct(found, batches)
+            if found.arrival_s >= self._ready_s:
+                self._add_delay(time.perf_counter() - found.arrival_s)
+            return
+        self._first.append(found)
+        if abs(found.stamp_ns - self._first[0].stamp_ns) >= START_S * 1e9:
+            self._start(batches)
+
+    def _add_delay(self, delay_s: float) -> None:
+        """Keep a delay; of very many a random choice (reservoir sampling)."""
+        if len(self._delays) < MAX_DELAYS:
+            self._delays.append(delay_s)
+        elif (place := int(self._random.integers(self._samples))) < MAX_DELAYS:
+            self._delays[place] = delay_s
+
+    def end(self, batches: _Batches) -> None:
+        """Correct what a short stream has left."""
+        if self._online is None and self._first:
+            self._start(batches)
+        batches.put(self._block())
+
+    def statistics(self, malformed: Malformed, lost: int) -> StreamStatistics:
+        """Statistics so far.
+
+        Raises:
+            DataError: no samples.
+        """
+        if not self._samples:
+            why = f"; the first of {malformed.count} messages: {malformed.first}" if malformed.count else ""
+            raise DataError(
+                f"the source sent no samples{why}", where="source", expected='{"t_ns": …, "gyro": […], "accel": […]}'
+            )
+        seconds = (self._last_ns - self._begin_ns) * 1e-9
+        return StreamStatistics(
+            samples=self._samples,
+            seconds=seconds,
+            rate_hz=(self._samples - 1) / seconds if seconds > 0.0 else 0.0,
+            delay_ms=self._delay(),
+            start=self._how,
+            gaps=self._gaps,
+            out_of_order=self._out_of_order,
+            not_measured=self._not_measured,
+            malformed=malformed.count,
+            not_shown=lost,
+            gyro_bias=self._bias[:3].tolist(),
+            accel_bias=self._bias[3:].tolist(),
+        )
+
+    def _delay(self) -> Delay | None:
+        """Percentiles of the delays; None where the stream ended before the start."""
+        if not self._delays:
+            return None
+        return Delay(*(np.percentile(self._delays, [50.0, 99.0, 100.0]) * 1e3).tolist())
+
+    def _count(self, found: Sample) -> None:
+        step_ns = found.stamp_ns - self._last_ns
+        if not self._samples:
+            self._begin_ns = found.stamp_ns
+        elif step_ns <= 0:
+            self._out_of_order += 1
+        elif step_ns > GAP_S * 1e9:
+            self._gaps += 1
+        self._last_ns = max(self._last_ns, found.stamp_ns)
+        self._samples += 1
+
+    def _start(self, batches: _Batches) -> None:
+        """Take the start bias from the first samples, and correct them.
+
+        Raises:
+            DataError: an untrained model, and no rest.
+        """
+        ordered = sorted({sample.stamp_ns: sample for sample in self._first}.values())
+        t_ns = np.array([sample.stamp_ns for sample in ordered], dtype=np.int64)
+        gyro, accel = (np.array([getattr(sample, name) for sample in ordered]) for name in ("gyro", "accel"))
+        good = measured(gyro, accel)
+        try:
+            start = auto(self._model, Imu(t_ns[good], gyro[good], accel[good]))
+        except DataError as error:
+            fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
+            raise DataError(error.what, where="source", fix=fix) from error
+        self._how, self._std = start.how, start.std
+        self._online = OnlineDebiaser(self._model, start)
+        for sample in self._first:
+            self._correct(sample, batches)
+        self._first = []
+        self._ready_s = time.perf_counter()
+
+    def _correct(self, found: Sample, batches: _Batches) -> None:
+        assert self._online is not None
+        u = np.array([found.gyro, found.accel])
+        rate, force, bias = self._online(found.stamp_ns, u[0], u[1])
+        self._bias = bias
+        if not np.isfinite(u).all():
+            self._not_measured += 1
+        if self._each is not None:
+            self._each(found, rate, force)
+        self._batch.append((found, bias))
+        if abs(found.stamp_ns - self._batch[0][0].stamp_ns) >= BATCH_S * 1e9:
+            batches.put(self._block())
+
+    def _block(self) -> list[tuple[Sample, np.ndarray, np.ndarray]]:
+        """Samples of the batch with bias and deviation."""
+        block = [(found, bias, self._std) for found, bias in self._batch]
+        self._batch = []
+        return block
+
+
+class _Batches:
+    """Queue of batches for the viewer's thread; batches that it has no time for are lost and counted."""
+
+    def __init__(self) -> None:
+        self._queue: queue.Queue[list[Any] | None] = queue.Queue(MAX_WAITING)
+        self.lost = 0
+        self.used = False
+
+    def put(self, batch: list[Any]) -> None:
+        """Hand a batch over without waiting."""
+        try:
+            if self.used and batch:
+                self._queue.put_nowait(batch)
+        except queue.Full:
+            self.lost += len(batch)
+
+    def finish(self) -> None:
+        """Say that no more come."""
+        self._queue.put(None)
+
+    def __iter__(self) -> Iterator[list[Any]]:
+        while (batch := self._queue.get()) is not None:
+            yield batch
+
+
+@contextmanager
+def _showing(show: Show | None) -> Iterator[_Batches]:
+    """Thread that shows batches, so that no sample waits for a viewer."""
+    batches = _Batches()
+    if show is None:
+        yield batches
+        return
+    batches.used = True
+    before = sys.getswitchinterval()
+    thread = threading.Thread(target=_show_all, args=(batches, show), daemon=True)
+    sys.setswitchinterval(SWITCH_S)
+    thread.start()
+    try:
+        yield batches
+    finally:
+        batches.finish()
+        thread.join()
+        sys.setswitchinterval(before)
+
+
+def _show_all(batches: Iterable[list[tuple[Sample, np.ndarray, np.ndarray]]], show: Show) -> None:
+    """Show each batch; samples that are not newer than those before, or not measured, are left out."""
+    last_ns, count = -1, 0
+    for batch in batches:
+        rows = []
+        for row in batch:
+            if row[0].stamp_ns > last_ns and np.isfinite(row[0].gyro).all() and np.isfinite(row[0].accel).all():
+                rows.append(row)
+                last_ns = row[0].stamp_ns
+        if not rows:
+            continue
+        t_ns = np.array([found.stamp_ns for found, _, _ in rows], dtype=np.int64)
+        gyro, accel = (np.array([getattr(found, name) for found, _, _ in rows]) for name in ("gyro", "accel"))
+        sequence = np.arange(count, count + len(rows), dtype=np.uint32)
+        count += len(rows)
+        imu = ImuBatch(t_ns, t_ns, sequence, t_ns, gyro, accel, "imu")
+        show(DebiasedBlock("/imu", imu, np.array([bias for _, bias, _ in rows]), np.array([std for _, _, std in rows])))

@@ -1,0 +1,132 @@
+"""Folders and zips with a table for each sensor: made-up ones in the layouts that the apps and data sets document."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+
+RNG = np.random.default_rng(8)
+COUNT = 400
+T_NS = 1_600_000_000_000_000_000 + np.arange(COUNT) * 10_000_000
+GYRO = RNG.normal(0, 0.003, (COUNT, 3))
+MOTION = RNG.normal(0, 0.02, (COUNT, 3))
+GRAVITY = np.tile([0.0, 0.0, 9.80665], (COUNT, 1))
+
+
+def sensor_logger(values: np.ndarray) -> str:
+    """Table of Sensor Logger: z before y before x."""
+    rows = [
+        f"{t},{(t - T_NS[0]) * 1e-9!r},{z!r},{y!r},{x!r}" for t, (x, y, z) in zip(T_NS.tolist(), values.tolist(), strict=True)
+    ]
+    return "\n".join(["time,seconds_elapsed,z,y,x", *rows]) + "\n"
+
+
+def phyphox(values: np.ndarray, unit: str) -> str:
+    """Table of phyphox: seconds since the start."""
+    t = (T_NS - T_NS[0]) * 1e-9
+    rows = [f"{s:.9E},{x!r},{y!r},{z!r}" for s, (x, y, z) in zip(t.tolist(), values.tolist(), strict=True)]
+    return "\n".join([f'"Time (s)","X ({unit})","Y ({unit})","Z ({unit})"', *rows]) + "\n"
+
+
+def pack(path: Path, files: dict[str, str]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in files.items():
+            archive.writestr(name, text)
+    return path
+
+
+METADATA = (
+    "version,device name,recording epoch time,recording time,recording timezone,platform,standardisation\n3,x,1,a,b,{},false\n"
+)
+STATED = """"event","experiment time","system time","system time text"
+"START",0.0,1600000000.000,"2020"
+"PAUSE",4.0,1600000004.0,""
+"""
+PHONES = {
+    "sensor logger, android": {
+        "Gyroscope.csv": sensor_logger(GYRO),
+        "Accelerometer.csv": sensor_logger(MOTION),
+        "TotalAcceleration.csv": sensor_logger(GRAVITY + MOTION),
+        "Magnetometer.csv": sensor_logger(np.full((COUNT, 3), 30.0)),
+        "Metadata.csv": METADATA.format("android"),
+    },
+    "sensor logger, ios": {
+        "Gyroscope.csv": sensor_logger(GYRO),
+        "Accelerometer.csv": sensor_logger(-MOTION),
+        "Gravity.csv": sensor_logger(-GRAVITY),
+        "Metadata.csv": METADATA.format("ios"),
+    },
+    "sensor logger, ios, uncalibrated": {
+        "GyroscopeUncalibrated.csv": sensor_logger(GYRO),
+        "AccelerometerUncalibrated.csv": sensor_logger(-(GRAVITY + MOTION) / 9.80665),
+        "Metadata.csv": METADATA.format("ios"),
+    },
+    "phyphox": {
+        "Gyroscope.csv": phyphox(GYRO, "rad/s"),
+        "Accelerometer.csv": phyphox(GRAVITY + MOTION, "m/s^2"),
+        "meta/time.csv": STATED,
+        "meta/device.csv": '"property","value"\n"deviceModel","Pixel"\n',
+    },
+}
+
+
+@pytest.mark.parametrize("phone", PHONES)
+def test_a_phones_zip_becomes_an_imu_in_si_units(convert, tmp_path, phone):
+    done = convert(pack(tmp_path / "walk.zip", PHONES[phone]), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    recording = read(tmp_path / "out.mcap")
+    assert np.abs(recording.imu.t_ns - T_NS).max() <= 1
+    np.testing.assert_allclose(recording.imu.gyro, GYRO, rtol=1e-12)
+    np.testing.assert_allclose(recording.imu.accel, GRAVITY + MOTION, rtol=1e-9, atol=1e-12)
+    assert ("sign was turned" in done.stderr) == ("ios" in phone)
+    assert ("/Magnetometer/x" in recording.scalars) == ("android" in phone)
+
+
+def test_an_unpacked_folder_reads_as_its_zip_and_other_zips_are_none(convert, tmp_path):
+    folder = tmp_path / "walk"
+    for name, text in PHONES["phyphox"].items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    assert convert(folder, tmp_path / "out.mcap").returncode == 0
+    assert np.array_equal(read(tmp_path / "out.mcap").imu.gyro, GYRO)
+    done = convert(pack(tmp_path / "other.zip", {"a.csv": "x,y\n1,2\n"}), tmp_path / "none.mcap")
+    assert done.returncode == 4
+    assert "no sequence found" in done.stderr
+
+
+def test_motion_without_gravity_is_refused_and_says_what_to_record(convert, tmp_path):
+    files = {"Gyroscope.csv": sensor_logger(GYRO), "Accelerometer.csv": sensor_logger(MOTION)}
+    done = convert(pack(tmp_path / "walk.zip", files), tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "gravity was taken out" in done.stderr
+    assert "Record the acceleration with gravity" in done.stderr
+
+
+def test_oxts_of_kitti_gives_the_imu_and_an_estimate(convert, imutool, tmp_path):
+    drive = {}
+    for n in range(50):
+        row = [49.0 + n * 1e-6, 8.0, 110.0, 0.0, 0.0, np.pi / 2, *[0.0] * 24]
+        row[11:14], row[17:20] = [0.1, 0.2, 9.81], [0.01, 0.02, 0.03]
+        drive[f"2011_09_26/drive/oxts/data/{n:010d}.txt"] = " ".join(map(repr, map(float, row)))
+    drive["2011_09_26/drive/oxts/timestamps.txt"] = "".join(f"2011-09-26 13:02:{n / 10:012.9f}\n" for n in range(50))
+    done = convert(pack(tmp_path / "drive.zip", drive), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    recording = read(tmp_path / "out.mcap", truth="/oxts/pose")
+    assert recording.imu.t_ns[1] - recording.imu.t_ns[0] == 100_000_000
+    assert recording.imu.gyro[3].tolist() == [0.01, 0.02, 0.03]
+    assert recording.imu.accel[3].tolist() == [0.1, 0.2, 9.81]
+    poses = recording.truths["/oxts/pose"]
+    np.testing.assert_allclose(poses.p_wb[-1], [0.0, 49e-6 * np.pi / 180 * 6_378_137.0, 0.0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(poses.q_wb_wxyz[0], [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], atol=1e-12)
+    with Log(tmp_path / "out.mcap") as log:
+        assert log.topics["/oxts/pose"].pose_kind == "estimate"
+        assert not log.truth_topics
+    report = json.loads(imutool("info", "out.mcap", "--json", "-", cwd=tmp_path).stdout)
+    assert report["truth"][0]["kind"] == "estimate"

@@ -1,0 +1,50 @@
+"""The delay between two sensors is measured where the motion shows it, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.recording.sensor_delay import sensor_delay
+
+RNG = np.random.default_rng(11)
+DURATION_S = 60.0
+WITHIN_S = 0.001  # the delays of interest are those of several milliseconds
+
+
+def attitude(t: np.ndarray) -> Rotation:
+    """Body to world of a camera held in the hand."""
+    angles = [0.5 * np.sin(2 * np.pi * f * t + k) for k, f in enumerate((0.7, 1.1, 0.4))]
+    return Rotation.from_euler("ZYX", np.stack(angles, axis=1))
+
+
+def measured(delay_s: float, rates_hz: tuple[float, float] = (400.0, 250.0), shaken: float = 0.3) -> tuple[np.ndarray, ...]:
+    t_gyro, t_accel = (np.arange(0.0, DURATION_S, 1.0 / hz) for hz in rates_hz)
+    step = 1e-4
+    gyro = (attitude(t_gyro - step).inv() * attitude(t_gyro + step)).as_rotvec() / (2 * step)
+    world = np.array([0.0, 0.0, 9.81]) + shaken * np.stack([np.sin(9.0 * t_accel + k) for k in range(3)], axis=1)
+    accel = attitude(t_accel).inv().apply(world)
+    gyro_ns, accel_ns = ((10**18 + np.rint(t * 1e9)).astype(np.int64) for t in (t_gyro, t_accel + delay_s))
+    return (
+        gyro_ns,
+        gyro + RNG.normal(0.01, 0.005, gyro.shape),
+        accel_ns,
+        accel + RNG.normal(0.0, 0.05, accel.shape),
+    )
+
+
+@pytest.mark.parametrize("delay_s", [-0.031, 0.0, 0.004, 0.012, 0.08])
+def test_a_planted_delay_is_found(delay_s):
+    found = sensor_delay(*measured(delay_s))
+    assert found is not None
+    assert abs(found.seconds - delay_s) < WITHIN_S
+    assert found.std_s < WITHIN_S
+
+
+def test_a_log_at_rest_or_of_vibration_shows_none():
+    gyro_ns, _, accel_ns, accel = measured(0.01)
+    noise = RNG.normal(0.0, 0.01, (len(gyro_ns), 3))
+    assert sensor_delay(gyro_ns, noise, accel_ns, np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.05, accel.shape)) is None
+    assert sensor_delay(gyro_ns, noise, accel_ns, accel) is None
+    assert sensor_delay(gyro_ns[:400], noise[:400], accel_ns[:250], accel[:250]) is None

@@ -1,0 +1,219 @@
+"""A live stream: every source gives the samples, the corrected ones are those of the log, what is no sample is counted."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.report_schema import assert_valid
+
+import imutool as api
+from imutool.bias_start.bias_at_rest import auto
+from imutool.errors import ConfigError, DataError
+from imutool.recording import Imu
+from imutool.viewing.stream import sources
+from imutool.viewing.stream.session import run
+from imutool.viewing.stream.sources import Malformed, Sample, open_source, sample
+
+Imutool = Callable[..., subprocess.CompletedProcess[str]]
+PLAIN = '{"t_ns": 5, "gyro": [0.1, 0.2, 0.3], "accel": [1, 2, 9.8]}'
+MESSAGE = (
+    '{"header": {"stamp": {%s}, "frame_id": "imu"}, "angular_velocity": {"x": 0.1, "y": 0.2, "z": 0.3},'
+    ' "linear_acceleration": {"x": 1, "y": 2, "z": 9.8}, "orientation": {"x": 0}}'
+)
+
+
+@pytest.fixture(scope="module")
+def imu() -> Imu:
+    """Eight seconds, the first three at rest."""
+    return api.example_recording(duration_s=8.0).imu
+
+
+def lines(imu: Imu) -> list[str]:
+    rows = zip(imu.t_ns.tolist(), imu.gyro.tolist(), imu.accel.tolist(), strict=True)
+    return [json.dumps({"t_ns": t_ns, "gyro": gyro, "accel": accel}) for t_ns, gyro, accel in rows]
+
+
+def stream(imu: Imu) -> Iterator[Sample]:
+    for line in lines(imu):
+        yield sample(line, time.perf_counter())
+
+
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        (PLAIN, 5),
+        (PLAIN.replace('"t_ns": 5', '"t_s": 1.5'), 1_500_000_000),
+        (MESSAGE % '"sec": 2, "nanosec": 7', 2_000_000_007),
+        (MESSAGE % '"secs": 2, "nsecs": 7', 2_000_000_007),
+        ('{"op": "publish", "topic": "/imu", "msg": %s}' % (MESSAGE % '"sec": 2, "nanosec": 7'), 2_000_000_007),
+    ],
+)
+def test_a_sample_is_read_from_plain_json_and_from_ros_messages(text: str, stamp_ns: int) -> None:
+    assert sample(text, 3.0) == Sample(stamp_ns, (0.1, 0.2, 0.3), (1.0, 2.0, 9.8), 3.0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "{}",
+        '{"gyro": [1, 2, 3], "accel": [1, 2, 3]}',
+        PLAIN.replace("0.3", '"a"'),
+        PLAIN.replace(", 0.3", ""),
+        "\ud800",
+    ],
+)
+def test_what_is_no_sample_is_refused(text: str) -> None:
+    with pytest.raises((ValueError, UnicodeError)):
+        sample(text, 0.0)
+
+
+def test_the_samples_are_corrected_as_by_the_log(imu: Imu) -> None:
+    model, shown, corrected = api.load_model("static"), [], []
+    done = run(
+        stream(imu), model, Malformed(), show=shown.append, each=lambda found, rate, force: corrected.append((*rate, *force))
+    )
+    first = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + 2_000_000_000)) + 1))
+    online = api.OnlineDebiaser(model, auto(model, first))
+    expected = [np.concatenate(online(*row)[:2]) for row in zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True)]
+    np.testing.assert_array_equal(corrected, expected)
+    assert (done.samples, done.malformed, done.gaps, done.out_of_order, done.not_shown) == (len(imu), 0, 0, 0, 0)
+    assert done.delay_ms is not None
+    assert 0.0 < done.delay_ms.median <= done.delay_ms.p99 <= done.delay_ms.max
+    np.testing.assert_array_equal(np.concatenate([block.batch.stamp_ns for block in shown]), imu.t_ns)
+    np.testing.assert_allclose(
+        np.concatenate([b.batch.gyro - b.bias[:, :3] for b in shown]), np.array(expected)[:, :3], rtol=1e-12
+    )
+
+
+def test_gaps_order_and_missing_values_are_counted_and_do_no_harm(imu: Imu) -> None:
+    t_ns, gyro = imu.t_ns.copy(), imu.gyro.copy()
+    t_ns[1000:] += 3_000_000_000  # a gap
+    t_ns[1200] = t_ns[1198]
+    gyro[1300] = np.nan
+    rows = [Sample(t, tuple(g), tuple(a), 0.0) for t, g, a in zip(t_ns.tolist(), gyro, imu.accel, strict=True)]
+    shown: list[Any] = []
+    done = run(iter([None, *rows]), api.load_model("static"), Malformed(), show=shown.append)
+    assert (done.gaps, done.out_of_order, done.not_measured) == (1, 1, 1)
+    stamps = np.concatenate([block.batch.stamp_ns for block in shown])
+    assert len(stamps) == len(imu) - 2
+    assert (np.diff(stamps) > 0).all()
+    assert np.isfinite(done.gyro_bias).all()
+
+
+def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) -> None:
+    malformed = Malformed()
+    malformed.add("nonsense", ValueError("no JSON"))
+    with pytest.raises(DataError, match=r"no samples; the first of 1 messages: no JSON: 'nonsense'"):
+        run(iter([None]), api.load_model("static"), malformed)
+    moving = imu.rows(slice(800, None))
+    with pytest.raises(DataError, match="Leave the sensor still for 2 s"):
+        run(stream(moving), api.load_model("static"), Malformed())
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["udp://127.0.0.1", "udp://h:99999", "zenoh://x", "ftp://x/y", "rosbridge://127.0.0.1:9", "rosbridge://127.0.0.1:9/imu"],
+)
+def test_a_wrong_source_is_refused_at_once(name: str) -> None:
+    with pytest.raises(ConfigError):
+        open_source(name, Malformed())
+
+
+def test_datagrams_are_samples(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sources, "WAIT_S", 0.01)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    malformed = Malformed()
+    source = open_source(f"udp://127.0.0.1:{port}", malformed)
+    with pytest.raises(ConfigError, match="cannot be bound"):
+        open_source(f"udp://127.0.0.1:{port}", malformed)
+    assert next(source) is None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.sendto("\n".join([lines(imu)[0], "nonsense", lines(imu)[1]]).encode(), ("127.0.0.1", port))
+    found = [one for one in (next(source) for _ in range(2)) if one is not None]
+    assert [one.stamp_ns for one in found] == imu.t_ns[:2].tolist()
+    assert malformed.count == 1
+    source.close()  # type: ignore[attr-defined]
+
+
+def test_a_rosbridge_is_subscribed_to(imu: Imu) -> None:
+    from websockets.sync.server import serve
+
+    asked: list[Any] = []
+
+    def publish(line: Any) -> None:
+        asked.append(json.loads(line.recv()))
+        for t_ns in imu.t_ns[:3].tolist():
+            stamp = f'"sec": {t_ns // 10**9}, "nanosec": {t_ns % 10**9}'
+            line.send('{"op": "publish", "topic": "/imu", "msg": %s}' % (MESSAGE % stamp))
+        line.close()
+
+    with serve(publish, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        port = server.socket.getsockname()[1]
+        found = list(open_source(f"rosbridge://127.0.0.1:{port}/imu/data", Malformed()))
+        server.shutdown()
+        thread.join()
+    assert asked == [{"op": "subscribe", "topic": "/imu/data"}]
+    assert [one.stamp_ns for one in found if one is not None] == imu.t_ns[:3].tolist()
+
+
+def test_the_command_replays_a_log_and_reports_the_delay(logs: Path, tmp_path: Path, imutool: Imutool) -> None:
+    words = ("live", "--from", logs / "flight_1.mcap", "--speed", "6", "--save", "live.rrd", "--json", "r.json")
+    done = imutool(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "99 % within" in done.stdout
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert_valid(report)
+    assert report["stream"]["samples"] > 4000
+    assert (tmp_path / "live.rrd").stat().st_size > 100_000
+    assert imutool(*words, cwd=tmp_path).returncode == 3  # the file exists
+
+
+def test_standard_input_is_printed_debiased_until_ctrl_c(imu: Imu, tmp_path: Path, command: str) -> None:
+    line = [command, "live", "--from", "stdin", "--no-view", "--print", "--json", str(tmp_path / "r.json")]
+    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdin.write("\n".join([*lines(imu), "nonsense", ""]))
+        process.stdin.flush()
+        printed = [json.loads(process.stdout.readline()) for _ in range(len(imu))]
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        told = process.stderr.read()
+        assert process.wait(30) == 0, told
+    assert [row["t_ns"] for row in printed] == imu.t_ns.tolist()
+    assert "1 messages hold no sample" in told
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert (report["stream"]["samples"], report["stream"]["malformed"]) == (len(imu), 1)
+
+
+def test_a_line_without_an_end_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as given:
+        monkeypatch.setattr(sys, "stdin", given)
+        monkeypatch.setattr(sources, "MAX_BYTES", 100)
+        malformed = Malformed()
+        source = open_source("stdin", malformed)
+        os.write(writing, b"x" * 1000 + b"\n" + PLAIN.encode() + b"\n")
+        os.close(writing)
+        assert [one.stamp_ns for one in source if one is not None] == [5]
+        assert malformed.count >= 1
