@@ -1,7 +1,4 @@
-"""Read an MCAP log: whole columns at a time, one chunk in memory, every CRC checked.
-
-Topics are found by schema, not by name; messages come in file order.
-"""
+"""Read an MCAP log: whole columns at a time in file order, one chunk in memory, CRCs checked."""
 
 from __future__ import annotations
 
@@ -62,9 +59,7 @@ class Log:
         try:
             with self.named():
                 self.index = self._read_index(self._source)
-                self.topics = MappingProxyType(topics_of(self.index))
-                imus = dict(reflected_topics(self.index, self.topics, self._first))
-                self.topics = MappingProxyType({**self.topics, **imus})
+                self._read_topics()
         except BaseException:
             self.close()
             raise
@@ -72,8 +67,13 @@ class Log:
     def _read_index(self, source: Source) -> LogIndex:
         return LogIndex(source, self.max_chunk)
 
-    def _first(self, topic: str) -> bytes | None:
-        return next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
+    def _read_topics(self) -> None:
+        """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
+        self.topics = MappingProxyType(topics_of(self.index))
+        more = reflected_topics(
+            self.index, self.topics, lambda topic: next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
+        )
+        self.topics = MappingProxyType({**self.topics, **more})
 
     def __enter__(self) -> Log:
         return self
