@@ -115,7 +115,7 @@ def evaluate(
         >>> linear["aoe_deg"] < raw["aoe_deg"]
         True
     """
-    tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True)
+    tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True, of_each="{}_*.tum")
     check_outputs([tum], [log, list(models)], overwrite=overwrite)
     return evaluation.evaluate(
         local(log, "log"),

@@ -147,7 +147,7 @@ def _outputs(save: Path | None, export_web: Path | None, png: Path | None, html:
     return [
         OutputFile("save", save, outputs.RRD, may_be_folder=True),
         OutputFile("export_web", export_web, files=("*",), keeps=True),
-        OutputFile("png", png, files=("*.png",), keeps=True),
+        OutputFile("png", png, files=("*.png",), keeps=True, of_each="{}-*.png"),
         OutputFile("html", html, outputs.HTML),
     ]
 

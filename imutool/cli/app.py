@@ -73,6 +73,7 @@ class Written:
     suffixes: tuple[str, ...] = ()
     files: tuple[str, ...] | None = None
     keeps: bool = False
+    of_each: str = ""
     may_be_folder: bool = False
 
 
@@ -111,7 +112,12 @@ class Command(TyperCommand):
         marks = written(type(self).function)
         places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
         wanted = [
-            OutputFile(name, place, mark.suffixes, mark.files, mark.keeps or (resume and _is_report(place)), mark.may_be_folder)
+            OutputFile(
+                *(name, place, mark.suffixes, mark.files),
+                keeps=mark.keeps or (resume and _is_report(place)),
+                of_each=mark.of_each,
+                may_be_folder=mark.may_be_folder,
+            )
             for name, place in places.items()
             for mark in (marks[name],)
         ]

@@ -18,7 +18,7 @@ from imutool.report import Report
 logger = logging.getLogger(__name__)
 
 ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
-TRAJECTORIES = Written(files=("*.tum",), keeps=True)
+TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):

@@ -25,7 +25,7 @@ SOURCE_HELP = "Also show other topics of the log, such as cameras."
 
 
 SAVED = Written(outputs.RRD, may_be_folder=True)
-PICTURES, SITE = Written(files=("*.png",), keeps=True), Written(files=("*",), keeps=True)
+PICTURES, SITE = Written(files=("*.png",), keeps=True, of_each="{}-*.png"), Written(files=("*",), keeps=True)
 
 
 class View(Report, frozen=True, tag="imutool.view/1"):

@@ -1,4 +1,4 @@
-"""Closed loop: simulate again with the physics that was found, diagnose again, compare before and after.
+"""Closed loop: simulate with the physics that was found, diagnose again, compare.
 
 recording + simulation ─ diagnose ─> physics.toml ─ simulate ─> closed.mcap ─ diagnose ─> nothing is missing
 """

@@ -224,15 +224,14 @@ def too_large(what: str, offset: int, size: int, max_chunk: int) -> LogError:
 
 def cut_short(source: Source) -> LogError:
     """Where a log without an end stops, found by following its records."""
-    position, inside = len(MAGIC), "inside its first record"
-    while source.size - position >= HEAD.size:
+    position, opcode, inside = len(MAGIC), 0, False
+    while source.size - position >= HEAD.size and not inside:
         opcode, length = source.head(position)
-        if length > source.size - position - HEAD.size:
-            inside = f"inside the {records.name_of(opcode)} record that begins at byte {position}"
-            break
-        position += HEAD.size + length
-        inside = f"after the {records.name_of(opcode)} record that ends at byte {position}"
-    return LogError(f"the log is cut short at byte {source.size}, {inside}", expected="a log that ends", fix=CUT_SHORT)
+        inside = length > source.size - position - HEAD.size
+        position += 0 if inside else HEAD.size + length
+    name = records.name_of(opcode) if position > len(MAGIC) or inside else "first"
+    where = f"{'inside' if inside or name == 'first' else 'after'} the {name} record at byte {position}"
+    return LogError(f"the log is cut short at byte {source.size}, {where}", expected="a log that ends", fix=CUT_SHORT)
 
 
 @dataclass(frozen=True, slots=True)

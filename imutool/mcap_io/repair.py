@@ -29,6 +29,7 @@ from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source
+from imutool.mcap_io.storage.system import collector_paused
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.writer import LogWriter
 
@@ -79,7 +80,7 @@ def repair(
     if same_location(source, target):
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     tell = progress or (lambda done, total: None)
-    with RecoveredLog(source, max_chunk=max_chunk) as log:
+    with collector_paused(), RecoveredLog(source, max_chunk=max_chunk) as log:
         try:
             return _repair(log, target, damaged, overwrite, tell)
         except _ContradictionError:

@@ -35,6 +35,7 @@ from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
+from imutool.training.closed_form import CORRELATED
 from imutool.training.fit import Epoch, note
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
@@ -42,7 +43,8 @@ from imutool.training.settings import TrainSettings
 from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
-LEAST_GAIN = 0.05  # of the judged loss, for an effect to be worth its parameters
+REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
+LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
 FOLDS = 3  # parts of a log where there are fewer logs than this
 LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
@@ -156,15 +158,17 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:
     """Wald's test of the last effect's parameters, corrected for the number of candidates.
 
-    The covariance takes windows as correlated (`CORRELATED`): those of all lengths, half overlapping, hold each sample's noise
-    about that often. The test keeps out effects without evidence; the held-out loss decides which come in.
+    Where nothing is planted, theta.covariance^-1.theta has the expectation tr(1 - prior covariance), the number of parameters
+    that the motion shows: these are its degrees of freedom. The test keeps out effects without evidence; the loss of other logs
+    decides which come in.
     """
     columns = parameter_columns(effects, names)
     theta, covariance = problem.solve(columns)
     own = [k for k, column in enumerate(columns) if column in parameter_columns(effects, names[-1:])]
-    last = theta[columns][own]
-    wald = float(last @ torch.linalg.solve(covariance[own][:, own], last))
-    return wald > float(chi2.isf(BY_CHANCE / len(effects), len(own)))
+    last, block = theta[columns][own], covariance[own][:, own]
+    wald = CORRELATED / REPEATED * float(last @ torch.linalg.solve(block, last))
+    shown = float((1 - block.diagonal() * problem.prior[columns][own]).sum())
+    return wald > float(chi2.isf(BY_CHANCE / len(effects), max(shown, 1.0)))
 
 
 def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:

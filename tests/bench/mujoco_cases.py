@@ -34,6 +34,8 @@ SETTLE_S = 3.0
 MASS, INERTIA, SMALL_MASS = 1e5, 1e5, 1e-4  # kg, kg m²: what sits on the springs must not move the body
 NOISE = np.array([2e-3] * 3 + [0.02] * 3)  # rad/s, m/s²: a sample's
 KINDS = ("null", "lever_arm", "mount_rotation", "mount_resonance", "clock_offset", "low_pass", "lever_arm+clock_offset")
+RINGING = ("mount_rings", "lever_arm+mount_rings")  # by name alone: a mount that shocks excite, faster than the samples
+SHOCK_M_S2, SHOCK_S, EVERY_S = 150.0, 2e-3, 3.0
 
 Six = Float64[np.ndarray, "n 6"]
 
@@ -47,6 +49,7 @@ class Mounted:
     f0_hz: float = 0.0
     zeta: float = 0.0
     delay_s: float = 0.0
+    shocked: bool = False
     cutoff_hz: float = 0.0
 
 
@@ -117,6 +120,9 @@ def drawn(kind: str, rng: Generator) -> tuple[Mounted, list[ConcealedEffect]]:
             settings |= {"f0_hz": rng.uniform(12.0, 18.0), "zeta": rng.uniform(0.05, 0.2)}
             told = {"f0": (settings["f0_hz"], "Hz"), "zeta": (settings["zeta"], "-")}
             effects.append(_effect(name, "accel", told | {f"share_{axis}": (1.0, "-") for axis in "xyz"}))
+        elif name == "mount_rings":
+            settings |= {"f0_hz": 18.1, "zeta": 0.06, "shocked": True}
+            effects.append(_effect("mount_resonance", "accel", {"f0": (18.1, "Hz"), "zeta": (0.06, "-")}))
         elif name == "clock_offset":
             settings["delay_s"] = float(rng.integers(4, 40)) * STEP_S * 2.0
             effects.append(_effect(name, "both", {"tau": (-settings["delay_s"], "s")}))
@@ -139,6 +145,8 @@ def fly(mounted: Mounted, duration_s: float, rng: Generator) -> Flown:
     data = mujoco.MjData(model)
     count = int((duration_s + SETTLE_S) / STEP_S) + 1
     push, twist = _halved(_smooth(rng, count, 2.0, 6.0)), _halved(_smooth(rng, count, 4.0, 1.5))
+    if mounted.shocked:
+        push = push + _shocks(rng, len(push))
     p, q, sensors = np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, 12))
 
     def force(_model: Any, now: Any) -> None:
@@ -158,6 +166,17 @@ def fly(mounted: Mounted, duration_s: float, rng: Generator) -> Flown:
         mujoco.set_mjcb_control(None)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     return Flown(np.arange(count) * STEP_S, p, q, sensors[:, :6], sensors[:, 6:])
+
+
+def _shocks(rng: Generator, count: int) -> Float64[np.ndarray, "n 3"]:
+    """Half sines of two milliseconds in a random direction, every few seconds, by half steps."""
+    width = round(2.0 * SHOCK_S / STEP_S)
+    out, shape = np.zeros((count, 3)), np.sin(np.pi * np.arange(width) / width)
+    at = np.cumsum(rng.exponential(EVERY_S, count)) * 2.0 / STEP_S
+    for k in at[at < count - width].astype(int):
+        direction = rng.standard_normal(3)
+        out[k : k + width] += SHOCK_M_S2 * shape[:, None] * direction / np.linalg.norm(direction)
+    return out
 
 
 def _halved(curves: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
@@ -227,7 +246,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    for k, kind in enumerate(KINDS):
+    for k, kind in enumerate((*KINDS, *RINGING)):
         conceal_mujoco(options.out / f"{k:04d}", seed=options.seed * len(KINDS) + k, kind=kind)
 
 

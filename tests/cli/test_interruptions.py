@@ -48,6 +48,7 @@ WRITERS: dict[str, tuple[Sequence[str], str]] = {
     "save": (["view", "in.mcap", "--save", "out.rrd"], "out.rrd"),
     "train": (["train", "in.mcap", "--method", "linear", "-o", "out.safetensors"], "out.safetensors"),
     "trajectories": (["evaluate", "in.mcap", "--trajectories", "out"], "out"),
+    "pictures": (["view", "in.mcap", "--png", "out"], "out"),
 }
 
 
@@ -102,8 +103,8 @@ def stopped(command: str, words: Sequence[str], folder: Path, number: signal.Sig
 MOMENTS = [
     *((name, signal.SIGINT) for name in ("export", "save")),
     *((name, signal.SIGTERM) for name in ("convert", "debias", "save")),
-    *((name, signal.SIGKILL) for name in ("convert", "debias", "export")),
-]  # Ctrl-C in convert, debias and train: tests/test_bad_input.py
+    *((name, signal.SIGKILL) for name in ("convert", "debias", "export", "view")),
+]  # fleets: tests/fleet/test_fleet.py; Ctrl-C in convert, debias and train: tests/test_bad_input.py
 
 
 @pytest.mark.parametrize(("name", "number"), MOMENTS, ids=lambda value: getattr(value, "name", value))

@@ -25,7 +25,7 @@ from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 
 Refused = Callable[..., str]
 
-USAGE, CONFIG = 2, 3
+USAGE, CONFIG, LOG = 2, 3, 5
 
 # words without which a command does not get as far as its outputs; in.mcap is junk where it exists
 NEEDS = {
@@ -70,7 +70,21 @@ READ = {
 }
 WORDS = {
     *("format", "sequence", "compression", "imu", "truth", "rule", "no_rule", "init", "verify", "connect", "method", "set_"),
-    *("sensor", "device", "align", "at", "signal", "kind", "size", "damaged", "name", "address", "memory", "robot_from"),
+    *(
+        "sensor",
+        "device",
+        "align",
+        "at",
+        "signal",
+        "kind",
+        "size",
+        "damaged",
+        "name",
+        "address",
+        "memory",
+        "robot_from",
+        "encoding",
+    ),
 }
 
 
@@ -242,6 +256,22 @@ def test_a_folder_that_is_a_file_is_refused(refused: Refused, tmp_path: Path, co
         return
     (tmp_path / "existing").write_text("precious")
     refused(CONFIG, command, *line(command, parameter, "existing"), "--overwrite")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"), [("view", "--png", "a_b-errors.png"), ("evaluate", "--trajectories", "a_b_raw.tum")]
+)
+def test_a_file_about_a_log_in_a_folder_of_others_is_refused_before_any_work(
+    refused: Refused, tmp_path: Path, command: str, option: str, name: str
+) -> None:
+    """The log is junk, which is not even looked at; files about other logs stay beside the new ones."""
+    (tmp_path / "in.mcap").write_bytes(b"junk")
+    (tmp_path / "a b.mcap").write_bytes(b"junk")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / f"other{name}").touch()
+    assert "MCAP log" in refused(LOG, command, "a b.mcap", option, "out")
+    (tmp_path / "out" / name).write_text("precious")
+    assert f"out/{name}: the target exists" in refused(CONFIG, command, "in.mcap", "a b.mcap", option, "out")
 
 
 @pytest.mark.parametrize(("command", "parameter"), [("models", "json_to"), ("info", "json_to")])

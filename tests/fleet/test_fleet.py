@@ -140,6 +140,22 @@ def test_somebody_elses_file_stays(fleet: Path, engine: Workers, tmp_path: Path)
     assert theirs.read_text() != "theirs"
 
 
+def test_a_target_of_which_every_note_was_hit_is_kept_and_with_overwrite_it_alone_is_done_again(
+    fleet: Path, engine: Workers, tmp_path: Path
+) -> None:
+    """Nothing says any more that the fleet wrote it; `resume` with `overwrite` goes on all the same."""
+    out = tmp_path / "out"
+    run(str(fleet), str(out), INFO, engine)
+    journal, before = out / NAME, sorted((path, path.read_bytes()) for path in out.rglob("*.json"))
+    journal.write_bytes(journal.read_bytes().replace(b"robot_a", b"r\0b\0t_a"))
+    kept = run(str(fleet), str(out), INFO, engine, resume=True)
+    assert dict(kept.progress.statuses) == {"failed": 1, "skipped": 1}
+    assert "robot_a/log.json: the target exists" in kept.not_whole[0].error
+    again = run(str(fleet), str(out), INFO, engine, resume=True, overwrite=True)
+    assert dict(again.progress.statuses) == {"ok": 1, "skipped": 1}
+    assert sorted((path, path.read_bytes()) for path in out.rglob("*.json")) == before
+
+
 @pytest.mark.parametrize("name", ["fleet.parquet", "fleet.json", "page.html"])
 def test_a_table_or_page_that_no_fleet_wrote_stays(fleet: Path, tmp_path: Path, name: str) -> None:
     out = tmp_path / "out"

@@ -12,7 +12,6 @@ import importlib
 import pkgutil
 import random
 import resource
-import signal
 import tempfile
 import time
 import traceback
@@ -21,6 +20,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import CompletedProcess
+
+from support.log_damage import in_time
 
 BUDGET_S = 20.0  # for one case; most take milliseconds
 ROOM_BYTES = 1 << 30  # of address space above that at the start of a case
@@ -69,19 +70,13 @@ def hunt(kind: str, seed: str, seconds: float) -> Iterator[list[str]]:
 @contextmanager
 def bounded() -> Iterator[None]:
     """Ends what takes too long, and refuses memory beyond `ROOM_BYTES`."""
-
-    def late(number: int, frame: object) -> None:
-        raise TooLong
-
-    before, limits = signal.signal(signal.SIGALRM, late), resource.getrlimit(resource.RLIMIT_AS)
+    limits = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ROOM_BYTES, limits[1]))
-    signal.setitimer(signal.ITIMER_REAL, BUDGET_S)
     try:
-        yield
+        with in_time(BUDGET_S, TooLong):
+            yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
         resource.setrlimit(resource.RLIMIT_AS, limits)
 
 

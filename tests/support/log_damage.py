@@ -34,14 +34,14 @@ DOUBTFUL = 3  # messages outside chunks that may be given up for nothing: nothin
 
 
 @contextmanager
-def in_time() -> Iterator[None]:
+def in_time(seconds: float = BUDGET_S, error: type[BaseException] = TimeoutError) -> Iterator[None]:
     """Ends a case that hangs."""
 
     def late(number: int, frame: object) -> None:
-        raise TimeoutError
+        raise error
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, BUDGET_S)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:

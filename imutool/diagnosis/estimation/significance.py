@@ -31,7 +31,9 @@ Matrix = Float64[np.ndarray, "p p"]
 
 
 def log_p_value(gain: float, parameters: int) -> float:
-    """Log p-value of a gain in squares under H0, by chi-square (leading term far out)."""
+    """Log p-value of a gain in squares under H0, by chi-square (leading term far out); 0 without parameters."""
+    if parameters == 0:  # all of them implausible: what is left of the effect does nothing
+        return 0.0
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters
     return float(np.log(gammaincc(k, half))) if half < TAIL else float((k - 1.0) * np.log(half) - half - gammaln(k))
 

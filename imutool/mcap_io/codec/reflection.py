@@ -1,4 +1,4 @@
-"""IMU messages of other encodings, found by reflection: protobuf by its descriptors, JSON by its first message.
+"""IMU messages in protobuf and JSON, found by reflection: descriptors, or the first message.
 
 A message is that of an IMU if it holds an angular velocity and a linear acceleration of three numbers each, by the names of its
 fields. Values count as rad/s and m/s². A message that lacks them has NaN, so that `clean` can leave it out.

@@ -30,6 +30,7 @@ from imutool.mcap_io.recovery.scan import Scan
 from imutool.mcap_io.recovery.scan_events import Gap, ScannedBlock
 from imutool.mcap_io.recovery.summary import proven_summary
 from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.storage.system import collector_paused
 
 MAX_SEARCHED = 1 << 20  # bytes of a damaged stretch in which definitions are sought
 
@@ -50,7 +51,8 @@ class RecoveredIndex(LogIndex):
         self._lost_spans: set[int] = set()
         self._stated: dict[int, int] = {}  # counts of an intact log
         self._listed: dict[int, ChunkIndex] = {}  # until the heads are compared
-        super().__init__(source, max_chunk)
+        with collector_paused():
+            super().__init__(source, max_chunk)
 
     def _read(self) -> None:
         contradiction = ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping
+from itertools import chain
 
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Header
@@ -127,9 +128,11 @@ class Scan(ScanResult):
         """Handles a Chunk record: proven, without CRC, or damaged."""
         end = position + HEAD.size + length
         why = f"the chunk at byte {position} is damaged: its lengths contradict one another"
-        for stated in dict.fromkeys((length, *self._other_lengths(position))):
-            if not 0 <= stated <= self.frames.limit - position - HEAD.size:
+        tried = set[int]()
+        for stated in chain((length,), self._other_lengths(position)):
+            if stated in tried or not 0 <= stated <= self.frames.limit - position - HEAD.size:
                 continue
+            tried.add(stated)
             try:
                 return self._take_chunk(position, HEAD.size + stated)
             except UnreadableError as error:  # its contents are proven and make no sense; what lies in them is theirs

@@ -110,20 +110,24 @@ class ScanResult:
 
     def add_block(self, block: MessageBlock, found: messages.Messages, head: records.ChunkHead | None) -> None:
         """Notes the counts, times and definitions of a block."""
-        times = found.heads["log_time"][found.heads["log_time"] < LATEST_NS]
-        block.counts = dict(Counter(found.heads["channel"].tolist()))
-        if len(times):
-            block.start_ns, block.end_ns = int(times.min()), int(times.max())
+        sizes, spans = {}, {}
+        if len(found.heads) == 1:  # in a tenth of the time; some logs have nothing else
+            _, length, channel, _, time_ns, _ = found.heads[0].item()
+            block.counts, sizes = {channel: 1}, {channel: (length, length)}
+            spans = {channel: (time_ns, time_ns)} if time_ns < LATEST_NS else {}
+        else:
+            block.counts = dict(Counter(found.heads["channel"].tolist()))
+            for channel in block.counts:
+                own = found.heads[found.heads["channel"] == channel]
+                sizes[channel] = int(own["length"].min()), int(own["length"].max())
+                possible = own["log_time"][own["log_time"] < LATEST_NS]
+                if len(possible):
+                    spans[channel] = int(possible.min()), int(possible.max())
+        if spans:
+            block.start_ns, block.end_ns = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
         defined = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
         self.items.append(block)
         size, crc = (head.size, head.crc) if head else (block.length, 0)
-        sizes, spans = {}, {}
-        for channel in block.counts:
-            own = found.heads[found.heads["channel"] == channel]
-            sizes[channel] = int(own["length"].min()), int(own["length"].max())
-            possible = own["log_time"][own["log_time"] < LATEST_NS]
-            if len(possible):
-                spans[channel] = int(possible.min()), int(possible.max())
         self.events.append(ScannedBlock(block, (block.start_ns, block.end_ns, size), crc, defined, sizes, spans))
         self.used_channels.update(block.counts)
 

@@ -71,7 +71,7 @@ def proven_summary(source: Source, losses: Losses) -> tuple[Footer, Summary | No
 
 
 def moved_summary(source: Source, starts: Sequence[int], position: int) -> tuple[int, Summary | None]:
-    """Moved summary that the CRC in the Footer proves, and its start; `starts` are possible ones."""
+    """Moved summary that the CRC in the Footer proves, and its start; `starts` may be it."""
     footer = records.parse(Footer, source.at(position + HEAD.size, FOOTER_SIZE - HEAD.size), position)
     stop = position + FOOTER_SIZE - 4
     stated = [at for at in _stated_starts(source, footer, position) if at >= 0]

@@ -7,6 +7,7 @@ one file, and a suffix that does not fit. A device or a pipe is written to.
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ class OutputFile:
         suffixes: Suffixes that fit the content; with none of them, any fits.
         files: Of a folder: patterns of the names written into it.
         keeps: The function itself decides about an existing one, before its work.
+        of_each: Of a folder that keeps other files: pattern of the names about an input, with {} for the input's name.
         may_be_folder: An existing folder gets a file of its own in it.
     """
 
@@ -41,6 +43,7 @@ class OutputFile:
     suffixes: tuple[str, ...] = ()
     files: tuple[str, ...] | None = None
     keeps: bool = False
+    of_each: str = ""
     may_be_folder: bool = False
 
     @property
@@ -76,6 +79,8 @@ def check_outputs(outputs: Iterable[OutputFile], inputs: Iterable[object] = (), 
     for output in files:
         if not output.keeps:
             _refuse_existing_output(output, overwrite)
+        elif output.of_each and not overwrite:
+            _refuse_existing_files(output, [place.stem for place in read])
 
 
 def refuse_existing(path: Location, *, overwrite: bool) -> None:
@@ -229,6 +234,15 @@ def _refuse_existing_output(output: OutputFile, overwrite: bool) -> None:
         there = sorted(e.name for e in place.iterdir() if any(fnmatchcase(e.name, pattern) for pattern in output.files))
         if there:
             raise ConfigError("the target exists", where=place / there[0], fix="Choose another folder, or add `overwrite=True`")
+
+
+def _refuse_existing_files(output: OutputFile, inputs: Sequence[str]) -> None:
+    """Refuse a folder with files about one of these inputs."""
+    folder = output.where
+    patterns = [output.of_each.format(re.sub(r"[^\w.+-]", "_", name)) for name in inputs]
+    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    for name in (name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)):
+        raise ConfigError("the target exists", where=folder / name, fix="Choose another folder, or add `overwrite=True`")
 
 
 def _refuse_missing_folder(place: Location) -> None:

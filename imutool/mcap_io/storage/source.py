@@ -11,6 +11,7 @@ from imutool.location import Location, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
 
 BLOCK_BYTES = 1 << 20
+SHORT_BYTES, AHEAD_BYTES = 512, 1 << 13  # a read of at most so many bytes of a local file takes as many at once
 CUT_SHORT = "Save the rest with `imutool repair`, or copy it again from where it was recorded"
 
 
@@ -23,6 +24,8 @@ class Source:
         except io_errors(path) as error:
             raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected=expected) from error
         self.path = path
+        self._ahead, self._ahead_at = b"", 0  # bytes read ahead of short reads, and where they lie
+        self._is_local = descriptor(self.file) is not None
 
     def at(self, offset: int, length: int) -> bytes:
         """Exactly these bytes.
@@ -30,6 +33,20 @@ class Source:
         Raises:
             LogError: the file does not have them, or the disk or the store does not give them.
         """
+        if length <= SHORT_BYTES and self._is_local:
+            start = offset - self._ahead_at
+            if not 0 <= start <= len(self._ahead) - length:
+                start, self._ahead_at = 0, offset
+                self._ahead = self._read(offset, min(AHEAD_BYTES, max(length, self.size - offset)))
+            if length <= len(self._ahead) - start:
+                return self._ahead[start : start + length]
+        parts = self._read(offset, length)
+        if len(parts) != length:
+            raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
+        return parts
+
+    def _read(self, offset: int, length: int) -> bytes:
+        """These bytes, or those up to the end of the file."""
         try:
             self.file.seek(offset)
             parts = self.file.read(length)
@@ -37,8 +54,6 @@ class Source:
                 parts += part
         except io_errors(self.path) as error:
             raise LogError(f"cannot be read at byte {offset} ({reason(error)})") from error
-        if len(parts) != length:
-            raise LogError(f"the log is cut short at byte {offset + len(parts)}", fix=CUT_SHORT)
         return parts
 
     def head(self, offset: int) -> tuple[int, int]:

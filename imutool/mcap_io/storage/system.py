@@ -1,17 +1,17 @@
 """Differences between operating systems: locks, memory, processes, copies by the kernel.
 
-
 Only this file uses what not every system has; elsewhere each function answers as well as the system allows.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
@@ -48,7 +48,7 @@ def lock(file: IO[bytes]) -> bool:
 
 
 def peak_bytes() -> int:
-    """Peak memory of this process; 0 if unknown. The `ru_maxrss` of Linux would begin with that of its parent."""
+    """Peak memory of this process; 0 if unknown (`ru_maxrss` of Linux begins with the parent's)."""
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
         return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
@@ -60,7 +60,7 @@ def peak_bytes() -> int:
 
 
 def memory_bytes() -> int:
-    """Memory of this machine, or of the container that this process runs in; a large number if unknown."""
+    """Memory of this machine or of this container; a large number if unknown."""
     limits = []
     with contextlib.suppress(AttributeError, OSError, ValueError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -79,7 +79,7 @@ def processors() -> int:
 
 
 def inherited(handle: int) -> dict[str, Any]:
-    """Options of `subprocess.Popen`: a process in a group of its own that inherits one end of a connection."""
+    """Options of `Popen`: a process group of its own, and one end of a connection."""
     if sys.platform == "win32":
         os.set_handle_inheritable(handle, True)
         start = subprocess.STARTUPINFO(lpAttributeList={"handle_list": [handle]})
@@ -94,6 +94,18 @@ def opened(handle: int) -> Connection:
 
         return PipeConnection(handle)
     return Connection(handle)
+
+
+@contextlib.contextmanager
+def collector_paused() -> Iterator[None]:
+    """Pause Python's cycle collector, which would visit millions of objects that stay."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def user() -> str:
@@ -111,7 +123,7 @@ def give(path: Path, status: os.stat_result) -> None:
 
 
 def copy_by_kernel(source: int, target: int, start: int, end: int) -> int:
-    """Copy bytes from one open file to the end of another; return where the kernel stopped, `start` if it cannot."""
+    """Append bytes of one open file to another; return where the kernel stopped."""
     calls: tuple[Callable[[int], int], ...] = (
         lambda at: os.copy_file_range(source, target, end - at, offset_src=at),
         lambda at: os.sendfile(target, source, at, end - at),

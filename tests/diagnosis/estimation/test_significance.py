@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from support import planted
 
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.significance import Scatter, scatter
+from imutool.diagnosis.estimation.significance import Scatter, log_p_value, scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 
 FELT = planted.shaken(duration_s=45.0)
@@ -31,6 +31,11 @@ def noisy(seed: int, lasting: bool) -> tuple[WhitenedLog, Fit, Scatter]:
 
 def z(found: Fit, std: np.ndarray) -> np.ndarray:
     return np.asarray((found.chosen[0][1] - SCALE) / std)
+
+
+def test_an_effect_without_parameters_gains_nothing_by_chance_or_otherwise() -> None:
+    """All of its parameters were implausible: a replacement by it would be a replacement by nothing."""
+    assert log_p_value(100.0, 0) == 0.0
 
 
 def test_white_noise_scatters_as_the_information_says() -> None:
