@@ -1,8 +1,7 @@
 """Debias a log: copy it and add debiased samples, biases and their covariance.
 
-Causal throughout, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start
-is known (`imutool.bias_start.initial_bias`). Smoothing reads the log twice; of the first pass it keeps thirteen numbers for
-each half second.
+Causal, unless `smooth` is asked for: the bias at a sample comes from that sample and earlier ones, once the start is known
+(`imutool.bias_start.initial_bias`). Smoothing reads the log twice, and keeps thirteen numbers for each half second.
 """
 
 from __future__ import annotations
@@ -23,8 +22,9 @@ from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
-from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start
+from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log
 from imutool.bias_start.stretches import Sieve
+from imutool.bias_start.verdict import Fitness
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
@@ -58,6 +58,7 @@ class DebiasReport:
     losses: Losses  # of a damaged source; empty as far as it was looked at (`check`)
     surveys: Mapping[str, Survey]  # of what was cleaned
     sieves: Mapping[str, Sieve]  # samples that are no measurement, and jumps of the clock
+    fits: Mapping[str, Fitness]  # of the model for this log
 
     @property
     def lossy(self) -> bool:
@@ -153,6 +154,7 @@ def debias(
     check: str = "imu",
     max_chunk: int | None = None,
     clean: CleaningSettings | None = None,
+    force: bool = False,
     overwrite: bool = False,
     encoding: str = "own",
     progress: Callable[[int, int], None] | None = None,
@@ -160,29 +162,26 @@ def debias(
 ) -> DebiasReport:
     """Writes `target`: all of `source`, and for each IMU its debiased samples and the bias.
 
-    One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the
-    one the log's metadata names, else the one that ships for its sensor, else the mean over time at rest. The IMUs are
-    those in `imus`, else those with a model of their own, else the log's only one.
-    With `smooth` the initial bias at every time comes from the whole log, also from later samples.
+    One model serves every IMU, or each has its own by topic, "" being that of all others. An IMU without one gets the one the
+    log's metadata names, else the one that ships for its very sensor, else the mean at rest. The IMUs are those in `imus`, else
+    those with a model of their own, else the log's only one. With `smooth` the initial bias comes from the whole log.
     Without a target the log itself is replaced; `check` is that of `mcap_io.rewrite`. The intact part of a damaged log is
     debiased from a repaired copy beside the target (`mcap_io.repair`), and `losses` lists the rest; it is not replaced. With
     `clean` a first pass finds samples to leave out or convert (`imutool.cleaning`); the record `imutool_clean` lists them.
     The new IMU has the type and encoding of its source, or with `encoding` "cdr" those of ROS 2.
-    A chunk of more than `max_chunk` bytes is not read into memory.
-    `watch` is called with every batch of debiased samples, those of a damaged log again when its repaired copy is debiased.
+    A chunk of more than `max_chunk` bytes is not read. A model that does not fit (`fitness`) is used only with `force`.
+    `watch` is called with every batch of debiased samples, again when the copy of a damaged log is debiased.
 
     Raises:
-        ConfigError: source or target cannot be opened, `init` makes no sense, `smooth` is asked for with another `init`,
-            or a model is given for an IMU that is not to be debiased.
-        LogError: nothing in the log can be saved, it has no such IMU, is debiased already, is damaged and its own target,
-            or cannot be trusted, with `clean`.
-        ModelError: no model and no time at rest; a model for another rate; a damaged model file.
+        ConfigError: a file cannot be opened, or options contradict each other.
+        LogError: nothing can be saved, no such IMU, one debiased already, damaged and its own target, or not to be trusted.
+        ModelError: no model and no time at rest; a model for another rate, or one that does not fit; a damaged model file.
     """
     check_smooth(init, smooth)
     check_mode(check)
     if encoding not in ENCODINGS:
         raise ConfigError(f"{encoding!r}", where="encoding", expected=" or ".join(ENCODINGS))
-    options = _Options(model, imus, init, smooth, clean, check, overwrite, encoding, watch)
+    options = _Options(model, imus, init, smooth, clean, check, force, overwrite, encoding, watch)
     refusal: LogError | None = None
     try:
         if (log := _open_intact(source, max_chunk)) is not None:
@@ -217,6 +216,7 @@ class _Options:
     smooth: bool
     clean: CleaningSettings | None
     check: str
+    force: bool
     overwrite: bool
     encoding: str
     watch: BlockCallback | None
@@ -237,13 +237,14 @@ def _debias(
     about = log.metadata().get("imutool", {})
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
-    derived, starts, models, records = [], {}, {}, {}
+    derived, starts, models, records, fits = [], {}, {}, {}, {}
     with Digest(source) as digest:
         for topic in topics:
             name, survey = given.get(topic, default), surveys.get(topic)
             chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
             derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
+            fits[topic] = fitness_in_log(log, topic, chosen, start, survey).report(models[topic], topic, force=options.force)
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
 
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}
@@ -263,7 +264,7 @@ def _debias(
         for text in sieve.warnings():
             logger.warning("%s %s: %s", source, topic, text)
     losses.unchecked_in = losses.unchecked_in or {0: report.unchecked}
-    return DebiasReport(models, starts, report, losses, surveys, sieves)
+    return DebiasReport(models, starts, report, losses, surveys, sieves, fits)
 
 
 def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
@@ -273,7 +274,7 @@ def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
 
 def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
     """The shipped model that a log's metadata name: a log may come from anybody."""
-    return shipped(about["model"]) if about.get("model") else shipped_for(about.get("sensor"), about.get("dataset"))
+    return shipped(about["model"]) if about.get("model") else next(iter(shipped_for(about)), None)
 
 
 def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smooth: bool) -> dict[str, str]:

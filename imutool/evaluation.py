@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
+from msgspec import to_builtins
 
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import BiasPrior
 from imutool.bias_start.correction import DebiasedImu, apply
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias
+from imutool.bias_start.fitness import judge
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
@@ -33,7 +35,6 @@ RAW = "raw"
 DRIFT_S = 5.0
 PURE, ZUPT = "integration", "zupt"
 RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
-SCHEMA = "imutool.evaluation/1"
 Refused = Callable[[str, ImutoolError], None]
 
 
@@ -57,8 +58,7 @@ def evaluate(
     log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.
 
     Raises:
-        ConfigError: `smooth` with another `init` than auto; two models of one name, files that exist, or no sample that is a
-            measurement.
+        ConfigError: `smooth` with another `init`; two models of one name, files that exist, or nothing measured.
         LogError, DataError: no IMU, no truth, or the two share no time.
         ModelError: a model that cannot be used with this log.
     """
@@ -69,7 +69,10 @@ def evaluate(
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     results = []
-    for name, found, start in runs(recording, models, init, log, smooth=smooth, refused=refused):
+    about = recording.metadata.get("imutool", {})
+    for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
+        found = _corrected(recording.imu, model, start)
+        fit = judge(model, start, [relative_samples(recording.imu)], about) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
@@ -84,6 +87,7 @@ def evaluate(
                     "init": init if start else None,
                     "init_how": start.how if start else None,
                     "smooth": smooth,
+                    "fit": fit and to_builtins(fit),
                     **metrics.evaluate(estimate, true, valid),
                     **drifted,
                     "gyro_bias": start.rest[:3].tolist() if start else [0.0, 0.0, 0.0],
@@ -117,6 +121,11 @@ def _left(start: InitialBias | None) -> BiasPrior:
     return BiasPrior(np.zeros(6), std, AT_REST_STD)
 
 
+def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> DebiasedImu:
+    """Samples corrected by a model; without one as they are."""
+    return apply(model, start, imu) if model and start else DebiasedImu(imu, np.zeros((len(imu), 6)))
+
+
 def runs(
     recording: Recording,
     models: Sequence[str | Path],
@@ -128,7 +137,7 @@ def runs(
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
     check_smooth(init, smooth)
-    yield RAW, DebiasedImu(recording.imu, np.zeros((len(recording.imu), 6))), None
+    yield RAW, _corrected(recording.imu, None, None), None
     for name, model, start in started(recording, models, init, where, smooth=smooth, refused=refused):
         yield name, apply(model, start, recording.imu), start
 

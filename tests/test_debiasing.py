@@ -59,7 +59,7 @@ def make_network(method: str, rate_hz: float = RATE_HZ) -> BiasNetwork:
     model = kinds[method].double()
     with torch.no_grad():
         for value in model.parameters():
-            value.add_(0.03 * torch.randn(value.shape, dtype=value.dtype))
+            value.add_(0.003 * torch.randn(value.shape, dtype=value.dtype))
         model.prior_std.copy_(torch.tensor([0.05] * 3 + [0.4] * 3))
         model.truth_std.copy_(torch.tensor([1e-3] * 3 + [0.05] * 3))
         model.noise_std.copy_(torch.tensor([2e-3] * 3 + [0.03] * 3))

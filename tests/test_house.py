@@ -334,9 +334,9 @@ def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
     lines = [
         f"debias {log} linear.mcap --model {logs / 'linear.safetensors'}",
         f"debias {log} smooth.mcap --smooth",
-        f"debias {log} hybrid.mcap --model euroc-adis16448-hybrid --init truth",
-        f"debias {log} ode.mcap --model euroc-adis16448-neural_ode",
-        f"debias {log} conv.mcap --model euroc-adis16448-conv",
+        f"debias {log} hybrid.mcap --model euroc-adis16448-hybrid --init truth --force",
+        f"debias {log} ode.mcap --model euroc-adis16448-neural_ode --force",
+        f"debias {log} conv.mcap --model euroc-adis16448-conv --force",
         f"evaluate {log} --model {logs / 'linear.safetensors'} --zupt",
         f"view {log} --model static --html view.html",
         f"repair {cut} repaired.mcap",

@@ -18,8 +18,10 @@ from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.fitness import judge
+from imutool.bias_start.initial_bias import InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
+from imutool.bias_start.verdict import Fitness
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location
@@ -87,6 +89,7 @@ class DebiasedRecording:
         std: One standard deviation of `bias`.
         model: Name of the model.
         start: Initial bias: `rest`, `std` and, in words, `how`.
+        fitness: Whether the model fits the recording: `verdict` (`fits`, `doubtful` or `unfit`) and `reasons`.
     """
 
     recording: Recording
@@ -94,6 +97,7 @@ class DebiasedRecording:
     std: Float64[np.ndarray, "n 6"]
     model: str
     start: InitialBias
+    fitness: Fitness
 
     def __repr__(self) -> str:
         mean = ["(" + ", ".join(f"{x:+.5f}" for x in part) + ")" for part in self.bias.mean(axis=0).reshape(2, 3)]
@@ -108,7 +112,13 @@ class DebiasedRecording:
 
 @overload
 def debias(
-    source: Recording, target: Model | None = None, *, model: Model | None = None, init: str = "auto", smooth: bool = False
+    source: Recording,
+    target: Model | None = None,
+    *,
+    model: Model | None = None,
+    init: str = "auto",
+    smooth: bool = False,
+    force: bool = False,
 ) -> DebiasedRecording: ...
 
 
@@ -123,6 +133,7 @@ def debias(
     imus: Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
+    force: bool = False,
     encoding: str = "own",
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -139,27 +150,27 @@ def debias(
     imus: Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
+    force: bool = False,
     encoding: str = "own",
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> DebiasedRecording | DebiasReport:
     """Subtract the IMU's bias from a recording, or write a debiased log.
 
-    `debias(recording, model)` returns arrays. `debias("in.mcap", "out.mcap", model=...)` writes a log with every record of
-    the old one, `/imu0/debiased`, the subtracted bias and its covariance. The bias at a sample depends on that sample and
-    earlier ones, unless `smooth` is true.
+    `debias(recording, model)` returns arrays. `debias("in.mcap", "out.mcap", model=...)` writes a log with every record of the
+    old one, `/imu0/debiased`, the bias and its covariance; without `smooth` it depends on no later sample.
 
     Args:
         source: Recording, or MCAP log: a file or a URL.
         target: Log to write. With a recording, the second argument is the model.
         model: Model file, name of a model that ships, `static`, or a dictionary from IMU topic to model. By default the
-            model that the log names or that ships for its sensor, otherwise the mean bias at rest. With a recording,
-            also a loaded model.
+            model that ships for the log's very sensor, else the mean at rest. With a recording, also a loaded model.
         init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers.
         smooth: Estimate the initial bias from the whole log, forward and backward.
-        imus: IMU topics of a log to debias; by default the only one.
+        imus: IMU topics of a log; by default the only one.
         in_place: Replace the log `source` instead of writing `target`.
         check: Chunks of a log whose CRC is compared: `imu`, `all` or `none`.
+        force: Use a model although it does not fit the log.
         encoding: Of the new IMU topic: `own`, that of its source, or `cdr`.
         overwrite: Replace an existing `target`.
         progress: Callback with bytes done and in all.
@@ -167,7 +178,7 @@ def debias(
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
         LogError: No such IMU, a log that is debiased already, or damage that cannot be repaired.
-        ModelError: No model and no time at rest, another sample rate, or a damaged model file.
+        ModelError: No model and no time at rest, a model for another rate or that does not fit the log, a damaged model file.
 
     Examples:
         >>> import imutool
@@ -180,7 +191,7 @@ def debias(
         4001
     """
     if isinstance(source, Recording):
-        return _debias_recording(source, model if target is None else target, init, smooth)
+        return _debias_recording(source, model if target is None else target, init, smooth, force)
     if isinstance(model, BiasModel) or isinstance(target, BiasModel):
         raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
     if in_place == (target is not None):
@@ -188,21 +199,22 @@ def debias(
     out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
     check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
     run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth, check=check)
-    return run(encoding=encoding, overwrite=overwrite, progress=progress)
+    return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
 
 
-def _debias_recording(recording: Recording, model: object, init: str, smooth: bool) -> DebiasedRecording:
+def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
     if not isinstance(model, Model | None):
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     name, chosen, start = _model_and_start(recording, model, init, smooth)
+    about = recording.metadata.get("imutool", {})
+    fitness = judge(chosen, start, [relative_samples(recording.imu)], about).report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
-    return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start)
+    return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
 
 
 def _model_and_start(recording: Recording, model: Model | None, init: str, smooth: bool) -> tuple[str, BiasModel, InitialBias]:
     if model is None:
-        about = recording.metadata.get("imutool", {})
-        model = shipped_for(about.get("sensor"), about.get("dataset")) or static.Model.method
+        model = next(iter(shipped_for(recording.metadata.get("imutool", {}))), static.Model.method)
     if not isinstance(model, BiasModel) or model.method == static.Model.method:
         given = static.Model.method if isinstance(model, BiasModel) else model
         ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)

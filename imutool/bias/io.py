@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -27,7 +28,12 @@ MAX_WEIGHT = 1e6  # the largest of the shipped models is 10
 MAX_TOML = 1 << 20  # bytes of a physics.toml; usual files have a few thousand
 MAX_SETTINGS = 16 << 10  # characters; usual settings have a few hundred
 WITH_RATE = ("conv", "hybrid", "neural_ode")  # their networks count in samples
-BEST_FIRST = ("hybrid", "neural_ode", "linear")  # by published results and docs/accuracy.md
+BEST_FIRST = ("hybrid", "neural_ode", "linear", "conv")  # by published results and docs/accuracy.md
+UNITS = {  # sensor and data set of the shipped models: the names of the sequences that this one unit recorded
+    ("adis16448", "euroc"): r"(MH_0[1-5]|V[12]_0[1-3])(_(easy|medium|difficult))?",
+    ("bmi160", "tum_vi"): r"(room|corridor|magistrale|outdoors|slides|calib-cam|calib-imu)[1-9]?",
+    ("fetch", "fetch"): r"0[1-8]_(square|um|eight|random|right_turn|left_turn|origin)",
+}
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
 
 
@@ -177,19 +183,21 @@ def shipped(name: str) -> Path:
     return files[name]
 
 
-def shipped_for(sensor: str | None, dataset: str | None) -> str | None:
-    """Name of the shipped model for the sensor of a data set, by the best method.
+def shipped_for(about: Mapping[str, str]) -> list[str]:
+    """Names of the shipped models for the very unit of a log, best method first.
 
-    None if there is none.
-
-    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 needs its own model.
+    A calibration belongs to one unit of a sensor, not to its type: another ADIS16448 needs its own model. `about` is what
+    the log says of its origin; the unit is known by sensor, data set, and the name of one of the data set's sequences.
     """
-    for method in BEST_FIRST if sensor and dataset else ():
-        for path in sorted(library().glob(f"*{method}.safetensors")):
-            about = header_of(path)
-            if (about["method"], about.get("sensor"), about.get("dataset")) == (method, sensor, dataset):
-                return path.stem
-    return None
+    names = UNITS.get((about.get("sensor", ""), about.get("dataset", "")))
+    if names is None or not re.fullmatch(names, about.get("sequence", "")):
+        return []
+    found = {}
+    for path in library().glob("*.safetensors"):
+        card = header_of(path)
+        if (card.get("sensor"), card.get("dataset")) == (about["sensor"], about["dataset"]):
+            found[card["method"]] = path.stem
+    return [found[method] for method in BEST_FIRST if method in found]
 
 
 def digest(path: Path) -> str:

@@ -19,6 +19,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
+from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import (
     InitialBias,
     NoRestError,
@@ -28,6 +29,7 @@ from imutool.bias_start.initial_bias import (
     smoothed_start,
 )
 from imutool.bias_start.stretches import Sieve, measured
+from imutool.bias_start.verdict import Fitness
 from imutool.cleaning import Survey, cleaned
 from imutool.cleaning.first_pass import raw_batches
 from imutool.errors import ConfigError, DataError, LogError, ModelError
@@ -130,6 +132,11 @@ def choose_model_and_start(
     else:
         start = find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
+
+
+def fitness_in_log(log: Log, topic: str, model: BiasModel, start: InitialBias, survey: Survey | None) -> Fitness:
+    """Fitness of a model, started in a log, for one of its IMUs."""
+    return judge(model, start, _Batches(log, topic, survey), log.metadata().get("imutool", {}))
 
 
 def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imutool.bias_start.verdict import Fitness
 from imutool.cli.app import HTML, LOG, LOST, RRD, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
@@ -23,8 +25,10 @@ if TYPE_CHECKING:
 MODEL_HELP = (
     "Model file, physics.toml or a name that ships; else a static estimate. TOPIC=MODEL sets the model of one IMU. Repeatable."
 )
+CONNECT_HELP = "Show the progress in a running viewer: HOST:PORT."
 CLEAN_HELP = "Drop invalid samples and convert units, as imutool clean does."
 REPORT_HELP = "Write an HTML page about the debiased log."
+FORCE_HELP = "Use a model although it does not fit the log; a warning says why it does not."
 ENCODING_HELP = "Encoding of the new IMU topic: that of its source, or CDR."
 VERIFY_HELP = "Chunks of OUT to read back: all, those with IMU messages (imu), or none."
 
@@ -46,12 +50,11 @@ def debias(
     clean: Annotated[bool, typer.Option("--clean", help=CLEAN_HELP)] = False,
     encoding: Annotated[str, typer.Option(metavar="own|cdr", help=ENCODING_HELP)] = "own",
     view: Annotated[bool, typer.Option("--view", help="Show the progress in a new viewer.")] = False,
-    connect: Annotated[
-        str | None, typer.Option(metavar="URL", help="Show the progress in a running viewer: HOST:PORT.")
-    ] = None,
+    connect: Annotated[str | None, typer.Option(metavar="URL", help=CONNECT_HELP)] = None,
     save_view: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save the viewer's data to a file."), RRD] = None,
     report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP), HTML] = None,
     max_chunk: MaxChunk = None,
+    force: Annotated[bool, typer.Option("--force", help=FORCE_HELP)] = False,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -76,6 +79,7 @@ def debias(
             check=verify,
             max_chunk=max_chunk,
             clean=CleaningSettings() if clean else None,
+            force=force,
             overwrite=overwrite and not in_place,
             encoding=encoding,
             progress=lambda done, total: tell(done, total, ""),
@@ -86,7 +90,7 @@ def debias(
         _say(report, summary)
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
         with progress("Drawing", verbose, quiet):
-            _draw(to_location(target or source), list(report.starts), report_to, overwrite)
+            _draw(to_location(target or source), report.fits, report_to, overwrite)
         if not json_only:
             say(f"Report: {report_to}")
     raise typer.Exit(LOST if report.lossy else 0)
@@ -115,6 +119,7 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
+    fit: Fitness
     left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
     stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
@@ -151,6 +156,7 @@ def _summary(
             start.rest[:3].tolist(),
             start.rest[3:].tolist(),
             start.std.tolist(),
+            report.fits[topic],
             report.sieves[topic].left_out or UNSET,
             [StretchEntry(*stretch) for stretch in report.sieves[topic].clock.stretches] or UNSET,
         )
@@ -177,6 +183,7 @@ def _say(report: DebiasReport, summary: DebiasSummary) -> None:
         gyro = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias)
         accel = ", ".join(f"{b:+.4f}" for b in imu.accel_bias)
         say(f"{topic}: {imu.model}, start bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
+        say(f"{topic}: {imu.fit.sentence('the model')}")
     counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
     say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
     verified = summary.verified
@@ -199,12 +206,14 @@ def _watching(
     return live_view(out.stem, connect_to=connect, save=save, instead=Path(f"{out.stem}.rrd"), overwrite=overwrite)
 
 
-def _draw(log: Location, topics: Sequence[str], page: Path, overwrite: bool) -> None:
+def _draw(log: Location, fits: Mapping[str, Fitness], page: Path, overwrite: bool) -> None:
     """Write a page about the debiased log; of several IMUs each has its topic as name."""
     from imutool.viewing.html.report import name_by_topic, write_page
     from imutool.viewing.model.runs import load
 
-    write_page(name_by_topic([load(log, imu=topic) for topic in topics], topics), page, overwrite=overwrite)
+    shown = [load(log, imu=topic) for topic in fits]
+    shown = [replace(run, notes=(*run.notes, fit.sentence("The model"))) for run, fit in zip(shown, fits.values(), strict=True)]
+    write_page(name_by_topic(shown, list(fits)), page, overwrite=overwrite)
 
 
 def _refuse_contradictions(target: str | None, in_place: bool, overwrite: bool) -> None:

@@ -6,14 +6,16 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
+from msgspec import convert
 
+from imutool.bias_start.verdict import Fitness
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.errors import ImutoolError
-from imutool.report import Report
+from imutool.report import Report, Section
 
 logger = logging.getLogger(__name__)
 
@@ -21,10 +23,39 @@ ALIGNED_HELP = "Also print evo's orientation error after an alignment of the pos
 TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
+class Score(Section, frozen=True):
+    """Scores of an estimate of a log; angles in degrees, lengths in metres, biases in rad/s and m/s².
+
+    Relative errors are keyed by their distance in metres; a figure that the log does not show is null.
+    """
+
+    log: str
+    model: str
+    estimate: Literal["integration", "zupt"]
+    init: str | None
+    init_how: str | None
+    smooth: bool
+    fit: Fitness | None
+    samples: int
+    duration_s: float
+    aoe_deg: float
+    aoe_aligned_deg: float | None
+    ape_m: float
+    ape_aligned_m: float | None
+    velocity_rmse_m_s: float | None
+    roe_deg: dict[str, float | None]
+    rpe_m: dict[str, float | None]
+    drift_orientation_deg: float | None
+    drift_velocity_m_s: float | None
+    drift_window_s: float
+    gyro_bias: list[float]
+    accel_bias: list[float]
+
+
 class Evaluation(Report, frozen=True, tag="imutool.evaluation/1"):
     """Report of `imutool evaluate`: scores of each log, model and estimate."""
 
-    results: list[dict[str, Any]]
+    results: list[Score]
 
 
 class VioReport(Report, frozen=True, tag="imutool.vio/1"):
@@ -72,27 +103,23 @@ def evaluate(
             first = len(results)
             refused: dict[str, ImutoolError] = {}
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
-            more: dict[str, Any] = {
-                "zupt": zupt,
-                "trajectories": trajectories,
-                "overwrite": overwrite,
-                "refused": refused.__setitem__,
-            }
+            more: dict[str, Any] = {"zupt": zupt, "trajectories": trajectories, "overwrite": overwrite}
+            more["refused"] = refused.__setitem__
             results += run(log, models=model or (), **read, **more)
             errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
                 run_data = load(log, models=scored, **read)
-                loaded.append(replace(run_data, notes=(*run_data.notes, *_stops(results[first:]))))
+                loaded.append(replace(run_data, notes=(*run_data.notes, *_fits(results[first:]), *_stops(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
-    if not write_json(Evaluation(results), json_to, overwrite=overwrite):
+    if not write_json(Evaluation(convert(results, list[Score])), json_to, overwrite=overwrite):
         rows = [{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results]
         figures(rows, aligned=aligned)
-        if report is not None:
-            say(f"Report: {report}")
+        for sentence in [*_fits(results), *([] if report is None else [f"Report: {report}"])]:
+            say(sentence)
     _raise_first(errors)
 
 
@@ -108,6 +135,12 @@ def _of_model(name: str, error: ImutoolError) -> ImutoolError:
     return type(error)(
         f"the model {name} is not scored: {error.what}", where=error.where, expected=error.expected, fix=error.fix
     )
+
+
+def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Sentences about the models that may not fit a log."""
+    rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] != "fits"]
+    return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
 
 
 def _stops(results: Sequence[dict[str, Any]]) -> list[str]:

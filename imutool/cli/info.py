@@ -69,6 +69,7 @@ def _described(
     log: str, quick: bool, max_chunk: int | None, noise: bool, settings: Mapping[str, str | None]
 ) -> tuple[LogInfo, IdentifiedNoise | None]:
     """Report on a log, and its noise if requested; the log is opened once."""
+    from imutool.bias.io import shipped_for
     from imutool.log_info.inspection import describe
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
@@ -77,7 +78,7 @@ def _described(
         fix = f"Name its logs, or report on all of them with: imutool fleet info {place} OUT"
         raise ConfigError("is a folder", where=place, expected="an MCAP log", fix=fix)
     with RecoveredLog(place, max_chunk=max_chunk) as opened:
-        report = describe(opened, check=not quick)
+        report = replace(describe(opened, check=not quick), models=shipped_for(opened.metadata().get("imutool", {})))
         if not noise:
             return report, None
         from imutool import noise_identification
@@ -90,6 +91,8 @@ def _print(report: LogInfo, identified: IdentifiedNoise | None) -> None:
     """Print tables, remarks, warnings and losses of one log."""
     table(topic_rows(report), keys=1)
     table(imu_rows(report), keys=2)
+    if report.models:
+        say(f"Models that ship for this very sensor: {', '.join(report.models)}")
     if identified is not None:
         from imutool import noise_identification
 

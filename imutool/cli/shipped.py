@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+from msgspec import convert
 from msgspec.structs import astuple
 
 from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written, app
+from imutool.cli.evaluate import Score
 from imutool.cli.terminal import epoch_line, err, figures, log_to_stderr, plain, progress, say, table, write_json
 from imutool.report import REPORTS, Report, Section, json_schema
 
@@ -18,7 +20,7 @@ FOLDER = Written(files=("*",), keeps=True)
 class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
     """Report of `imutool demo`: scores of `imutool evaluate`, and the files written."""
 
-    results: list[dict[str, Any]]
+    results: list[Score]
     log: str
     debiased: str
     model: str
@@ -98,7 +100,7 @@ def demo(
     with progress("Training", verbose, quiet) as tell:
         done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
     files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
-    if not write_json(DemoReport(results=done.results, **files), json_to, overwrite=overwrite):
+    if not write_json(DemoReport(results=convert(done.results, list[Score]), **files), json_to, overwrite=overwrite):
         say("Pure integration of a flight the model has not seen, from its true start:")
         figures(done.results)
         say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")

@@ -117,6 +117,7 @@ class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):
     checked: bool
     losses: dict[str, Any]
     noise: dict[str, Any] | UnsetType = UNSET
+    models: list[str] | UnsetType = UNSET  # that ship for the log's very unit, best first
 
 
 class LogInfos(Report, frozen=True, tag="imutool.infos/1"):

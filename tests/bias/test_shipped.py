@@ -48,12 +48,17 @@ def test_a_model_that_ships_is_whole(path: Path) -> None:
     assert all(log["name"] in card for log in about["logs"])
 
 
-def test_a_log_finds_the_best_model_of_its_sensor() -> None:
-    assert shipped_for("adis16448", "euroc") == "euroc-adis16448-hybrid"
-    assert shipped_for("bmi160", "tum_vi") == "tum_vi-bmi160-hybrid"
-    assert shipped_for("fetch", "fetch") == "fetch-hybrid"
-    for sensor, data_set in (("adis16448", "mine"), ("bmi160", "euroc"), (None, "euroc"), (None, None)):
-        assert shipped_for(sensor, data_set) is None
+UNITS = [("adis16448", "euroc", "MH_04_difficult"), ("bmi160", "tum_vi", "room6"), ("fetch", "fetch", "05_random")]
+
+
+@pytest.mark.parametrize(("sensor", "data_set", "sequence"), UNITS)
+def test_a_log_finds_the_models_of_its_very_unit(sensor: str, data_set: str, sequence: str) -> None:
+    about = {"sensor": sensor, "dataset": data_set, "sequence": sequence}
+    best, *others = shipped_for(about)
+    assert (best, len(others)) == (f"{data_set}{'' if sensor == data_set else f'-{sensor}'}-hybrid", 3)
+    for key in about:  # another unit of the sensor, another sensor, a recording that the data set does not have
+        assert shipped_for(about | {key: "mine"}) == []
+        assert shipped_for({name: word for name, word in about.items() if name != key}) == []
 
 
 def test_a_converted_log_is_debiased_with_it_unasked(data: Path, tmp_path: Path) -> None:

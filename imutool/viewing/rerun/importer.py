@@ -124,8 +124,7 @@ def _imu_and_model(log: Log) -> tuple[str | None, str | None]:
     imu = log.imu_topics[0]
     if any(topic.metadata.get(DERIVED_KEY) == imu for topic in log.with_schema((schemas.IMU,))):
         return imu, None
-    about = dict(log.metadata_records()).get(METADATA, {})
-    return imu, shipped_for(about.get("sensor"), about.get("dataset"))
+    return imu, next(iter(shipped_for(dict(log.metadata_records()).get(METADATA, {}))), None)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,227 @@
+"""Fitness of a bias model for a log, from its samples: `fits`, `doubtful` or `unfit`.
+
+The inertial filter predicts the samples of each half second: at rest no velocity and no rate, in motion a bounded velocity,
+which ties the gyro to the direction of gravity. Under a model that fits, the innovations e of the bounded velocity are small,
+e^T S^-1 e ~ chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking
+and Navigation, 2001, sec. 5.4), and the bias that the log shows by itself lies within the prior of the training runs. Where one
+of the two fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant bias: the
+model is unfit if even from its start in this log it explains the samples worse than no model.
+
+The thresholds come from `tests/bench/fit.py`: pieces of the training logs of the models that ship, and logs of other sensors.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imutool.bias import static
+from imutool.bias.io import library, shipped_for
+from imutool.bias.model import BiasModel, Vector6
+from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
+from imutool.bias_start.verdict import Fitness
+from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
+from imutool.inertial.stationary import white_noise
+from imutool.recording import GRAVITY_M_S2
+
+CHECKED_S = 120.0  # of a log that the check reads
+UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
+SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds
+MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
+MOST_DEVIATIONS = 5.0  # between the log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
+LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
+MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
+TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
+DEPENDENT = (
+    2.0  # ratio of the shown bias's deviation to the filter's, whose velocities are independent; a circling hand's are not
+)
+MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
+MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
+STUDENT = 7.0  # degrees of freedom of the innovations' likelihood, so that one jolt does not decide
+GRAVITY_RANGE = (0.8, 1.2)  # of the mean specific force to gravity; a sensor in g has 0.1
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Evidence of some samples about a prior: log-likelihood, share of surprising innovations, and the bias shown.
+
+    `difference` is that bias minus the prior's mean, `variance` its variance without the prior.
+    """
+
+    log_likelihood: float
+    surprising: float
+    difference: Vector6
+    variance: Vector6
+
+
+def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
+    """Fitness of a model, started in a log, for up to `CHECKED_S` seconds of its samples.
+
+    `about` is what the log says of its origin: `sensor`, `dataset`.
+    """
+    if model.method == static.Model.method:
+        units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
+        return Fitness("fits", (f"no trained model but a constant bias of this log; models ship for {', '.join(units)}",))
+    samples = _head(batches)
+    if len(samples[0]) < 2:
+        return Fitness("doubtful", ("the log is too short to be judged",))
+    if wrong := _wrong_gravity(samples):
+        return Fitness("unfit", (wrong,))
+    prior = _prior(model)
+    found = _evidence(model, samples, prior)
+    none = None
+    if _deviations(found, prior).max() > MOST_DEVIATIONS or found.surprising > MOST_SURPRISING:
+        none = _evidence(static.Model(), samples, BiasPrior(np.zeros(6), UNKNOWN_STD, prior.ground_std, prior.walk))
+    contradictions = [] if none is None else _contradictions(found, prior, none)
+    if none is not None and contradictions:
+        worse = _worse_than_none(model, samples, start, found, prior, none)
+        if worse:
+            return Fitness("unfit", (*contradictions, *worse))
+    doubts = [*contradictions, *_other_conditions(model, samples), *_other_unit(model, about)]
+    if not doubts and not _same_unit(model, about) and not _telling(found, prior):
+        doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
+    if doubts:
+        return Fitness("doubtful", tuple(doubts))
+    return Fitness("fits", (_agreement(found, prior),))
+
+
+def _prior(model: BiasModel) -> BiasPrior:
+    """Prior of a model's training runs; without any, that of an unknown sensor."""
+    prior = bias_prior(model)
+    return prior if model.prior_std.any() else replace(prior, std=UNKNOWN_STD)
+
+
+def _head(batches: Iterable[Samples]) -> Samples:
+    """Samples of the first `CHECKED_S` seconds."""
+    parts = list(itertools.takewhile(lambda part: not len(part[0]) or part[0][0] < CHECKED_S, batches))
+    t_s = np.concatenate([np.zeros(0), *(part[0] for part in parts)])
+    gyro, accel = (np.concatenate([np.zeros((0, 3)), *(part[column] for part in parts)]) for column in (1, 2))
+    end = int(np.searchsorted(t_s, CHECKED_S))
+    return t_s[:end], gyro[:end], accel[:end]
+
+
+def _wrong_gravity(samples: Samples) -> str:
+    """Sentence on a mean specific force that is not gravity's; empty if it is."""
+    size = float(np.median(np.linalg.norm(samples[2], axis=1)))
+    low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
+    if low <= size <= high:
+        return ""
+    return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
+
+
+def _evidence(model: BiasModel, samples: Samples, prior: BiasPrior) -> _Evidence:
+    """Evidence of samples, minus the model's motion-dependent bias, about a prior of a constant bias."""
+    blocks = list(filter_blocks(model, [samples], replace(prior, walk=np.zeros(6)), ahead=True))
+    if not blocks:
+        return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
+    innovations = np.array([_innovation(block) for block in blocks])
+    last = blocks[-1].step.after
+    after, before = np.diag(last.covariance(False)), prior.std**2
+    precision = 1.0 / after - 1.0 / before
+    shown = precision > 1e-9 / before
+    gain = np.where(shown, 1.0 - after / before, 1.0)
+    difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
+    variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
+    surprising = float((innovations[:, 0] > SURPRISING).mean())
+    return _Evidence(float(innovations[:, 1].sum()), surprising, difference, variance)
+
+
+def _innovation(block: FilteredBlock, settings: FilterSettings | None = None) -> tuple[float, float]:
+    """Chi-square of a block's velocity, and its log-likelihood under Student's distribution."""
+    s, expected = settings or FilterSettings(), block.step.expected
+    length_s = block.end_s - block.start_s
+    noise = s.rest_m_s**2 if block.resting else 2.0 * s.speed_m_s**2 * s.speed_correlation_s / length_s
+    S = expected.P[VELOCITY, VELOCITY] + noise * np.eye(3)
+    chi_square = float(expected.v_w @ np.linalg.solve(S, expected.v_w))
+    log_det = float(np.linalg.slogdet(S)[1])
+    return chi_square, -0.5 * (STUDENT + 3.0) * math.log1p(chi_square / STUDENT) - 0.5 * log_det
+
+
+def _deviations(found: _Evidence, prior: BiasPrior) -> Vector6:
+    """Differences between the bias that a log shows and the prior, in standard deviations."""
+    return np.asarray(np.abs(found.difference) / _shown_std(found, prior))
+
+
+def _shown_std(found: _Evidence, prior: BiasPrior) -> Vector6:
+    """Standard deviation of the bias that a log shows about the prior's mean."""
+    return np.asarray(np.sqrt(prior.std**2 + DEPENDENT**2 * found.variance + AT_REST_STD**2))
+
+
+def _contradictions(found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:
+    """Sentences on what in a log contradicts a prior and the correction, unless no model does better."""
+    sentences, deviations = [], _deviations(found, prior)
+    for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
+        axis = int(np.argmax(deviations[columns])) + columns.start
+        if deviations[axis] > MOST_DEVIATIONS:
+            sentences.append(
+                f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the training"
+                f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another switching-on"
+            )
+    if found.surprising > MOST_SURPRISING + none.surprising:  # fast vehicles surprise without a model, too
+        sentences.append(
+            f"gyro and gravity disagree after the correction in {found.surprising:.0%} of the half seconds, before it in"
+            f" {none.surprising:.0%}"
+        )
+    return sentences
+
+
+def _worse_than_none(
+    model: BiasModel, samples: Samples, start: InitialBias, found: _Evidence, prior: BiasPrior, none: _Evidence
+) -> list[str]:
+    """Sentences on a model that explains a log worse than no model, even from its start in that log."""
+    shown = found.variance < MOST_CHANGE**2 / MOST_DEVIATIONS**2
+    if (shown & (np.abs(found.difference) > MOST_CHANGE + MOST_DEVIATIONS * prior.std)).any():
+        return ["no switching-on changes the bias by so much: the log is of another unit"]
+    measured = start.std.any()  # a start that the user gives is no part of the model
+    used = start.follows or (replace(prior, mean=start.rest, std=np.maximum(start.std, LEAST_STD)) if measured else prior)
+    evidence = _evidence(model, samples, used).log_likelihood - none.log_likelihood
+    if evidence > LEAST_EVIDENCE:
+        return []
+    return [f"the raw samples agree with gravity and stops better than the corrected, by {-evidence:.0f} in log-likelihood"]
+
+
+def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
+    """Sentences on noise and sample rate that the training logs did not have."""
+    sentences = []
+    noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
+    known = model.noise_std > 0
+    ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
+    if ratio > MOST_NOISE:
+        sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
+    rate_hz = 1.0 / float(np.median(np.diff(samples[0])))
+    if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
+        sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
+    return sentences
+
+
+def _other_unit(model: BiasModel, about: Mapping[str, str]) -> Iterator[str]:
+    """Sentences on a log that names another origin than the model's."""
+    for key, words in (("sensor", "sensor"), ("dataset", "data set")):
+        own, other = model.card.get(key), about.get(key)
+        if own and other and own != other:
+            yield f"the model was made for the {words} {own}, the log is of {other}"
+
+
+def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
+    """Whether the log is of the very unit for which a model ships, or was in its training."""
+    names = [log.get("name") for log in model.card.get("logs", ()) if isinstance(log, dict)]
+    return model.card.get("name") in shipped_for(about) or about.get("sequence") in names
+
+
+def _telling(found: _Evidence, prior: BiasPrior) -> bool:
+    """Whether the log would show the bias of another sensor."""
+    return bool((_shown_std(found, prior) < TELLING / 2.0).any())
+
+
+def _agreement(found: _Evidence, prior: BiasPrior) -> str:
+    """Sentence on a log that agrees with a model."""
+    deviations = _deviations(found, prior)
+    return (
+        f"the log's bias lies within {deviations.max():.1f} standard deviations of the training runs, and gyro and gravity"
+        f" disagree in {found.surprising:.0%} of the half seconds"
+    )

@@ -1,0 +1,98 @@
+"""A model that ships fits logs of its sensor; of another sensor, or of samples that were tampered with, it is caught."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imutool
+from imutool.bias import linear, static
+from imutool.bias.io import save
+from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_at_rest import auto
+from imutool.bias_start.fitness import judge
+from imutool.bias_start.initial_bias import from_numbers, relative_samples
+from imutool.bias_start.verdict import Fitness
+from imutool.errors import ModelError
+from imutool.recording import Imu, Recording
+from imutool.sensor.made_up_flight import flight
+
+MADE_FOR = {"sensor": "made up", "dataset": "flights"}
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """A flight of a minute that starts at rest; its biases are its own."""
+    return flight(3, duration_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def model(recording: Recording) -> BiasModel:
+    """A model of that very sensor, without a motion-dependent part."""
+    rest = imutool.debias(recording, "static").start.rest
+    statistics = {
+        "prior_mean": rest,
+        "prior_std": np.array([1e-3] * 3 + [0.05] * 3),
+        "noise_std": np.array([5e-3] * 3 + [0.1] * 3),
+    }
+    made = linear.Model(linear.Config(), 1.0 / recording.imu.period_s, statistics)
+    made.card = {"name": "own", "logs": [{}] * 3, **MADE_FOR}
+    return made
+
+
+def judged(model: BiasModel, imu: Imu, about: dict[str, str] | None = None) -> Fitness:
+    return judge(model, auto(model, imu), [relative_samples(imu)], about or {})
+
+
+def test_the_sensor_itself_fits(model: BiasModel, recording: Recording) -> None:
+    assert judged(model, recording.imu).verdict == "fits"
+    assert judged(model, recording.imu, MADE_FOR).verdict == "fits"
+    assert judge(static.Model(), from_numbers("0,0,0,0,0,0"), [], {}).verdict == "fits"
+
+
+def test_another_name_is_doubtful_however_well_it_agrees(model: BiasModel, recording: Recording) -> None:
+    found = judged(model, recording.imu, MADE_FOR | {"sensor": "another"})
+    assert found == Fitness("doubtful", ("the model was made for the sensor made up, the log is of another",))
+
+
+TAMPERED = {
+    "gyro in deg/s": ("gyro and gravity disagree", lambda imu: replace(imu, gyro=np.degrees(imu.gyro))),
+    "accel in g": ("expected about 9.81", lambda imu: replace(imu, accel=imu.accel / 9.81)),
+    "axes of the gyro permuted": ("gyro", lambda imu: replace(imu, gyro=imu.gyro[:, [1, 2, 0]])),
+    "another unit": ("another unit", lambda imu: replace(imu, gyro=imu.gyro + np.array([0.08, 0.0, 0.0]))),
+}
+
+
+@pytest.mark.parametrize("how", TAMPERED)
+def test_what_is_not_of_the_sensor_is_unfit(how: str, model: BiasModel, recording: Recording) -> None:
+    reason, tamper = TAMPERED[how]
+    found = judged(model, tamper(recording.imu), MADE_FOR)
+    assert found.verdict == "unfit"
+    assert reason in " ".join(found.reasons)
+
+
+def test_another_switching_on_is_doubtful_not_unfit(model: BiasModel, recording: Recording) -> None:
+    shifted = replace(recording.imu, gyro=recording.imu.gyro + np.array([0.0, 0.015, 0.0]))
+    found = judged(model, shifted, MADE_FOR)
+    assert found.verdict == "doubtful"
+    assert "about y differs by" in found.reasons[0]
+
+
+def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
+    model: BiasModel, recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    imutool.write(tmp_path / "in.mcap", replace(recording, imu=replace(recording.imu, gyro=np.degrees(recording.imu.gyro))))
+    save(model, tmp_path / "own.safetensors")
+    words = [str(tmp_path / name) for name in ("in.mcap", "out.mcap", "own.safetensors")]
+    with pytest.raises(ModelError, match=r"does not fit this log.*`force`"):
+        imutool.debias(words[0], words[1], model=words[2])
+    assert not Path(words[1]).exists()
+    report = imutool.debias(words[0], words[1], model=words[2], force=True)
+    assert report.fits["/imu0"].verdict == "unfit"
+    assert "the model own is unfit: " in caplog.text
+    doubtful = imutool.debias(replace(recording, metadata={"imutool": {"sensor": "another"}}), model)
+    assert doubtful.fitness.verdict == "doubtful"
+    assert "the model own is doubtful: " in caplog.text
