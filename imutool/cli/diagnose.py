@@ -132,7 +132,7 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
         from imutool.diagnosis.closed_loop import table as closed_table
 
         left = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
-        answer = f"{left} is still missing" if diagnosis.closed.mismatch else "nothing is missing"
+        answer = f"still missing: {left}" if diagnosis.closed.mismatch else "nothing is missing"
         say(f"Simulated again with physics.toml and diagnosed again: {answer}.")
         table(closed_table(diagnosis.closed), keys=1)
     if folder is not None:

@@ -25,6 +25,7 @@ LOG = "closed.mcap"
 WINDOW_S = 5.0  # over which samples are integrated
 EDGES_HZ = (0.0, 1.0, 5.0, 20.0, np.inf)  # of the bands of the spectrum
 LATE_PARTS = 4  # of a log, for the error over time
+BY_RECORDING = {"quantization"}  # seen in the recording alone, also where the new simulation has it by its physics
 METRIC_S = 600.0  # that a metric may take
 
 
@@ -38,7 +39,9 @@ def closed_loop(
     compared = [*_compared(first.traces[0], again.traces[0])]
     if metric is not None and before is not None:
         compared.append(Compared("metric", metric(before), metric(log), "-"))
-    return ClosedLoop(str(log), again.mismatch, tuple(finding.effect for finding in again.findings), tuple(compared))
+    given = {finding.effect for finding in first.findings} & BY_RECORDING
+    missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
+    return ClosedLoop(str(log), bool(missing or again.located), missing, tuple(compared))
 
 
 def script_metric(script: Path, real: Path) -> Callable[[Path], float]:

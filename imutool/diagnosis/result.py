@@ -120,6 +120,7 @@ class Finding(Section, frozen=True, omit_defaults=True):
         similar: other effects that would do as well.
         kind: `driven` follows the channel `driver`; `unknown` is a `curve` of `variable`, or a term `variable`, on `axis`.
         onset_s: when it sets in (s from the start of the log).
+        python: an equation without a name as Python, where it has one.
     """
 
     effect: str
@@ -137,6 +138,7 @@ class Finding(Section, frozen=True, omit_defaults=True):
     axis: str | None = None
     variable: str = ""
     onset_s: float | None = None
+    python: str = ""
 
 
 class Unexplained(Section, frozen=True):

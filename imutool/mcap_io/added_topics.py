@@ -14,7 +14,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import as_ros1
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch, Topic
+from imutool.mcap_io.topics import DERIVED_KEY, REFLECTED, ImuBatch, Topic
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageTopic
 
@@ -87,11 +87,12 @@ def define(out: LogWriter, new: NewTopic, log: Log, source: Topic, *, own: bool)
         text, name = schemas.ros1_definition(new.schema_name).encode(), new.schema_name.replace("/msg/", "/")
         topic = MessageTopic(new.name, name, "ros1msg", text, "ros1", tuple(metadata.items()))
         return out.define(topic), partial(as_ros1, schema_name=new.schema_name)
-    if own and source.reflected is not None and new.schema_name == schemas.IMU:
+    if own and source.message_encoding in REFLECTED and new.schema_name == schemas.IMU:
         channel = next(channel for channel in log.index.channels.values() if channel.topic == source.name)
         schema = log.index.schemas.get(channel.schema_id)
         data = schema.data if schema else b""
         described = source.own_schema, source.schema_encoding, data, source.message_encoding, tuple(metadata.items())
+        assert source.reflected is not None, "an IMU in such an encoding was found by reflection"
         return out.define(MessageTopic(new.name, *described)), source.reflected.from_cdr
     return out.channel(new.name, new.schema_name, metadata), None
 

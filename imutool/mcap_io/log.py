@@ -62,9 +62,7 @@ class Log:
         try:
             with self.named():
                 self.index = self._read_index(self._source)
-                self.topics = MappingProxyType(topics_of(self.index))
-                imus = dict(reflected_topics(self.index, self.topics, self._first))
-                self.topics = MappingProxyType({**self.topics, **imus})
+                self._read_topics()
         except BaseException:
             self.close()
             raise
@@ -72,11 +70,14 @@ class Log:
     def _read_index(self, source: Source) -> LogIndex:
         return LogIndex(source, self.max_chunk)
 
-    def _first(self, topic: str) -> bytes | None:
-        """Bytes of a topic's first message."""
-        for _, rows in self.rows([topic]):
-            return bytes(rows.payload[0])
-        return None
+    def _read_topics(self) -> None:
+        """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
+        self.topics = MappingProxyType(topics_of(self.index))
+
+        def first(topic: str) -> bytes | None:
+            return next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
+
+        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, first)})
 
     def __enter__(self) -> Log:
         return self

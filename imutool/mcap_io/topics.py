@@ -15,7 +15,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_imu, decode_poses, decode_scalars, decode_twist
 from imutool.mcap_io.codec.messages import Messages, Rows
-from imutool.mcap_io.codec.reflection import ReflectedImu, reflect
+from imutool.mcap_io.codec.reflection import ReflectedImu, reflect, reflect_cdr
 from imutool.mcap_io.index import LogIndex
 
 ENCODINGS = ("cdr", "ros1")
@@ -247,11 +247,13 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
     return found
 
 
-def reflected_topics(
-    index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]
-) -> Iterator[tuple[str, Topic]]:
-    """IMUs among the topics whose type is none of ROS; `first` gives the first message of a topic."""
+def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]) -> dict[str, Topic]:
+    """IMUs among the topics whose type is not that of ROS; `first` gives the first message of a topic.
+
+    Types of ROS 2 count only where the log has no other IMU: drivers publish their own message beside that of ROS.
+    """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
+    imus: dict[str, Topic] = {}
     for name, topic in topics.items():
         if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
             continue
@@ -262,4 +264,16 @@ def reflected_topics(
         except ImportError:
             continue
         if imu is not None:
-            yield name, replace(topic, schema_name=schemas.IMU, reflected=imu, own_schema=topic.schema_name)
+            imus[name] = _as_imu(topic, imu)
+    if imus or any(topic.schema_name == schemas.IMU for topic in topics.values()):
+        return imus
+    for name, topic in topics.items():
+        described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr")
+        definition = definitions[name] if described else None
+        if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
+            imus[name] = _as_imu(topic, imu)
+    return imus
+
+
+def _as_imu(topic: Topic, imu: ReflectedImu) -> Topic:
+    return replace(topic, schema_name=schemas.IMU, reflected=imu, own_schema=topic.schema_name)

@@ -12,6 +12,7 @@ import hashlib
 import importlib.util
 import json
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
@@ -24,11 +25,13 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from imutool.errors import LogError
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.encode import encode_image, encode_imu
 from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+from imutool.mcap_io.repair import repair
 
 COUNT = 2001
 LIMIT_S = 40
@@ -231,7 +234,39 @@ def main() -> None:
                 print(f"open as {opener.__name__:14} {1e3 * (time.process_time() - began):8.1f} ms CPU")
 
 
+def small_chunks(count: int) -> None:
+    """CPU seconds of `info` and `repair` for a log of so many chunks of one message, whole and with one flipped byte."""
+    with tempfile.TemporaryDirectory() as name:
+        log = Path(name) / "log.mcap"
+        with log.open("wb") as file:
+            writer = Writer(file, chunk_size=1)
+            writer.start("ros2")
+            channel = writer.register_channel(
+                "/talk", "cdr", writer.register_schema("std_msgs/msg/Int64", "ros2msg", b"int64 data\n")
+            )
+            for row in range(count):
+                writer.add_message(channel, 10**18 + row, struct.pack("<Iq", 256, row), 10**18 + row, row)
+            writer.finish()
+        for state in ("whole", "one byte flipped"):
+            for what, work in (
+                ("info", lambda: inspect(log)),
+                ("repair", lambda: repair(log, log.with_name("out"), overwrite=True)),
+            ):
+                began = time.process_time()
+                work()
+                print(f"{state}, {what}: {time.process_time() - began:.1f} CPU s", flush=True)
+            if state == "whole":
+                with Log(log) as opened:
+                    block = opened.index.blocks[count // 3]
+                raw = bytearray(log.read_bytes())
+                raw[block.offset + block.length - 1] ^= 1
+                log.write_bytes(raw)
+
+
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["--small-chunks"]:
+        small_chunks(int(sys.argv[2]))
+        sys.exit()
     if sys.argv[1:2] == ["--read"]:
         print(json.dumps(digests(READERS[sys.argv[2]][0](Path(sys.argv[3])))))
     else:

@@ -11,6 +11,7 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -139,6 +140,42 @@ def test_debias_leaves_out_what_holds_no_sample_and_counts_it(imutool, tmp_path)
     assert done.returncode == 3
     assert "1 not finite" in done.stderr
     assert len(read(tmp_path / "d.mcap", imu="/robot/imu/debiased").imu) == COUNT - 1
+
+
+def test_a_ros2_type_with_rates_and_accelerations_is_an_imu_where_the_log_has_no_other(imutool, tmp_path):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    text = "uint64 timestamp\nstring note\nfloat32[3] gyro_rad\nuint32 gyro_integral_dt\nfloat32[3] accelerometer_m_s2\n"
+    store.register(get_types_from_msg(text, "px4_msgs/msg/SensorCombined"))
+    kind = store.types["px4_msgs/msg/SensorCombined"]
+    with (tmp_path / "in.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema("px4_msgs/msg/SensorCombined", "ros2msg", text.encode())
+        channel = writer.register_channel("/fmu/out/sensor_combined", "cdr", schema)
+        for n in range(COUNT):
+            message = kind(n, "x" * (n // 100), GYRO[n].astype(np.float32), 5000, ACCEL[n].astype(np.float32))
+            t_ns = START_NS + n * 5_000_000
+            writer.add_message(channel, t_ns, store.serialize_cdr(message, message.__msgtype__), t_ns)
+        writer.finish()
+    imu = read(tmp_path / "in.mcap").imu
+    assert imu.t_ns.tolist() == [START_NS + n * 5_000_000 for n in range(COUNT)]  # the log times: its stamp has no unit
+    assert np.array_equal(imu.gyro, GYRO.astype(np.float32))
+    assert np.array_equal(imu.accel, ACCEL.astype(np.float32))
+    assert imutool("debias", "in.mcap", "d.mcap", cwd=tmp_path).returncode == 0
+    with Log(tmp_path / "d.mcap") as log:
+        assert log.topics["/fmu/out/sensor_combined/debiased"].schema_name == "sensor_msgs/msg/Imu"
+        assert log.topics["/fmu/out/sensor_combined/debiased"].reflected is None
+
+
+def test_a_log_cut_in_its_summary_is_debiased_in_its_encoding(imutool, tmp_path):
+    log = write_log(tmp_path / "in.mcap", "protobuf")
+    log.write_bytes(log.read_bytes()[:-60])
+    done = imutool("debias", "in.mcap", "d.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "mended: the log ends inside its summary" in done.stdout
+    with Log(tmp_path / "d.mcap") as made:
+        assert made.topics["/robot/imu/debiased"].message_encoding == "protobuf"
+    assert len(read(tmp_path / "d.mcap", imu="/robot/imu/debiased").imu) == COUNT
 
 
 def test_a_cut_log_is_refused_and_repair_is_named(convert, tmp_path):

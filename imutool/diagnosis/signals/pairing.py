@@ -90,6 +90,9 @@ def paired(real: Location, sim: Location) -> Pairing:
             pair, remark = in_one_unit(given)
             remarks += [remark] if remark else []
             pairs.append(pair)
+    if any(pair.kind == "wheels" for pair in pairs):  # the wheels are given, as the motion of an arm is
+        joints = tuple(f"{topic}." for topic, schema in own.schemas.items() if schema == JOINTS)
+        pairs = [pair for pair in pairs if not pair.names[0].startswith(joints)]
     pairs.sort(key=lambda pair: pair.kind == "number")  # a sort keeps the log's order otherwise
     untried = [name for pair in pairs[MOST_COMPARED:] for name in pair.names]
     pairs = pairs[:MOST_COMPARED]

@@ -3,30 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float64
-from scipy.ndimage import median_filter
-from scipy.signal import welch
+from jaxtyping import Float64
 
-from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.noise_estimate import noise_std, ridge_fit
+from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.observability import unobservable
-from imutool.diagnosis.estimation.timestamps import grid
-from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
-from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
+from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import held_out_rms, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
-from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
+from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import common_effects as common
-from imutool.diagnosis.signals.alignment import AlignedSignal, Column, aligned
+from imutool.diagnosis.signals.alignment import AlignedSignal, aligned
+from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.noise import lsb_of, rich_residual, whitened
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
@@ -42,7 +40,10 @@ from imutool.sensor.robot_effects import (
 )
 
 EXACT = 1e-3
-RICH_KNOTS = 12
+MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
+LEARNT_ERROR = 0.003  # of the efforts themselves
+SMALL_GAIN = 1e-3  # of the largest effect's squares, which such an error may take (3 % of its size)
+CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 CERTAIN = 6.0  # deviations from which a constant is a finding
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
 DELAYS = frozenset({"delay", "latency"})
@@ -90,21 +91,36 @@ def diagnose_signal(
     """
     settings = settings or DiagnoseSettings()
     signal = aligned(pair, others, settings)
-    lsb = _lsb(pair, settings)
+    lsb = lsb_of(pair, settings)
     always: Chosen = tuple((common.offset(signal, k), np.zeros(1)) for k in range(signal.columns))
     candidates = catalogue(signal)
     if not signal.shares_epoch:
         always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
         candidates = [effect for effect in candidates if effect.name not in DELAYS]
     columns = range(signal.columns)
-    later = [[e for k in columns for e in common.driven(signal, k)], [e for k in columns for e in common.unknown(signal, k)]]
-    log = _whitened(signal, np.stack([_rich_residual(signal, k) for k in columns], axis=1), lsb)
-    selection = select_effects([log], candidates, later, always=always)
-    rewhitened = _whitened(signal, signal.real - expected(signal, selection.whole.chosen), lsb)
+    log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
+    selection = _selected(log, candidates, always)
+    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), lsb)
     if (noise_std(rewhitened.whiten) < settings.signal.better_noise * noise_std(log.whiten)).any():
         log = rewhitened  # the effects' own high frequencies were taken for noise
-        selection = select_effects([log], candidates, later, always=always)
+        selection = _selected(log, candidates, always)
     return _summarized(log, candidates, selection, lsb, settings)
+
+
+def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Selection:
+    """Effects of the catalogue, channels that drive and terms of equations; a curve where none of them stands out."""
+    signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    columns = range(signal.columns)
+    driven = [effect for k in columns for effect in common.driven(signal, k)]
+    equations = [effect for k in columns for effect in terms(signal, k)]
+    selection = select_effects([log], candidates, [driven, equations], always=always)
+    if selection.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
+        return selection
+    curves = [effect for k in columns for effect in common.unknown(signal, k)]
+    curved = select_effects([log], candidates, [driven, curves], always=always)
+    before = fit([log], always, part="all").objective
+    gain = selection.whole.objective - curved.whole.objective
+    return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection
 
 
 def catalogue(signal: AlignedSignal) -> list[Effect]:
@@ -112,95 +128,6 @@ def catalogue(signal: AlignedSignal) -> list[Effect]:
     scale = signal.scale()
     any_signal = common.named(signal) if signal.columns == 1 else ()
     return [*any_signal, *(effect for effects in CATALOGUE.get(signal.kind, ()) for effect in effects(scale))]
-
-
-# ── noise ──
-
-
-def _whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Sequence[float]) -> WhitenedLog:
-    """The signal with its noise model.
-
-    Where the simulated signal has its power, the noise density is taken from just above, so that an effect that nobody has
-    modelled is not taken for noise; the simulation's own noise, which is in its band, comes on top. An error of rounding is no
-    white noise where the signal is slow: the density is no less than that.
-    """
-    settings, band = pair.settings, None
-    if pair.band_hz is not None:
-        band = Band.below(pair.band_hz, 1.0 / pair.period_s, settings.noise)
-    every = 1 if band is None else band.every
-    usable, rate_hz, filters, stds = pair.usable[::every, 0], 1.0 / (pair.period_s * every), [], []
-    slow, expected_slow = (values if band is None else band(values) for values in (residual, pair.sampled.x))
-    top_hz = settings.signal.noise_band_end * rate_hz if pair.band_hz is None else 0.9 * pair.band_hz
-    for k in range(pair.columns):
-        edge = _edge_hz(expected_slow[:, k], rate_hz, settings)
-        f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise, "median" if band is None else "mean")
-        near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
-        far = (f_hz >= edge) & (f_hz <= top_hz)
-        level = float(np.median(power[near]))
-        if band is None:  # the error of a motion grows with frequency
-            level = max(level, float(np.median(power[far])))
-        power[f_hz < edge] = level + pair.sim_density[k]
-        if lsb[k]:
-            model = (pair.real - residual)[:, k]
-            rounding = np.rint(model / lsb[k]) * lsb[k] - model
-            power = np.maximum(power, _density(rounding[::every], usable, rate_hz, settings.noise)[1])
-        filter_, std = autoregression(power, rate_hz, settings.noise.order)
-        filters.append(filter_)
-        stds.append(std)
-    return WhitenedLog(pair, Whitener(np.stack(filters), np.array(stds), band))
-
-
-def _edge_hz(x: Column, rate_hz: float, settings: DiagnoseSettings) -> float:
-    """Frequency where a signal's power ends, within what a noise can be measured above."""
-    own = settings.signal
-    f_hz, power = welch(x, rate_hz, nperseg=min(settings.noise.segment_samples, len(x)))
-    share = np.cumsum(power) / max(float(power.sum()), 1e-300)
-    edge_hz = own.edge_factor * f_hz[np.searchsorted(share, own.power_share)]
-    return float(np.clip(edge_hz, own.least_edge * rate_hz, own.most_edge * rate_hz))
-
-
-def _density(
-    x: Float64[np.ndarray, " n"],
-    usable: Bool[np.ndarray, " n"],
-    rate_hz: float,
-    settings: NoiseSettings,
-    average: Literal["median", "mean"] = "median",
-) -> tuple[Column, Column]:
-    """Frequencies, and the one-sided density of the usable part of a signal, without lines.
-
-    The mean counts what comes off and on, as a joint turns round, for noise.
-    """
-    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(settings.segment_samples, len(x)), average=average)
-    return f_hz, np.asarray(median_filter(power, settings.line_bins, mode="nearest")) / max(float(usable.mean()), 1e-3)
-
-
-def _rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]:
-    """Residual of a smooth function of signals, derivatives, state and time: noise, or what is sharp."""
-    ideal, k = pair.ideal, np.arange(len(pair.ideal.fine))
-    at = (pair.stamp_s - pair.lag_s - ideal.start_s) * ideal.rate_hz
-    derivatives = [ideal.fine]
-    for _ in range(3):
-        derivatives.append(np.gradient(derivatives[-1], axis=0) * ideal.rate_hz)
-    columns = [np.interp(at, k, values) for each in derivatives for values in each.T]
-    x, dx = columns[column], columns[column + pair.columns]
-    states = [np.interp(at, k, values) for values in ideal.state.values()]
-    columns += [np.sign(x), np.sign(dx), *states, *(np.sign(values) for values in states)]
-    for values in (x, dx, pair.stamp_s, *states):
-        if np.ptp(values) > 0:
-            columns += [*SplineBasis(np.linspace(values.min(), values.max(), RICH_KNOTS - 2)).basis(values).T]
-    return np.asarray(pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], pair.usable[:, 0]))
-
-
-def _lsb(pair: SignalPair, settings: DiagnoseSettings) -> list[float]:
-    """Quantization step of recorded values, by column.
-
-    0 where they lie on no grid, or the simulation's lie on the same.
-    """
-    steps = []
-    for real, sim in zip(pair.real.T, pair.sim.T, strict=True):
-        step, simulated = (grid(values, settings.timestamps) for values in (real, sim))
-        steps.append(0.0 if simulated and abs(step / simulated - 1.0) < settings.signal.same_grid else step)
-    return steps
 
 
 # ── report ──
@@ -211,8 +138,9 @@ def _summarized(
 ) -> SignalDiagnosis:
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     level, logs, names = noise_floor([log]), [log], pair.names
+    selection, small = _above_model_error(log, selection, level)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
-    findings = [finding_of(logs, selection, selected, level) for selected in selection.selected]
+    findings = [_with_python(finding_of(logs, selection, selected, level)) for selected in selection.selected]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
     located = locate_findings([pair], [before], [after], level, (), p_values, settings.localization) if findings else []
     floor = level.copy()
@@ -224,9 +152,13 @@ def _summarized(
             floor[k] = np.hypot(level[k], lsb[k] / np.sqrt(12.0))
     offsets = dict(_offsets(pair, selection))
     findings += _constants(pair, offsets, level)
+    if pair.band_hz is not None:  # dynamics that were learnt are known to a per cent
+        floor = level = np.hypot(
+            level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
+        )
     unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
-    unseen = [] if pair.columns == 1 else _unseen(log, candidates, selection, settings)
+    unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
     return SignalDiagnosis(
         located=tuple(located),
         findings=tuple(findings),
@@ -242,6 +174,30 @@ def _summarized(
             for k, name in enumerate(names)
         },
     )
+
+
+def _with_python(finding: Finding) -> Finding:
+    """A finding with its equation as Python."""
+    if finding.kind != "unknown" or finding.curve is not None:
+        return finding
+    return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
+
+
+def _above_model_error(log: WhitenedLog, selection: Selection, level: Float64[np.ndarray, " k"]) -> tuple[Selection, list[str]]:
+    """Selection without effects as small as the error of learnt dynamics, and those effects."""
+    pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    if pair.band_hz is None or not selection.selected:
+        return selection, []
+    least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
+    kept, small, scale = list[SelectedEffect](), list[SelectedEffect](), pair.scale()
+    for selected in selection.selected:
+        held_out = finding_of([log], selection, selected, level).held_out
+        size = float(np.sqrt(max(held_out.rms_before**2 - held_out.rms_after**2, 0.0)))
+        columns = [pair.names.index(name) for name in selected.effect.sensors] or list(range(pair.columns))
+        large = selected.gain >= least and size >= LEARNT_ERROR * min(scale.size[k] for k in columns)
+        (kept if large else small).append(selected)
+    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
+    return replace(selection, selected=tuple(kept)), names
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""IMU messages of other encodings, found by reflection: protobuf by its descriptors, JSON by its first message.
+"""IMU messages of other types, found by reflection: by protobuf descriptors, ros2msg definitions, or a first JSON message.
 
 A message is that of an IMU if it holds an angular velocity and a linear acceleration of three numbers each, by the names of its
 fields. Values count as rad/s and m/s². A message that lacks them has NaN, so that `clean` can leave it out.
@@ -16,7 +16,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
+from imutool.errors import LogError
+from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.described_cdr import DescribedCdr
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, NS_PER_S, runs
@@ -151,6 +154,15 @@ def reflect(encoding: str, schema_name: str, schema: bytes, first: bytes | None)
         protobuf = Protobuf.of(schema_name, schema)
         return None if protobuf is None else _found(protobuf.tree(DEPTH), protobuf)
     return None
+
+
+def reflect_cdr(schema_name: str, schema: bytes) -> ReflectedImu | None:
+    """Fields of an IMU in a `ros2msg` definition; None of any other message, or a definition that cannot be read."""
+    try:
+        form = DescribedCdr(ros2_definition.parse(schema_name, schema))
+    except LogError:
+        return None
+    return _found(form.tree(DEPTH), form)
 
 
 def _found(tree: Tree, form: Format) -> ReflectedImu | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 import numpy as np
 from mcap.opcode import Opcode
 
@@ -13,7 +11,6 @@ from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.summary import PRIVATE
 from imutool.mcap_io.storage.source import Source, crc_of
-from imutool.mcap_io.topics import topics_of
 from imutool.mcap_io.verify import stated_crc
 
 
@@ -63,7 +60,7 @@ class RecoveredLog(Log):
         with self.named():
             self.index = RecoveredIndex(self._source, self.max_chunk, by_records=True)
             self.index.check()
-            self.topics = MappingProxyType(topics_of(self.index))
+            self._read_topics()
 
     def check_data_crc(self) -> None:
         """Compares the CRC of the data section, where one is stated and no damage is known yet.

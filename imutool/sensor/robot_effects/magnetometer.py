@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.scale import Scale
-from imutool.sensor.robot_effects.signal_samples import SignalSamples, Values
+from imutool.sensor.robot_effects.signal_samples import SignalSamples
 from imutool.units import AXES
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -31,7 +32,7 @@ def _misaligned(s: SignalSamples, theta: Theta) -> SignalSamples:
     return s.but(s.y @ Rotation.from_rotvec(theta).as_matrix())
 
 
-def attitude(s: SignalSamples) -> Values:
+def attitude(s: SignalSamples) -> Float64[np.ndarray, "n 3 3"]:
     """R_wb at the samples, from the state."""
     return np.asarray(np.stack([s.state[f"R{i}{j}"] for i in range(3) for j in range(3)], axis=1).reshape(-1, 3, 3))
 

@@ -85,7 +85,7 @@ def _findings(d: Diagnosis) -> Iterator[str]:
         cells = [
             f"<strong>{text(label(finding))}</strong> {text(finding.signal)}"
             f"<br>{text(effect_sentence(d, finding))}{_similar(finding)}",
-            f"<code>{text(finding.equation)}</code>{_entries(finding)}",
+            f"<code>{text(finding.equation)}</code>{_python(finding)}{_entries(finding)}",
             _gain(finding),
             f"<span class=entry>{text(chance_text(finding.false_discovery_rate, short=True))}</span>",
         ]
@@ -119,6 +119,10 @@ def _entries(finding: Finding) -> str:
     return "".join(out)
 
 
+def _python(finding: Finding) -> str:
+    return f"<pre>{text(finding.python)}</pre>" if finding.python else ""
+
+
 def _locations(d: Diagnosis) -> Iterator[str]:
     if not d.located:
         return
@@ -138,7 +142,7 @@ def _locations(d: Diagnosis) -> Iterator[str]:
 
 
 def _before_and_after(d: Diagnosis) -> Iterator[str]:
-    if not d.traces:
+    if not d.traces and not d.signals:
         return
     found = bool(d.findings)
     legend = BEFORE + AFTER if found else DIFFERENCE
@@ -152,6 +156,8 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
+    if not d.traces:
+        return
     spectrum, rate, attitude = figures.spectrum(d), figures.residual_against_rate(d), figures.residual_against_attitude(d)
     if spectrum is not None:
         yield _figure(
@@ -209,7 +215,7 @@ def _provenance(d: Diagnosis) -> Iterator[str]:
     yield f"<dt>expected from</dt><dd>{text(d.sim) if d.sim is not None else 'the true poses of the recording itself'}</dd>"
     for trace in d.traces:
         yield f"<dt>samples</dt><dd>{text(_samples(trace))}</dd>"
-    for bias in d.bias:
+    for bias in (row for row in d.bias if not math.isnan(row.sum()) or d.traces):
         gyro, accel = (", ".join(f"{b:+.4g}" for b in part) for part in (bias[:3], bias[3:]))
         yield f"<dt>constant bias</dt><dd>gyro ({gyro}) rad/s, accel ({accel}) m/s²</dd>"
     if d.not_identifiable:

@@ -60,7 +60,7 @@ class _Cdr:
     def __init__(self) -> None:
         self.data = bytearray(b"\0\1\0\0")
 
-    def number(self, kind: str, *values: float) -> None:
+    def number(self, kind: str, *values: float | int) -> None:
         size = struct.calcsize(kind)
         for value in values:
             self.data += b"\0" * (-(len(self.data) - 4) % size) + struct.pack(f"<{kind}", value)

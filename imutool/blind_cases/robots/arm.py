@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-STEP_S, EACH, SETTLING_S = 0.001, 5, 2.0  # integrated at 1 kHz, recorded at 200 Hz
+STEP_S, EACH, SETTLING_S = 0.001, 10, 2.0  # integrated at 1 kHz, recorded at 100 Hz
 ANGLE_NOISE, VELOCITY_NOISE, EFFORT_NOISE = 2e-5, 5e-4, 0.004  # rad, rad/s, of the efforts' size
 BANDWIDTH = 9.0  # rad/s of the controller
 

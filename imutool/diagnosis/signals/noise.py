@@ -1,0 +1,107 @@
+"""Noise of a signal: whitening filters by column, and the step of its values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.ndimage import median_filter
+from scipy.signal import welch
+
+from imutool.diagnosis.estimation.noise_estimate import ridge_fit
+from imutool.diagnosis.estimation.timestamps import grid
+from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
+from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
+from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
+from imutool.diagnosis.signals.alignment import AlignedSignal, Column
+from imutool.diagnosis.signals.ideal_signal import SignalPair
+
+RICH_KNOTS = 12
+
+
+def whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Sequence[float]) -> WhitenedLog:
+    """The signal with its noise model.
+
+    Where the simulated signal has its power, the noise density is taken from just above, so that an effect that nobody has
+    modelled is not taken for noise; the simulation's own noise, which is in its band, comes on top. An error of rounding is no
+    white noise where the signal is slow: the density is no less than that.
+    """
+    settings, band = pair.settings, None
+    if pair.band_hz is not None:
+        band = Band.below(pair.band_hz, 1.0 / pair.period_s, settings.noise)
+    every = 1 if band is None else band.every
+    usable, rate_hz, filters, stds = pair.usable[::every, 0], 1.0 / (pair.period_s * every), [], []
+    slow, expected_slow = (values if band is None else band(values) for values in (residual, pair.sampled.x))
+    top_hz = settings.signal.noise_band_end * rate_hz if pair.band_hz is None else 0.9 * pair.band_hz
+    for k in range(pair.columns):
+        edge = _edge_hz(expected_slow[:, k], rate_hz, settings)
+        f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise, "median" if band is None else "mean")
+        near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
+        far = (f_hz >= edge) & (f_hz <= top_hz)
+        level = float(np.median(power[near]))
+        if band is None:  # the error of a motion grows with frequency
+            level = max(level, float(np.median(power[far])))
+        power[f_hz < edge] = level + pair.sim_density[k]
+        if lsb[k]:
+            model = (pair.real - residual)[:, k]
+            rounding = np.rint(model / lsb[k]) * lsb[k] - model
+            power = np.maximum(power, _density(rounding[::every], usable, rate_hz, settings.noise)[1])
+        filter_, std = autoregression(power, rate_hz, settings.noise.order)
+        filters.append(filter_)
+        stds.append(std)
+    return WhitenedLog(pair, Whitener(np.stack(filters), np.array(stds), band))
+
+
+def _edge_hz(x: Column, rate_hz: float, settings: DiagnoseSettings) -> float:
+    """Frequency where a signal's power ends, within what a noise can be measured above."""
+    own = settings.signal
+    f_hz, power = welch(x, rate_hz, nperseg=min(settings.noise.segment_samples, len(x)))
+    share = np.cumsum(power) / max(float(power.sum()), 1e-300)
+    edge_hz = own.edge_factor * f_hz[np.searchsorted(share, own.power_share)]
+    return float(np.clip(edge_hz, own.least_edge * rate_hz, own.most_edge * rate_hz))
+
+
+def _density(
+    x: Float64[np.ndarray, " n"],
+    usable: Bool[np.ndarray, " n"],
+    rate_hz: float,
+    settings: NoiseSettings,
+    average: Literal["median", "mean"] = "median",
+) -> tuple[Column, Column]:
+    """Frequencies, and the one-sided density of the usable part of a signal, without lines.
+
+    The mean counts what comes off and on, as a joint turns round, for noise.
+    """
+    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(settings.segment_samples, len(x)), average=average)
+    return f_hz, np.asarray(median_filter(power, settings.line_bins, mode="nearest")) / max(float(usable.mean()), 1e-3)
+
+
+def rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]:
+    """Residual of a smooth function of signal, state and time: noise, or what is sharp."""
+    ideal, k = pair.ideal, np.arange(len(pair.ideal.fine))
+    at = (pair.stamp_s - pair.lag_s - ideal.start_s) * ideal.rate_hz
+    derivatives = [ideal.fine]
+    for _ in range(3):
+        derivatives.append(np.gradient(derivatives[-1], axis=0) * ideal.rate_hz)
+    columns = [np.interp(at, k, values) for each in derivatives for values in each.T]
+    x, dx = columns[column], columns[column + pair.columns]
+    states = [np.interp(at, k, values) for values in ideal.state.values()]
+    columns += [np.sign(x), np.sign(dx), *states, *(np.sign(values) for values in states)]
+    for values in (x, dx, pair.stamp_s, *states):
+        if np.ptp(values) > 0:
+            columns += [*SplineBasis(np.linspace(values.min(), values.max(), RICH_KNOTS - 2)).basis(values).T]
+    return np.asarray(pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], pair.usable[:, 0]))
+
+
+def lsb_of(pair: SignalPair, settings: DiagnoseSettings) -> list[float]:
+    """Quantization step of recorded values, by column.
+
+    0 where they lie on no grid, or the simulation's lie on the same.
+    """
+    steps = []
+    for real, sim in zip(pair.real.T, pair.sim.T, strict=True):
+        step, simulated = (grid(values, settings.timestamps) for values in (real, sim))
+        steps.append(0.0 if simulated and abs(step / simulated - 1.0) < settings.signal.same_grid else step)
+    return steps
