@@ -31,7 +31,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from imutool.mcap_io.added_topics import Made, NewTopic
+from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.codec.messages import message_record, message_rows
@@ -61,12 +61,12 @@ class Constant:
         NewTopic(f"{IMU}/bias", schemas.TWIST),
     )
 
-    def __call__(self, batch: ImuBatch) -> Made:
+    def __call__(self, batch: ImuBatch) -> DerivedBatch:
         """The same bias for every sample."""
         bias, eye = np.tile(BIAS, (len(batch.stamp_ns), 1)), np.tile(np.eye(6), (len(batch.stamp_ns), 1, 1))
         imu = encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel - bias, batch.frame_id)
         vector = encode_vector3(batch.stamp_ns, bias, batch.frame_id)
-        return Made(batch, [imu, vector, vector, encode_twist(batch.stamp_ns, bias, bias, eye, batch.frame_id)])
+        return DerivedBatch(batch, [imu, vector, vector, encode_twist(batch.stamp_ns, bias, bias, eye, batch.frame_id)])
 
 
 # ── the logs ─────────────────────────────────────────────────────────────────────────────────────────────────────────
