@@ -220,8 +220,5 @@ def _telling(found: _Evidence, prior: BiasPrior) -> bool:
 
 def _agreement(found: _Evidence, prior: BiasPrior) -> str:
     """Sentence on a log that agrees with a model."""
-    deviations = _deviations(found, prior)
-    return (
-        f"the log's bias lies within {deviations.max():.1f} standard deviations of the training runs, and gyro and gravity"
-        f" disagree in {found.surprising:.0%} of the half seconds"
-    )
+    deviations = _deviations(found, prior).max()
+    return f"the bias that the log shows lies within {deviations:.1f} standard deviations of the training runs"

@@ -1,4 +1,6 @@
-"""Fleet as a Rerun catalog: a dataset with a segment for each log, in layers, served to this machine.
+"""Fleet as a Rerun catalog: a dataset with a segment for each log, in layers.
+
+The server listens to this machine alone.
 
 https://rerun.io/docs/concepts/query-and-transform/catalog-object-model
 """

@@ -1,4 +1,4 @@
-"""Layers of a fleet's logs for Rerun's catalog: raw, debiased and diagnosis, each in an .rrd file."""
+"""Layers of a log in Rerun's catalog: raw, debiased and diagnosis, each in an .rrd file."""
 
 from __future__ import annotations
 

@@ -49,13 +49,23 @@ class Solution:
     std: Float[Tensor, "logs 3"]
 
 
+def carried_attitudes(model: BiasNetwork, windows: Windows) -> Float[Tensor, "batch n 3 3"]:
+    """Attitudes under the accelerometer: from the true one at each window's start, along the debiased gyro."""
+    segment = windows.segment
+    return attitudes(windows.R_start, segment.gyro - model.sensor_bias("gyro", segment), windows.dt)
+
+
 def sensor_residual(
-    model: BiasNetwork, sensor: Sensor, windows: Windows, W: Float[Tensor, "3 3"] | None = None
+    model: BiasNetwork,
+    sensor: Sensor,
+    windows: Windows,
+    W: Float[Tensor, "3 3"] | None = None,
+    R_wb: Float[Tensor, "batch n 3 3"] | None = None,
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
     """Residual of each window's debiased samples, and its Jacobian by each sample.
 
-    `W u` is taken off the sensor's samples on top of what the model takes off. The attitude under the accelerometer starts at
-    the true one and follows the debiased gyro.
+    `W u` is taken off the sensor's samples on top of what the model takes off. `R_wb` are `carried_attitudes`, where they are
+    known already.
     """
     segment = windows.segment
     u, _ = segment.of(sensor)
@@ -64,7 +74,7 @@ def sensor_residual(
         true_u = true_u - u @ W.mT
     if sensor == "gyro":
         return rotation_residual(true_u, windows.dt, windows.R_start.mT @ windows.R_end)
-    R_wb = attitudes(windows.R_start, segment.gyro - model.sensor_bias("gyro", segment), windows.dt)
+    R_wb = carried_attitudes(model, windows) if R_wb is None else R_wb
     return velocity_residual(true_u, windows.dt, R_wb, windows.v_end - windows.v_start, u.new_tensor(GRAVITY_W))
 
 
@@ -96,6 +106,7 @@ def solve(
     turns = ROTATION[sensor] if nuisances else slice(0, 0)
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
+    carried: dict[int, Float[Tensor, "m n 3 3"]] = {}  # by window length: the gyro does not change here
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
         own[:, :3] = rest[:, columns]
         now = torch.cat([W.flatten()[:known], own.flatten()])
@@ -104,7 +115,9 @@ def solve(
             if not len(first):
                 continue
             windows = pool.windows(first, n, rest[pool.log[first]])
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None)
+            if sensor == "accel" and n not in carried:
+                carried[n] = carried_attitudes(model, windows)
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None, carried.get(n))
             rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
             by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
             apart = own.clone()

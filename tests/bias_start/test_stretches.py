@@ -67,7 +67,7 @@ def debiased(log: Path, model: str, start: str = "auto") -> tuple[DebiasReport, 
     """The report, the bias and its standard deviation of every debiased sample."""
     blocks: list[DebiasedBlock] = []
     name = model if model == "static" else MODELS / f"euroc-adis16448-{model}.safetensors"
-    how = {"smooth": True} if start == "smooth" else {"init": start}
+    how = {"smooth": True, "force": True} if start == "smooth" else {"init": start, "force": True}
     report = debias(log, log.with_name("out.mcap"), model=name, overwrite=True, check="none", watch=blocks.append, **how)  # type: ignore[arg-type]
     return report, np.concatenate([b.bias for b in blocks]), np.concatenate([b.std for b in blocks])
 
@@ -168,7 +168,8 @@ def test_time_costs_by_samples(step_s: float, model: str, batch: ImuBatch, tmp_p
 
 def test_a_jump_is_in_report_and_metadata(batch: ImuBatch, tmp_path: Path, imutool: Callable[..., object]) -> None:
     write_log(jumping(DEFECTS["zero force"](batch), YEARS), tmp_path / "in.mcap")
-    done = imutool("debias", "in.mcap", "out.mcap", "--model", "euroc-adis16448-hybrid", "--json", "r.json", cwd=tmp_path)
+    words = ("--model", "euroc-adis16448-hybrid", "--force", "--json", "r.json")
+    done = imutool("debias", "in.mcap", "out.mcap", *words, cwd=tmp_path)
     assert done.returncode == 3  # type: ignore[attr-defined]
     assert "the clock jumps by +1.5778" in done.stderr  # type: ignore[attr-defined]
     assert "60 samples are no measurement and left out (60 without any specific force)" in done.stderr  # type: ignore[attr-defined]

@@ -165,7 +165,7 @@ def _viewer_version(url: str) -> str | None:
             answers.put(ViewerClient.connect(url).get_state().viewer_version)
         except ConnectionError as error:
             answers.put(error)
-        except (RuntimeError, TimeoutError):
+        except (RuntimeError, TimeoutError, AttributeError):  # the last one: a client of Rerun 0.40
             answers.put(None)
 
     # a relay server keeps the request for fifteen seconds: nothing waits for that thread

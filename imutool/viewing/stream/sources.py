@@ -1,4 +1,4 @@
-"""Sources of a live stream: a recorded log at its own speed, standard input, UDP, a rosbridge."""
+"""Sources of a live stream: a log at its own speed, standard input, UDP, a rosbridge."""
 
 from __future__ import annotations
 
