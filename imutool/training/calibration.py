@@ -35,7 +35,7 @@ from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
-from imutool.training.closed_form import CORRELATED
+from imutool.training.closed_form import CORRELATED, widest
 from imutool.training.fit import Epoch, note
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
@@ -85,11 +85,13 @@ def calibrate(
     names: Sequence[str] | None = None,
     part: Part = "train",
     signals: Signals | None = None,
+    own_prior: Float[Tensor, " o"] | None = None,
 ) -> Calibration:
     """Fit the effects that the logs support, or those named.
 
     `gyro` is the debiased rate that carries the attitude under the accelerometer, and the gyro's own samples for the gyro.
-    `signals` are those of every sample where the logs begin before the pool does.
+    `signals` are those of every sample where the logs begin before the pool does, `own_prior` that of each log's nuisances
+    where it is known. Parts of a log do not show how logs differ, and keep the widest.
 
     Raises:
         DataError: a log without a stretch of truth that is free of gaps.
@@ -97,13 +99,15 @@ def calibrate(
     """
     effects = catalogue.trained(sensor, names)
     seen = Seen(folded(pool, part), sensor, signals_of(pool) if signals is None else signals, gyro)
-    every, gains = linearise(seen, effects, part), {}
+    if own_prior is None and len(pool.names) < FOLDS:
+        own_prior = widest(sensor, pool.t)
+    every, gains = linearise(seen, effects, part, own_prior), {}
     forms, problem = effects, every
     if names is None:
         gains = effects_beyond_chance(problem, effects)
         if len(gains) < len(effects):
             effects = tuple(effect for effect in effects if effect.name in gains)
-            problem = linearise(seen, effects, part)
+            problem = linearise(seen, effects, part, every.own_prior)
     theta, covariance = problem.solve(range(len(problem.theta)))
     rest = problem.own_at(theta)[:, :3]
     return Calibration(
@@ -204,7 +208,7 @@ class PhysicsFirst:
         for sensor in SENSORS:
             report(note(f"looking for effects on the {sensor}"))
             chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals)
-            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals)  # nothing is left to be chosen
+            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals, chosen.problem.own_prior)
             of_choice = ("gains", "forms", "problem", "named")
             fits[sensor] = replace(whole, **{name: getattr(chosen, name) for name in of_choice})
             model.take(sensor, fits[sensor].effects, fits[sensor].theta, fits[sensor].covariance)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -32,11 +33,13 @@ ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
 MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes
 
 
-NUISANCE_STD = {  # how far they differ from log to log
+NUISANCE_STD = {  # how far they differ from log to log, at most
     "gyro": (0.01,) * 3 + (5e-3,),  # rotation (rad), clock (s)
     "accel": (0.1,) * 2 + (0.01,) * 3 + (5e-3,) + (0.02,) * 3,  # tilt (m/s² of gravity), rotation, clock, lever arm (m)
 }
 ROTATION = {"gyro": slice(3, 6), "accel": slice(5, 8)}  # of a log's unknowns, of which the rest bias comes first
+CLOCK, LEVER = {"gyro": slice(6, 7), "accel": slice(8, 9)}, {"gyro": slice(7, 7), "accel": slice(9, 12)}
+NARROWER = np.geomspace(1.0, 20.0, 13)  # shares of these widths that logs may show, as divisors
 END_SAMPLES = 3  # whose mean is the rate at an end of a window
 
 
@@ -160,6 +163,54 @@ def nuisance_jacobian(
     by_lever = windows.R_start @ so3.hat(w_start) - windows.R_end @ so3.hat(w_end)
     tilt = torch.eye(3).to(R)[None, :, :2] * duration_s[:, None, None]
     return torch.cat([tilt, -force, change + force @ w_start[..., None], by_lever], dim=2)
+
+
+def widest(sensor: Sensor, like: Tensor) -> Float[Tensor, " o"]:
+    """One over the plausible variance of each of a log's own unknowns."""
+    return torch.tensor([REST_PRIOR[sensor]] * 3 + list(NUISANCE_STD[sensor])).to(like) ** -2
+
+
+def shown_by_logs(
+    sensor: Sensor,
+    H: Float[Tensor, "logs k k"],
+    g: Float[Tensor, "logs k"],
+    theta: Float[Tensor, " p"],
+    own: Float[Tensor, "logs o"],
+    prior: Float[Tensor, " p"],
+) -> Float[Tensor, " o"]:
+    """Prior of a log's own unknowns, as wide as the logs' nuisances scatter beyond their own deviations.
+
+    The restricted likelihood of all logs decides between widths up to `NUISANCE_STD`: what logs share is the effects', and
+    logs that agree keep one clock, one rotation and one lever arm. `H` and `g` are the losses of the logs about a point.
+    """
+    own_prior = widest(sensor, theta)
+    for _ in range(2):
+        for part in (ROTATION[sensor], CLOCK[sensor], LEVER[sensor]):
+            tried = []
+            for narrower in NARROWER if part.start < part.stop else ():
+                other = own_prior.clone()
+                other[part] = widest(sensor, theta)[part] * narrower**2
+                tried.append((_minus_log_likelihood(H, g, theta, own, prior, other), len(tried), other))
+            own_prior = min(tried)[2] if tried else own_prior
+    return own_prior
+
+
+def _minus_log_likelihood(
+    H: Float[Tensor, "logs k k"],
+    g: Float[Tensor, "logs k"],
+    theta: Float[Tensor, " p"],
+    own: Float[Tensor, "logs o"],
+    prior: Float[Tensor, " p"],
+    own_prior: Float[Tensor, " o"],
+) -> float:
+    """Twice the negative logarithm, but for a constant, with all unknowns integrated out."""
+    p = len(prior)
+    A, b = H[:, p:, p:] + torch.diag(own_prior), g[:, p:] + own_prior * own
+    X, y = torch.linalg.solve(A, H[:, p:, :p]), torch.linalg.solve(A, b[..., None])
+    S = torch.diag(prior) + (H[:, :p, :p] - H[:, :p, p:] @ X).sum(0)
+    v = prior * theta + (g[:, :p] - (H[:, :p, p:] @ y)[..., 0]).sum(0)
+    gain = (b * y[..., 0]).sum() + v @ torch.linalg.solve(S, v) - (own_prior * own.square()).sum()
+    return float(torch.logdet(A).sum() + torch.logdet(S) - len(own) * own_prior.log().sum() - gain)
 
 
 def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:

@@ -3,9 +3,8 @@
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
 (`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
 the same form as a nuisance is what the logs have in common. The unknowns of a log are eliminated log by log (Schur's
-complement): a prediction of one log from all others is one solve of a matrix as small as theta. `imutool.inertial.windows`
-gives the residual of a window and its Jacobian by each sample. An effect's error is linear in its parameters, so the rest is a
-product of matrices.
+complement), so that one solve of a matrix as small as theta predicts a log from all others. An effect's error is linear in its
+parameters: with a window's residual and Jacobian (`imutool.inertial.windows`), the rest is a product of matrices.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
 from imutool.sensor.linear_form import LinearForm, patterns
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import CORRELATED, NUISANCE_STD, REST_PRIOR, median_per_log, nuisance_jacobian
+from imutool.training.closed_form import CORRELATED, median_per_log, nuisance_jacobian, shown_by_logs, widest
 from imutool.training.segments import Part, Pool, Windows
 from imutool.units import Sensor
 
@@ -32,9 +31,8 @@ WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), 
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
 MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
-# Standard deviations of the priors, in the parameters' units, where they are not the plausible sizes of the diagnosis: training
-# calibrates a sensor that works, and what it did not see of a drift or a nonlinearity has to stay near zero; a diagnosis looks
-# for faults. The shipped models were trained with these.
+# Deviations of the priors, in the parameters' units, where they are not the plausible sizes of the diagnosis, which looks for
+# faults: training calibrates a sensor that works, and what it did not see of a drift or a nonlinearity has to stay near zero.
 PRIOR_STD: Mapping[str, float] = {
     "accel_bias_drift": 0.1,
     "accel_scale": 0.1,
@@ -150,11 +148,6 @@ class Seen:
     gyro: Float[Tensor, "n 3"]
 
     @property
-    def own_size(self) -> int:
-        """Number of unknowns of each log."""
-        return 3 + len(NUISANCE_STD[self.sensor])
-
-    @property
     def free(self) -> int:
         """Number of those without a prior when a log is predicted: rest bias, and the tilt of its world."""
         return 3 if self.sensor == "gyro" else 5
@@ -169,8 +162,10 @@ class WindowSet:
     judged: bool
 
 
-def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
+def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
     """Gauss-Newton on all effects at once, from the shortest windows to all lengths.
+
+    Without `own_prior` nuisances get a prior as wide as the logs scatter, once all lengths are in.
 
     Raises:
         DataError: a log without a window that is free of gaps.
@@ -178,16 +173,18 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part) -> Problem:
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
     std = np.concatenate([np.zeros(0), *(prior_std(effect) for effect in effects)])
     prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
-    own_prior = torch.tensor([REST_PRIOR[seen.sensor]] * 3 + list(NUISANCE_STD[seen.sensor])).to(seen.pool.t) ** -2
-    theta, own = torch.zeros_like(prior), prior.new_zeros(logs, seen.own_size)
+    width = widest(seen.sensor, prior) if own_prior is None else own_prior
+    theta, own = torch.zeros_like(prior), prior.new_zeros(logs, len(width))
     for step in range(len(sets) + 2):
-        fit = judged = Equations.none(prior, logs, len(prior) + seen.own_size)
+        fit = judged = Equations.none(prior, logs, len(prior) + len(width))
         size = prior.new_zeros(logs)
         for windows in sets[: step + 1]:
             equations, size = _equations(seen, effects, theta, own, windows, size)
             fit = fit + equations
             judged = judged + equations if windows.judged else judged
-        problem = Problem(theta, own, prior, own_prior, seen.free, fit, judged)
+        if own_prior is None and step >= len(sets) - 1:
+            width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
+        problem = Problem(theta, own, prior, width, seen.free, fit, judged)
         if step < len(sets) + 1:
             theta = problem.solve(range(len(prior))).theta
             own = problem.own_at(theta)

@@ -14,7 +14,7 @@ from imutool.bias.networks import linear
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Recording
 from imutool.training import closed_form
-from imutool.training.closed_form import Solution, solve
+from imutool.training.closed_form import CLOCK, NUISANCE_STD, ROTATION, Solution, shown_by_logs, solve
 from imutool.training.segments import Pool
 from imutool.units import Sensor
 
@@ -202,3 +202,28 @@ def test_a_log_whose_training_part_has_no_truth_is_named(flights: list[Recording
         holed = without_truth(holed, start, start + 0.3)
     with pytest.raises(DataError, match=r"no stretch of 0.5 s of truth without a gap in the train part of exact_2"):
         calibrate([flights[0], holed])
+
+
+def shown(clock_s: float, turn_rad: float) -> tuple[float, float]:
+    """Widths of clock and rotation from twelve logs with a common clock of 6 ms and their own on top."""
+    rng, deviation = np.random.default_rng(3), np.array([1e-3] * 3 + [5e-4] * 3 + [2e-4])
+    H, g = [], []
+    for sign in (1, -1) * 6:
+        J = np.linalg.qr(rng.normal(size=(40, 7)))[0] / deviation
+        J = np.column_stack([J[:, 6], J])  # theta is the common clock
+        own = np.concatenate([0.01 * rng.normal(size=3), sign * turn_rad * np.ones(3), [sign * clock_s]])
+        e = rng.normal(size=40) - J @ np.concatenate([[6e-3], own])
+        H.append(torch.from_numpy(J.T @ J))
+        g.append(torch.from_numpy(J.T @ e))
+    theta, own = torch.zeros(1).double(), torch.zeros(12, 7).double()
+    found = shown_by_logs("gyro", torch.stack(H), torch.stack(g), theta, own, torch.tensor([1e4]).double()) ** -0.5
+    return float(found[CLOCK["gyro"]]), float(found[ROTATION["gyro"]][0])
+
+
+def test_nuisances_are_as_wide_as_logs_scatter() -> None:
+    """A common clock is no scatter, and no width is beyond the plausible."""
+    *_, turn, clock = NUISANCE_STD["gyro"]
+    assert shown(0.0, 0.0) == (pytest.approx(clock / 20), pytest.approx(turn / 20))
+    assert shown(2e-3, 0.0) == (pytest.approx(2e-3, rel=0.3), pytest.approx(turn / 20))
+    assert shown(0.0, 4e-3) == (pytest.approx(clock / 20), pytest.approx(4e-3, rel=0.3))
+    assert shown(0.05, 0.1) == (pytest.approx(clock), pytest.approx(turn))
