@@ -186,7 +186,7 @@ def shown_by_logs(
     own_prior = widest(sensor, theta)
     for _ in range(2):
         for part in (ROTATION[sensor], CLOCK[sensor], LEVER[sensor]):
-            tried = []
+            tried: list[tuple[float, int, Tensor]] = []
             for narrower in NARROWER if part.start < part.stop else ():
                 other = own_prior.clone()
                 other[part] = widest(sensor, theta)[part] * narrower**2
