@@ -65,7 +65,7 @@ def named_folder(source: Path) -> Path:
 
 
 def each_path(folder: Path, depth: int = DEPTH) -> Iterator[Path]:
-    """Files below a folder, in order, and sequences in ASL folders, whose own files are not listed.
+    """Files below a folder in order; of an ASL sequence its folder instead.
 
     Raises:
         DataError: a folder cannot be listed.

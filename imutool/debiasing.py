@@ -29,15 +29,15 @@ from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.location import Location
-from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
+from imutool.mcap_io.passthrough.source_digest import SourceDigest
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
-from imutool.mcap_io.storage.source import Digest
 from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
@@ -80,7 +80,7 @@ BlockCallback = Callable[[DebiasedBlock], None]
 
 
 class Debiaser:
-    """Debiased topics of one IMU, computed by batches during the copy (`mcap_io.added_topics`).
+    """Debiased topics of one IMU, computed by batches during the copy (`DerivedTopics`).
 
     With a survey the samples are cleaned first. `watch` is called with every batch.
     """
@@ -235,10 +235,11 @@ def _debias(
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     topics = choose_imus(log, options.imus, given)
     about = log.metadata().get("imutool", {})
+    log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
     derived, starts, models, records, fits = [], {}, {}, {}, {}
-    with Digest(source) as digest:
+    with SourceDigest(log.index, source) as digest:
         for topic in topics:
             name, survey = given.get(topic, default), surveys.get(topic)
             chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
@@ -250,11 +251,10 @@ def _debias(
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}
 
         def metadata(verified: Verified) -> Values:
-            origin = {"source_file": source.name, "source_sha256": digest.result(), "source_size": str(source.stat().st_size)}
-            checked = {"verified": json.dumps(verified._asdict())}
+            origin = {"source_file": source.name, "source_size": str(source.stat().st_size), **digest.result()}
+            origin["verified"] = json.dumps(verified._asdict())
             entries = {
-                _record_name("imutool", topic, records): v | origin | checked | sieves[topic].record()
-                for topic, v in records.items()
+                _record_name("imutool", topic, records): v | origin | sieves[topic].record() for topic, v in records.items()
             }
             return entries | {_record_name(CLEAN_RECORD, topic, records): found.record() for topic, found in surveys.items()}
 

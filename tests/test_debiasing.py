@@ -280,7 +280,7 @@ def test_in_place_the_log_gains_its_channels_under_its_own_name(source: Path, ta
 
 def test_the_static_bias_of_a_long_log_takes_no_more_memory(tmp_path: Path) -> None:
     peaks = []
-    for seconds_long in (30.0, 240.0):
+    for seconds_long in (90.0, 240.0):  # both fill what is kept for the copy (`chunk_check.KEPT_BYTES`)
         recording = flight(1, duration_s=seconds_long)
         log = tmp_path / f"{seconds_long}.mcap"
         write(recording, log, compression="none")
@@ -290,7 +290,7 @@ def test_the_static_bias_of_a_long_log_takes_no_more_memory(tmp_path: Path) -> N
             peaks.append(tracemalloc.get_traced_memory()[1])
         finally:
             tracemalloc.stop()
-    samples = 210 * 200
+    samples = 150 * 200
     assert peaks[1] - peaks[0] < 0.5 * samples * 7 * 8  # of the samples themselves there is not even half; a minute is held
     assert peaks[1] < 40 << 20
 

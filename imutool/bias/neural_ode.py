@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
-from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, gelu
+from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, erf, gelu
 from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.units import SENSORS, Sensor
@@ -209,8 +209,6 @@ def _perceptron(layers: list[tuple[Array, Array]], x: Array) -> Array:
 
 def _perceptron_slope(layers: list[tuple[Array, Array]], x: Array, J: Array) -> Array:
     """Derivative of a perceptron's output, if J is that of its input."""
-    from scipy.special import erf
-
     *hidden, before, last = layers
     for W, b in hidden:
         h = np.dot(x, W) + b

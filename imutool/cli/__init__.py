@@ -1,43 +1,33 @@
-"""Command line: each command stands in a file of this room; `load` imports them.
+"""Command line: a file for each command; `load` imports the one that is asked for.
 
 Results go to stdout; log lines and progress go to stderr.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+from imutool.cli.overview import COMMANDS, MODULES, show
 
 if TYPE_CHECKING:
     from imutool.cli.app import App
 
-MODULES = (
-    "convert",
-    "info",
-    "repair",
-    "train",
-    "debias",
-    "clean",
-    "evaluate",
-    "view",
-    "live",
-    "simulate",
-    "diagnose",
-    "fleet",
-    "fleet_view",
-    "shipped",
-)
 REPEAT_S = 0.01
-INTERRUPTED, TERMINATED = 130, 143  # what a shell reports of a program that SIGTERM ended
+COMPLETION = "_IMUTOOL_COMPLETE"  # a shell asks for words; any command may be meant
+WRONG_USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # what a shell reports of a program that SIGTERM ended
 
 
-def load() -> App:
-    """Application with every command; the order is that of `--help`."""
-    for name in MODULES:
-        import_module(f"imutool.cli.{name}")
+def load(words: Sequence[str] = ()) -> App:
+    """Application with the command that `words` ask for, or with all in the order of --help."""
+    name = next((word for word in words if not word.startswith("-")), "")
+    for module in (COMMANDS[name][0],) if name in COMMANDS else MODULES:
+        import_module(f"imutool.cli.{module}")
     from imutool.cli.app import app
 
     return app
@@ -50,8 +40,13 @@ def main() -> None:
     # A scheduler's SIGTERM would end the process where it stands, with its temporary files and parts of uploads left behind
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     sys.unraisablehook = _unraisable
+    gc.set_threshold(100_000)  # imports make objects that stay: the collector took a twelfth of a command's start
+    words = sys.argv[1:]
     try:
-        app = load()
+        if words in ([], ["--help"]) and COMPLETION not in os.environ:
+            show()
+            sys.exit(0 if words else WRONG_USAGE)
+        app = load(() if COMPLETION in os.environ else words)
         from imutool.cli.app import caught
     except BaseException as error:  # Ctrl-C before there is anybody who could catch it in style
         from imutool.errors import was_interrupted

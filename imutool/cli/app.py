@@ -16,7 +16,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
-from imutool.cli.parameters import current, error_with_flags, flags, with_flags
+from imutool.cli.overview import ABOUT, show
+from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, with_flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.mcap_io.storage import outputs
@@ -30,6 +31,14 @@ NOTHING_LEFT = "Nothing half-written is left"
 
 class _Commands(TyperGroup):
     """Group of commands that reports an interrupt; typer would exit without a message."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the page of `imutool --help`."""
+        show()
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Parameters with --help; they convert texts and paths by themselves."""
+        return [PlainValue.into(parameter) for parameter in super().get_params(ctx)]
 
     def invoke(self, ctx: Any) -> Any:
         with caught():
@@ -90,6 +99,10 @@ class Command(TyperCommand):
     """Command that refuses destructive outputs first, and whose errors name flags."""
 
     function: Callable[..., Any]  # what the command runs
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Parameters with --help; they convert texts and paths by themselves."""
+        return [PlainValue.into(parameter) for parameter in super().get_params(ctx)]
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.
@@ -165,7 +178,7 @@ def listing(group: str, option: str) -> type[TyperCommand]:
 
 app = App(
     name="imutool",
-    help="Convert IMU recordings to MCAP, train bias models, debias logs, diagnose and view them.",
+    help=ABOUT,
     cls=_Commands,
     no_args_is_help=True,
     rich_markup_mode="rich",

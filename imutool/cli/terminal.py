@@ -10,10 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
 
 from imutool.cli.parameters import with_flags
 from imutool.errors import redact
@@ -101,6 +98,9 @@ def _split(widths: Sequence[int], room: int) -> list[int]:
 
 
 def _print(columns: Sequence[Sequence[str]], width: int) -> None:
+    from rich import box
+    from rich.table import Table
+
     grid = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     for header, *cells in columns:
         numbers = all(NUMBER.fullmatch(cell) for cell in cells)
@@ -150,8 +150,13 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, i
     With --verbose the words stay as lines.
     """
     log_to_stderr(verbose, quiet)
+    if quiet:
+        yield lambda done, total, word: None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
-    with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, disable=quiet, transient=True) as bar:
+    with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, transient=True) as bar:
         task = bar.add_task(what, total=None, word="")
 
         def tell(done: int, total: int, word: str) -> None:

@@ -1,7 +1,4 @@
-"""Read an MCAP log: whole columns at a time, one chunk in memory, every CRC checked.
-
-Topics are found by schema, not by name; messages come in file order.
-"""
+"""Read an MCAP log: whole columns at a time in file order, one chunk in memory, CRCs checked."""
 
 from __future__ import annotations
 
@@ -21,6 +18,7 @@ from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
+from imutool.mcap_io.passthrough.chunk_check import KeptChunks
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import (
     ENCODINGS,
@@ -40,8 +38,6 @@ from imutool.mcap_io.topics import (
 class Log:
     """An MCAP file or object in a store, open for reading.
 
-    It may have chunks, a summary and message indexes, or not.
-
     Memory is bounded by its largest chunk; one of more than `max_chunk` bytes is refused. An open `Source` can be given in
     place of a path. Times given to a method select by log time, both ends included. The first damage is an error;
     `recovery.recovered_log.RecoveredLog` reads what is intact of a damaged log.
@@ -59,6 +55,7 @@ class Log:
         place = to_location(path) if isinstance(path, str) else path
         self._source = place if isinstance(place, Source) else Source(place)
         self._owns_source, self.path = True, self._source.path
+        self.kept: KeptChunks | None = None
         try:
             with self.named():
                 self.index = self._read_index(self._source)
@@ -73,11 +70,10 @@ class Log:
     def _read_topics(self) -> None:
         """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
         self.topics = MappingProxyType(topics_of(self.index))
-
-        def first(topic: str) -> bytes | None:
-            return next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
-
-        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, first)})
+        more = reflected_topics(
+            self.index, self.topics, lambda topic: next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
+        )
+        self.topics = MappingProxyType({**self.topics, **more})
 
     def __enter__(self) -> Log:
         return self
@@ -218,8 +214,7 @@ class Log:
                     yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
                 elif (found := self.index.unpack_or_lose(block)) is not None:
                     times = found.times()[np.isin(found.heads["channel"], list(channels))]
-                    if len(times):
-                        yield times
+                    yield from [times] if len(times) else []
 
     def imu_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
         """The messages of an IMU topic in file order, a chunk at a time.
@@ -265,13 +260,16 @@ class Log:
         encoding = self.topic(topic, (schemas.IMAGE,)).message_encoding
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
-                for payload in rows.payload:
-                    stamp_ns, _, image = decode_image(payload.tobytes(), encoding)
-                    yield stamp_ns, image
+                yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)
 
     def channel_ids(self, topic: str) -> set[int]:
         """The channels of a topic."""
         return {i for i, channel in self.index.channels.items() if channel.topic == topic}
+
+    def keep(self, topics: Collection[str]) -> None:
+        """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""
+        known = {t: (self.topics[t], self.channel_ids(t)) for t in topics if t in self.topics}
+        self.kept = KeptChunks(self._source, known, self.max_chunk)
 
     def rows(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
@@ -279,8 +277,7 @@ class Log:
         """The messages of some topics in file order; each chunk is unpacked once for all topics."""
         wanted = {topic: self.channel_ids(topic) for topic in topics}
         every = set().union(*wanted.values()) if wanted else set()
-        first = -1 if start_ns is None else start_ns
-        last = 2**63 - 1 if end_ns is None else end_ns
+        first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns
         with self.named():
             for block in self.index.blocks:
                 if block.may_hold(every) and block.start_ns <= last and block.end_ns >= first:
@@ -289,6 +286,9 @@ class Log:
     def _rows_of(
         self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, messages.Rows]]:
+        if self.kept is not None and (kept := self.kept.rows(block, wanted, first, last)) is not None:
+            yield from kept
+            return
         found = self.index.unpack_or_lose(block)
         if found is None:
             return

@@ -1,10 +1,10 @@
 """Copy a log byte for byte and add topics to it, in one pass with one chunk in memory.
 
 A chunk without IMU messages is copied from file to file (`target.Target.copy`), and its message indexes say what to enter in
-the summary. A chunk that holds messages of a source IMU, or that its indexes do not describe, is unpacked and checked; the
-bytes that were checked are those that are written. Only the summary is new, and message indexes where the source has none
-or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that goes by chunk
-indexes would otherwise not find them beside the new ones.
+the summary. A chunk that holds messages of a source IMU, or that its indexes do not describe, is unpacked and checked, once:
+those that were checked before the copy began (`Log.keep`) are only copied. Only the summary is new, and message indexes where
+the source has none or wrong ones. Messages outside chunks keep their bytes and are wrapped into chunks, because a reader that
+goes by chunk indexes would otherwise not find them beside the new ones.
 
 Where the source states the CRC of its data section, it is checked and the copy states one, for which every byte passes through
 memory (1.3 instead of 1.2 of the CPU time of `cp`, `pass` in `tests/bench/rewrite.py`). Where the source states none, as most
@@ -23,19 +23,14 @@ from mcap.records import Metadata, MetadataIndex
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location, identity, same_location
-from imutool.mcap_io.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
-from imutool.mcap_io.blocks import (
-    Attachment,
-    MessageBlock,
-    MessageIndexes,
-    RecordSpan,
-    parse_message_indexes,
-    read_message_indexes,
-)
-from imutool.mcap_io.codec import messages, records
+from imutool.mcap_io.blocks import Attachment, MessageBlock, MessageIndexes, RecordSpan, read_message_indexes
+from imutool.mcap_io.codec import records
+from imutool.mcap_io.codec.messages import Messages
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
+from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
 from imutool.mcap_io.storage.system import give
 from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
@@ -141,7 +136,7 @@ class _Rewrite:
         self.streams = [self._stream(topics, own) for topics in derived]
         self.imu_channels = set().union(*(stream.sources for stream in self.streams)) if self.streams else set()
         self.passing = PassThrough(self.source, out.target)
-        self.checked = self.unchecked = 0  # chunks unpacked while copying
+        self.checked = self.unchecked = 0  # chunks unpacked before or while copying; messages that no CRC covers
         self.new_chunks = set[int]()  # their offsets
 
     def _stream(self, topics: DerivedTopics, own: bool) -> DerivedStream:
@@ -213,6 +208,12 @@ class _Rewrite:
         if block.compression is None:
             self._wrap_run(block)
             return
+        if kept := self.log.kept and self.log.kept.pop(block, self.imu_channels):
+            for stream in self.streams:
+                stream.add(kept.parts[stream.derived.source_topic])
+            self.checked += 1
+            self._list_chunk(block, kept.head, kept.indexes, self.passing.defer(block.end))
+            return
         if self.index.definitions_known and block.indexes and self.imu_channels.isdisjoint(block.indexes):
             head, indexes = read_message_indexes(self.source, block)
             if indexes is not None:
@@ -224,8 +225,7 @@ class _Rewrite:
         """Writes messages outside chunks as a chunk."""
         raw = self.source.at(block.offset, block.length)
         found = self.index.unpack_bytes(block, raw)
-        for stream in self.streams:
-            stream.add(found)
+        self._add(found)
         self.passing.flush()
         self.checked += 1
         self.unchecked += len(found.heads)
@@ -235,14 +235,8 @@ class _Rewrite:
     def _copy_unpacked(self, block: MessageBlock) -> None:
         """Copies a chunk that must be unpacked; wrong message indexes are replaced."""
         everything = memoryview(self.source.at(block.offset, block.end - block.offset))
-        raw, behind = everything[: block.length], everything[block.length :]
         try:
-            head = block.head(raw)
-            indexes, data = (
-                parse_message_indexes(behind, block, head.size),
-                records.unpack(raw, block.offset, self.index.max_chunk),
-            )
-            found, right = indexes.messages(data, block.offset) if indexes else (messages.parse(data, block.offset), False)
+            head, indexes, right, found = check_chunk(everything, block, self.index.max_chunk)
         except LogError as error:
             self.index.lose(block, error)
             self.passing.flush()
@@ -250,16 +244,20 @@ class _Rewrite:
             return
         for opcode, first, length in found.definitions:
             self._define(opcode, found.data[first : first + length].tobytes(), block.offset)
-        for stream in self.streams:
-            stream.add(found)
+        self._add(found)
         self.checked += 1
         if indexes is not None and right:
             self._list_chunk(block, head, indexes, self.passing.write(everything) - block.offset)
         else:
             self.unchecked += 0 if head.crc else len(found.heads)
-            entry = head.index_at(self.passing.write(raw), block.length)
+            entry = head.index_at(self.passing.write(everything[: block.length]), block.length)
             self.out.write_indexes(entry, found.heads["channel"].copy(), found.times(), found.offsets)
             self.passing.skip(block.end)
+
+    def _add(self, found: Messages) -> None:
+        """Hands messages of the source IMUs to the topics computed from them."""
+        for stream in self.streams:
+            stream.add(parts_of(found, self.log.topics[stream.derived.source_topic], stream.sources))
 
     def _list_chunk(self, block: MessageBlock, head: ChunkHead, indexes: MessageIndexes, moved: int) -> None:
         """Enters a chunk with its own message indexes in the summary."""

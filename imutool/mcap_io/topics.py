@@ -248,8 +248,9 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
 
 
 def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]) -> dict[str, Topic]:
-    """IMUs among the topics whose type is not that of ROS; `first` gives the first message of a topic.
+    """IMUs among the topics whose type is not that of ROS.
 
+    `first` gives the first message of a topic.
     Types of ROS 2 count only where the log has no other IMU: drivers publish their own message beside that of ROS.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}

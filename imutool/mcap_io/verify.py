@@ -15,11 +15,12 @@ from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location
-from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, parse_message_indexes, read_message_indexes
+from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, read_message_indexes
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.chunk_check import check_chunk
 from imutool.mcap_io.storage.source import crc_of
 
 MODES = ("all", "imu", "none")
@@ -91,21 +92,16 @@ class _Sums:
         """Checks a block, with `whole` its messages too."""
         if block.compression is None:
             raise LogError(f"messages lie outside chunks at byte {block.offset}", expected="chunks alone")
-        raw = index.source.at(block.offset, block.end - block.offset) if whole else b""
         if whole:
-            listed = parse_message_indexes(raw[block.length :], block, block.head(raw).size)
+            everything = memoryview(index.source.at(block.offset, block.end - block.offset))
+            _, listed, right, _ = check_chunk(everything, block, index.max_chunk)
         else:
-            _, listed = read_message_indexes(index.source, block)
+            (_, listed), right = read_message_indexes(index.source, block), True
         if listed is None:
             if index.unpack(block).offsets.size:
                 raise LogError(f"the message indexes behind the chunk at byte {block.offset} are damaged")
             return
-        if (
-            whole
-            and not listed.messages(
-                records.unpack(memoryview(raw)[: block.length], block.offset, index.max_chunk), block.offset
-            )[1]
-        ):
+        if not right:
             raise LogError(f"the message indexes behind the chunk at byte {block.offset} list other messages than are in it")
         if (block.start_ns, block.end_ns) != (listed.start_ns, listed.end_ns):
             raise LogError(

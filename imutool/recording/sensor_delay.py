@@ -20,7 +20,7 @@ LEAST_CORRELATION, LEAST_PARTS = 0.6, 4
 
 
 class SensorDelay(NamedTuple):
-    """Time by which the accelerometer's stamps are later than the gyroscope's, with its standard deviation."""
+    """Lateness of the accelerometer's stamps against the gyroscope's, with its deviation."""
 
     seconds: float
     std_s: float

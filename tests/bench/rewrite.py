@@ -1,15 +1,16 @@
-"""What adding channels to a log costs beside `cp` of it: `python tests/bench/rewrite.py [--gb 0.9] [--rounds 5] [--in FOLDER]`.
+"""What `imutool debias` costs beside `cp` of the log: `python tests/bench/rewrite.py [--gb 1.5] [--rounds 3] [--in FOLDER]`.
 
 The log is the usual and worst one: a 200 Hz IMU interleaved with images in every chunk of 1 MiB, half of them packed
 already and half not, in three compressions; then one whose IMU has chunks of its own. Each job is a process of its own, all
 jobs take turns in every round, the first round does not count, and the least is shown (what the machine does besides only
-adds): CPU seconds beyond what a python costs that only imports what the job needs; peak memory is taken likewise. In memory
-(`--in /dev/shm`) nothing is written to a disk; elsewhere we end with fsync, and `cp` followed by `sync` is the fairer peer.
+adds). In memory (`--in /dev/shm`) nothing is written to a disk; elsewhere we end with fsync, and `cp` followed by `sync` is the
+fairer peer.
 
-Jobs: `rewrite` adds the four topics of `imutool debias`, with a constant for a bias; `verify none` and `verify all` check
-less and more; `pass` adds nothing; `crc` adds nothing to a log that states the CRC of its data section; `re-encode` is
-the best existing way, every message read and written by the `mcap` package; `sha256` is what the digest of the source in
-the metadata adds; `debias` is the whole command, with torch to start and a shipped model.
+Jobs: `debias` is the whole command with its start and a shipped model, checks as by default, and `debias linear` the same with
+the model that costs least. The others are parts, shown with `--jobs`, in CPU seconds and memory beyond what a python costs
+that only imports what they need: `rewrite` adds the four topics of `imutool debias`, with a constant for a bias; `rewrite
+verify none` and `rewrite verify all` check less and more; `pass` adds nothing; `re-encode` is the best existing way, every
+message read and written by the `mcap` package; `sha256` is what a digest of all bytes would add.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -31,10 +31,10 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.codec.messages import message_record, message_rows
+from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.topics import ImuBatch
@@ -177,13 +177,17 @@ class Spent(NamedTuple):
 
 
 def timed(line: list[str]) -> Spent:
-    """A command run to its end."""
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run(line, check=True, stdout=subprocess.PIPE)
-    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    said = done.stdout.split()
-    return Spent(cpu, wall, int(said[-1]) / 1e3 if said and said[-1].isdigit() else 0.0)
+    """A command run to its end; peak memory is its own, since the start of a process would count its parent's."""
+    began = time.perf_counter()
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=INSTALLED) as process:
+        assert process.stdout is not None
+        said = process.stdout.read().split()
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    wall = time.perf_counter() - began
+    assert process.returncode == 0, line
+    peak = int(said[-1]) / 1e3 if said and said[-1].isdigit() else usage.ru_maxrss / 1e3
+    return Spent(usage.ru_utime + usage.ru_stime, wall, peak)
 
 
 def race(names: list[str], source: Path, packing: str, rounds: int) -> dict[str, Spent]:
@@ -194,7 +198,7 @@ def race(names: list[str], source: Path, packing: str, rounds: int) -> dict[str,
         "cp": ["cp", str(source), str(target)],
         "cp, sync": ["sh", "-c", 'cp "$0" "$1" && sync "$1"', str(source), str(target)],
         "debias": [imutool, "debias", str(source), str(target), "-q", "--model", "euroc-adis16448-hybrid"],
-        "import torch": [sys.executable, "-c", "import torch"],
+        "debias linear": [imutool, "debias", str(source), str(target), "-q", "--model", "euroc-adis16448-linear"],
     }
     for count in range(rounds + 1):
         for name in names:
@@ -208,12 +212,14 @@ def race(names: list[str], source: Path, packing: str, rounds: int) -> dict[str,
 
 # ── the tables ───────────────────────────────────────────────────────────────────────────────────────────────────────
 
-FULL = ["nothing", "cp", "cp, sync", "rewrite", "rewrite verify none", "rewrite verify all", "pass", "re-encode", "sha256"]
-FEW = ["nothing", "cp", "cp, sync", "rewrite", "pass"]
+WHOLE = ["cp", "cp, sync", "debias", "debias linear"]
+# a package is compiled once, when it is installed; a checkout in an environment that keeps no bytecode would be at each start
+INSTALLED = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+INSTALLED.setdefault("PYTHONPYCACHEPREFIX", f"{tempfile.gettempdir()}/imutool-bench-bytecode")
 
 
-def logs(gb: float, folder: Path, chosen: list[str]) -> Iterator[tuple[str, Path, str, list[str]]]:
-    """Each log in turn, made, lent and deleted: its name, where it is, how it is packed, and the jobs for it."""
+def logs(gb: float, folder: Path, chosen: list[str]) -> Iterator[tuple[str, Path, str]]:
+    """Each log in turn, made, lent and deleted: its name, where it is, and how it is packed."""
     path = folder / "log.mcap"
     for name in chosen:
         place, _, packing = name.partition("-")
@@ -221,19 +227,17 @@ def logs(gb: float, folder: Path, chosen: list[str]) -> Iterator[tuple[str, Path
             write_mixed(path, gb, packing)
         else:
             write_apart(path, gb, packing, data_crc=place == "crc")
-        yield name, path, packing, FULL if place == "mixed" else FEW
+        yield name, path, packing
         path.unlink()
 
 
 def table(name: str, size: int, spent: dict[str, Spent]) -> None:
     """Prints the jobs of one log, ratios against `cp` in the same run."""
-    nothing, cp = spent.pop("nothing"), spent["cp"]
-    print(
-        f"\n{name}, {size / 1e6:.0f} MB; python and imports alone take {nothing.cpu:.2f} s of CPU and {nothing.peak_mb:.0f} MB"
-    )
+    nothing, cp = spent.pop("nothing", None), spent["cp"]
+    print(f"\n{name}, {size / 1e6:.0f} MB")
     print(f"{'':24}{'CPU s':>8}{'/ cp':>8}{'wall s':>9}{'/ cp':>8}{'peak MB':>10}")
     for job_name, taken in spent.items():
-        mine = taken if job_name in ("cp", "cp, sync", "debias", "import torch") else taken.beyond(nothing)
+        mine = taken if nothing is None or job_name in WHOLE else taken.beyond(nothing)
         print(f"{job_name:24}{mine.cpu:8.2f}{mine.cpu / cp.cpu:8.2f}{mine.wall:9.2f}{mine.wall / cp.wall:8.2f}", end="")
         print(f"{mine.peak_mb:10.0f}" if taken.peak_mb else "", flush=True)
 
@@ -242,18 +246,18 @@ def main() -> None:
     """Prints a table for each log."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     every = ["mixed-none", "mixed-lz4", "mixed-zstd", "apart-zstd", "crc-zstd"]
-    parser.add_argument("--gb", type=float, default=0.9, help="size of the messages")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--gb", type=float, default=1.5, help="size of the messages")
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--in", dest="folder", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--logs", nargs="*", choices=every, default=every)
-    parser.add_argument("--jobs", nargs="*", help="these alone; `debias` and `import torch` run only when named")
+    parser.add_argument("--jobs", nargs="*", help="parts of the command")
     args = parser.parse_args()
     need = int(2.2e9 * args.gb)
     assert shutil.disk_usage(args.folder).free > 2 * need, f"{args.folder} has no room for {need / 1e9:.0f} GB"
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
         print(f"{args.rounds} rounds in {args.folder}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-        for log, path, packing, jobs in logs(args.gb, Path(name), args.logs):
-            chosen = jobs if args.jobs is None else ["nothing", "cp", *args.jobs]
+        for log, path, packing in logs(args.gb, Path(name), args.logs):
+            chosen = WHOLE if args.jobs is None else ["nothing", "cp", *args.jobs]
             table(log, path.stat().st_size, race(chosen, path, packing, args.rounds))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.special
 import torch
 from torch import Tensor, nn
 
@@ -16,7 +17,7 @@ from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.neural_ode import Curve, Drift, Network
 from imutool.bias.networks.ode import HermitePath, integrate
 from imutool.bias.neural_ode import DRIFT_FILTER_S, NEAR_ZERO, SLOW_S, Config
-from imutool.bias.neural_stream import Curves, CurveWeights
+from imutool.bias.neural_stream import Curves, CurveWeights, erf
 from imutool.geometry import so3
 from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
@@ -159,6 +160,12 @@ def test_the_curve_of_no_motion_is_exactly_zero(scale: float) -> None:
             assert left <= curve.curve * 64 * 1e-16 * (1.0 + scale)
         alone = np.abs(at_work.one(np.zeros(6), np.zeros(6), 3.0)).max()
         assert alone <= curve.curve * 64 * 1e-16 * (1.0 + scale)
+
+
+def test_the_error_function_is_scipys() -> None:
+    x = np.concatenate([np.linspace(-9.0, 9.0, 200_001), 10.0 ** np.arange(-300.0, 1.0, 7.0)])
+    assert np.abs(erf(x) - scipy.special.erf(x)).max() < 4e-16  # two units in the last place of 1
+    assert erf(np.array([0.0, 6.0, 8.0, -8.0])).tolist() == [0.0, 1.0, 1.0, -1.0]
 
 
 @pytest.mark.parametrize("bent", [True, False])

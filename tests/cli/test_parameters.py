@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -9,10 +10,29 @@ import pytest
 import typer
 
 from imutool import cli
+from imutool.cli import overview
 from imutool.cli.parameters import error_with_flags, flags, with_flags
 from imutool.errors import ConfigError
 
 COMMANDS = typer.main.get_command(cli.load()).commands  # type: ignore[attr-defined]
+
+
+def test_the_page_of_help_lists_every_command_with_its_own_words(capsys: pytest.CaptureFixture[str]) -> None:
+    own = {name: (command.help or "").splitlines()[0] for name, command in COMMANDS.items()}
+    assert {name: text for name, (_, text) in overview.COMMANDS.items()} == own
+    homes = {c.callback.__module__: c.name for c in cli.load().registered_commands if c.callback is not None}
+    assert {f"imutool.cli.{module}" for module in overview.MODULES} == homes.keys() | {"imutool.cli.fleet_view"}
+    overview.show()
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in own)
+
+
+def test_help_and_a_command_import_what_they_need() -> None:
+    seen = "import sys; sys.argv = ['imutool', WORDS]; from imutool.cli import main\ntry: main()\nexcept SystemExit: pass\n"
+    seen += "print(sorted({'numpy', 'typer', 'scipy', 'pydantic', 'imutool.cli.train', 'rich.progress'} & set(sys.modules)))"
+    for words, modules in (("'--help'", []), ("'debias', 'missing.mcap', 'out.mcap', '-q'", ["numpy", "typer"])):
+        done = subprocess.run([sys.executable, "-c", seen.replace("WORDS", words)], capture_output=True, text=True, check=True)
+        assert done.stdout.splitlines()[-1] == str(modules)
 
 
 def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:

@@ -25,11 +25,11 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from imutool.errors import ConfigError, DataError, LogError
-from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import message_rows
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage import local
 from imutool.mcap_io.storage.source import Digest, Source, sha256

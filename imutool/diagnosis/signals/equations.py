@@ -77,7 +77,7 @@ class Term:
 def terms(signal: AlignedSignal, k: int) -> Iterator[Effect]:
     """Terms of the library in one column."""
     by_name, own = channels(signal.sampled, k), signal.names[k].rpartition("[")[2].rstrip("]")
-    varying = [name for name, values in by_name.items() if np.ptp(values) > 0.0]
+    varying = [name for name, values in by_name.items() if np.ptp(values) > 0.0 and not _is_copy(signal, name, values)]
     if own.isdigit():  # what a joint feels depends on its own motion, and on another's by a product
         varying = [name for name in varying if not name.startswith("acceleration")]
     simple = [name for name in varying if not own.isdigit() or name.endswith(f"[{own}]")]
@@ -87,6 +87,14 @@ def terms(signal: AlignedSignal, k: int) -> Iterator[Effect]:
         for other in varying[at + 1 :]:
             if name in simple or other in simple:
                 yield _effect(signal, k, Term(k, (name, other), _product), f"{name} {other}", by_name)
+
+
+def _is_copy(signal: AlignedSignal, name: str, values: Samples) -> bool:
+    """Whether a channel is one of the recorded columns, or another copy: it would explain every misfit."""
+    if name not in signal.ideal.channels:
+        return False
+    alike = (abs(float(np.corrcoef(values, column)[0, 1])) for column in signal.real.T)
+    return name in signal.names or max(alike) > signal.settings.signal.copy_correlation
 
 
 def _of_one(signal: AlignedSignal, k: int, name: str, values: Samples) -> Iterator[Effect]:

@@ -1,4 +1,7 @@
-"""Numbers of a CDR message by the `ros2msg` definition in the log; messages of one layout are walked once."""
+"""Numbers of a CDR message by the `ros2msg` definition in the log.
+
+Messages of one layout are walked once.
+"""
 
 from __future__ import annotations
 

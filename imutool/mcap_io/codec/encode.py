@@ -170,7 +170,7 @@ def encode_twist(
 
 
 def as_ros1(rows: UInt8[np.ndarray, "n L"], schema_name: str) -> UInt8[np.ndarray, "n M"]:
-    """CDR messages of one layout in the encoding of ROS 1: header and numbers, no alignment; `seq` is zero."""
+    """CDR messages of one layout in the encoding of ROS 1, `seq` zero."""
     source = layout_of(schema_name, "cdr", message=rows[0].tobytes())
     target = layout_of(schema_name, "ros1", texts=list(source.texts))
     made = _blank(len(rows), target)

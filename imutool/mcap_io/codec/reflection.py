@@ -1,5 +1,6 @@
-"""IMU messages of other types, found by reflection: by protobuf descriptors, ros2msg definitions, or a first JSON message.
+"""IMU messages of other types and encodings, found by reflection on their fields.
 
+Fields come from protobuf descriptors, `ros2msg` definitions, or the first JSON message.
 A message is that of an IMU if it holds an angular velocity and a linear acceleration of three numbers each, by the names of its
 fields. Values count as rad/s and m/s². A message that lacks them has NaN, so that `clean` can leave it out.
 """
@@ -157,7 +158,7 @@ def reflect(encoding: str, schema_name: str, schema: bytes, first: bytes | None)
 
 
 def reflect_cdr(schema_name: str, schema: bytes) -> ReflectedImu | None:
-    """Fields of an IMU in a `ros2msg` definition; None of any other message, or a definition that cannot be read."""
+    """Fields of an IMU in a `ros2msg` definition; None of any other message."""
     try:
         form = DescribedCdr(ros2_definition.parse(schema_name, schema))
     except LogError:

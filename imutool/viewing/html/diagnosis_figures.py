@@ -73,11 +73,11 @@ def residual(trace: Traces, *, found: bool) -> str:
 
     def draw(figure: Any) -> None:
         panels = figure.subplots(3, 2, sharex=True, sharey="col")
+        sides = [(residual_in_band(trace, expected), color) for expected, color in _sides(trace, found)]
         for column, (signal, part) in enumerate(SIGNALS.items()):
             for row, axes in enumerate(panels[:, column]):
-                for expected, color in _sides(trace, found):
-                    left = residual_in_band(trace, expected)[:, part][:, row]
-                    axes.plot(*decimate_extremes(trace.t_s, left, BUCKETS), color=color, lw=0.6)
+                for left, color in sides:
+                    axes.plot(*decimate_extremes(trace.t_s, left[:, part][:, row], BUCKETS), color=color, lw=0.6)
                 for first, last in true_intervals(trace.t_s, trace.held_out):
                     axes.axvspan(first, last, color=HELD, alpha=0.15, lw=0)
                 axes.set_ylabel(f"{AXES[row]} ({UNITS[signal]})")

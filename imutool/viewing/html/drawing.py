@@ -22,6 +22,7 @@ from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 WIDTH_INCH = 11.5  # on a page of 1150 pixels, letters of 9 points are 12 pixels high
 HALF_INCH = 5.6  # two side by side, or one on a phone, where letters are 9 pixels high
 DOTS_PER_INCH = 200  # sharp in print
+SVG_DOTS_PER_INCH = 72  # of matplotlib's SVG
 HEADING_INCH = 0.45
 PER_DECADE = 40  # points of a spectrum
 LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
@@ -96,11 +97,12 @@ def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inc
         from matplotlib.backends.backend_svg import FigureCanvasSVG
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(width_inch, height_inch))
+        figure = Figure(figsize=(width_inch, height_inch), dpi=SVG_DOTS_PER_INCH)
         FigureCanvasSVG(figure)
         buffer = io.StringIO()
         draw(figure)
         titles = _curves(figure)
+        _lay_out(figure)
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     drawn = buffer.getvalue()
     drawn = drawn[drawn.index("<svg") :]
@@ -253,6 +255,15 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
         finally:
             for name in colors:
                 del known[name]
+
+
+def _lay_out(figure: Any) -> None:
+    """Place the axes once; `savefig` would draw everything an extra time to do so."""
+    import matplotlib
+
+    figure.get_layout_engine().execute(figure)
+    with matplotlib.rc_context({"figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
 
 
 def _curves(figure: Any) -> dict[str, str]:

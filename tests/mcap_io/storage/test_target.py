@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from imutool.errors import ConfigError
-from imutool.mcap_io.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.topics import ImuBatch

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64, Shaped, UInt8, UInt16
+from jaxtyping import Int64, UInt8, UInt16
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import as_ros1
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.passthrough.chunk_check import Part
 from imutool.mcap_io.topics import DERIVED_KEY, REFLECTED, ImuBatch, Topic
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageTopic
 
 BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
 
-Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
-Payload = UInt8[np.ndarray, "n L"]
 Translate = Callable[[UInt8[np.ndarray, "..."]], UInt8[np.ndarray, "..."] | list[bytes]]  # from CDR
 
 
@@ -105,7 +104,7 @@ class DerivedStream:
     derived: DerivedTopics
     sources: set[int]
     defined: Sequence[tuple[int, Translate | None]]  # channel ids, and translations out of CDR
-    undecoded: list[tuple[Heads, Payload]] = field(default_factory=list)  # of the source, of equal size
+    undecoded: list[Part] = field(default_factory=list)  # of the source, of equal size
     undecoded_bytes: int = 0
     data: list[UInt8[np.ndarray, "..."]] = field(default_factory=list)
     channels: list[UInt16[np.ndarray, " n"]] = field(default_factory=list)
@@ -118,15 +117,13 @@ class DerivedStream:
         """Channel ids of the new topics."""
         return [number for number, _ in self.defined]
 
-    def add(self, found: messages.Messages) -> None:
+    def add(self, parts: Iterable[Part]) -> None:
         """Takes in the IMU's messages of a source chunk, and decodes them once there are enough."""
-        of = found.heads["channel"]
-        mask = np.logical_or.reduce([of == channel for channel in self.sources])
-        for heads, payload in self.log.topics[self.derived.source_topic].cut(found, mask):
-            if self.undecoded and self.undecoded[-1][1].shape[1] != payload.shape[1]:
+        for part in parts:
+            if self.undecoded and self.undecoded[-1].payload.shape[1] != part.payload.shape[1]:
                 self.decode()
-            self.undecoded.append((heads, payload))
-            self.undecoded_bytes += payload.size
+            self.undecoded.append(part)
+            self.undecoded_bytes += part.payload.size
         if self.undecoded_bytes >= BATCH_BYTES:
             self.decode()
 

@@ -1,0 +1,121 @@
+"""Check chunks with their message indexes, and keep what was read for the copy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Shaped, UInt8
+
+from imutool.mcap_io.blocks import MessageBlock, MessageIndexes, parse_message_indexes
+from imutool.mcap_io.codec import messages, records
+from imutool.mcap_io.codec.records import ChunkHead
+from imutool.mcap_io.storage.source import Source
+from imutool.mcap_io.topics import Topic
+
+NO_ENTRIES = np.zeros((0, 2), np.uint64)
+KEPT_BYTES = 6 << 20  # of messages: the first minute of a 200 Hz IMU, and all of a small log
+
+Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
+
+
+class Part(NamedTuple):
+    """Messages of one size, copied out of their chunk."""
+
+    heads: Heads
+    payload: UInt8[np.ndarray, "n L"]
+
+
+class CheckedChunk(NamedTuple):
+    """A chunk whose contents have the stated CRC, and whether its message indexes list them."""
+
+    head: ChunkHead
+    indexes: MessageIndexes | None  # those behind the chunk; None if missing or damaged
+    right: bool
+    found: messages.Messages
+
+
+def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> CheckedChunk:
+    """Unpack a chunk and compare it with its CRC and its message indexes.
+
+    `everything` is the chunk with the message indexes behind it.
+
+    Raises:
+        LogError: the chunk is damaged.
+    """
+    raw = everything[: block.length]
+    head = block.head(raw)
+    indexes = parse_message_indexes(everything[block.length :], block, head.size)
+    data = records.unpack(raw, block.offset, max_chunk)
+    if indexes is None:
+        return CheckedChunk(head, None, False, messages.parse(data, block.offset))
+    found, right = indexes.messages(data, block.offset)
+    return CheckedChunk(head, indexes, right, found)
+
+
+class KeptChunk(NamedTuple):
+    """Head, message indexes and messages of some channels of a checked chunk."""
+
+    head: ChunkHead
+    indexes: MessageIndexes
+    parts: Mapping[str, list[Part]]  # by topic
+
+
+class KeptChunks:
+    """Chunks that were read and checked before the copy, and then are only copied.
+
+    A chunk is kept if nothing is left to do about it: it is intact, its message indexes are right, and it defines nothing.
+    Whoever copies it must make sure that the file is still the same (`location.identity`).
+    """
+
+    def __init__(self, source: Source, topics: Mapping[str, tuple[Topic, set[int]]], max_chunk: int) -> None:
+        self._source, self._topics, self._max_chunk = source, topics, max_chunk
+        self._channels = set[int]().union(*(channels for _, channels in topics.values()))
+        self._kept: dict[int, KeptChunk] = {}
+        self._room = KEPT_BYTES
+
+    def pop(self, block: MessageBlock, channels: set[int]) -> KeptChunk | None:
+        """Hand over a chunk, if it was kept with the messages of these channels."""
+        return self._kept.pop(block.offset, None) if channels == self._channels else None
+
+    def rows(
+        self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
+    ) -> list[tuple[str, messages.Rows]] | None:
+        """Messages of some topics by log time, as `Log.rows`; None if the chunk is not kept.
+
+        Raises:
+            LogError: the chunk is damaged.
+        """
+        if not wanted.keys() <= self._topics.keys() or (parts := self._read(block)) is None:
+            return None
+        found = []
+        for topic in wanted:
+            for heads, payload in parts[topic]:
+                times = heads["log_time"].view(np.int64)
+                mask = (times >= first) & (times <= last)
+                if mask.any():
+                    found.append((topic, messages.columns(heads[mask], payload[mask])))
+        return found
+
+    def _read(self, block: MessageBlock) -> Mapping[str, list[Part]] | None:
+        """Messages in a chunk, which is kept; None if its indexes are wrong, or there is no room."""
+        if (known := self._kept.get(block.offset)) is not None:
+            return known.parts
+        if block.compression is None or not block.indexes or block.end - block.offset > self._max_chunk or self._room <= 0:
+            return None
+        everything = memoryview(self._source.at(block.offset, block.end - block.offset))
+        head, indexes, right, found = check_chunk(everything, block, self._max_chunk)
+        if indexes is None or not right or found.definitions:
+            return None
+        parts = {name: list(parts_of(found, topic, channels)) for name, (topic, channels) in self._topics.items()}
+        self._room -= sum(column.nbytes for of_topic in parts.values() for part in of_topic for column in part)
+        self._kept[block.offset] = KeptChunk(head, indexes._replace(entries=NO_ENTRIES), parts)
+        return parts
+
+
+def parts_of(found: messages.Messages, topic: Topic, channels: set[int]) -> Iterator[Part]:
+    """Messages of a topic's channels, in stretches of one size."""
+    of = found.heads["channel"]  # `np.isin` takes ten times as long for the few there are
+    for heads, payload in topic.cut(found, np.logical_or.reduce([of == channel for channel in channels])):
+        yield Part(heads, payload)
