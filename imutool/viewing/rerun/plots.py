@@ -27,7 +27,7 @@ def frame(
     play_state: Literal["following"] | None = "following",
     recordings: Literal["collapsed", "expanded"] = "collapsed",
 ) -> rrb.Blueprint:
-    """Blueprint around views and containers: `elapsed` as the timeline, the list of recordings on the left, all else folded."""
+    """Blueprint around views and containers, with `elapsed` as the timeline."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(
