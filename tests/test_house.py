@@ -46,7 +46,7 @@ TIERS = (
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
 FOR_CONVERTERS = {"converters", "errors", "geometry", "recording", "bag"}
 
-HEAVY = {"torch", "torchdiffeq", "safetensors", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
+HEAVY = {"torch", "torchdiffeq", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
 HELP_SHARE = 0.4  # of the time `import torch` takes; the command itself takes about a tenth of it
 ROUNDS = 3
 

@@ -21,8 +21,8 @@ from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
-from imutool.report import Section
 from imutool.viewing.stream.sources import Malformed, Sample, Samples
+from imutool.viewing.stream.statistics import Delay, StreamStatistics
 
 START_S = 2.0  # of the stream, from which the start bias is taken
 BATCH_S = 0.1  # shown together
@@ -34,31 +34,6 @@ MAX_DELAYS = 1 << 20  # of which percentiles are taken: 17 minutes at 1 kHz, the
 logger = logging.getLogger("imutool")
 Corrected = Callable[[Sample, np.ndarray, np.ndarray], None]
 Show = Callable[[DebiasedBlock], None]
-
-
-class Delay(Section, frozen=True):
-    """Delay from the arrival of a sample to its corrected value, in ms, after the start."""
-
-    median: float
-    p99: float
-    max: float
-
-
-class StreamStatistics(Section, frozen=True):
-    """Statistics of a live stream; `start` says where the start bias comes from."""
-
-    samples: int
-    seconds: float
-    rate_hz: float
-    delay_ms: Delay | None
-    start: str
-    gaps: int
-    out_of_order: int
-    not_measured: int
-    malformed: int
-    not_shown: int
-    gyro_bias: list[float]
-    accel_bias: list[float]
 
 
 def run(
