@@ -1,4 +1,4 @@
-"""Read an MCAP log: whole columns at a time in file order, one chunk in memory, CRCs checked."""
+"""Read an MCAP log: whole columns in file order, one chunk in memory, CRCs checked."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ Show = Callable[[DebiasedBlock], None]
 
 
 class Delay(Section, frozen=True):
-    """Delay from the arrival of a sample to its corrected value, in ms, from the end of the start on."""
+    """Delay from a sample's arrival to its corrected value, in ms, after the start."""
 
     median: float
     p99: float
@@ -70,7 +70,7 @@ def run(
     each: Corrected | None = None,
     seconds: float | None = None,
 ) -> StreamStatistics:
-    """Debias a stream until it ends, `seconds` have passed or Ctrl-C; `each` gets every corrected sample.
+    """Debias a stream until it ends, `seconds` have passed or Ctrl-C is pressed.
 
     The start bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
     samples until then are corrected late and are not counted in the delay.
