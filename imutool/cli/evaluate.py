@@ -24,7 +24,7 @@ TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
 class Score(Section, frozen=True, kw_only=True):
-    """Scores of an estimate of a log: degrees, metres, rad/s and m/s².
+    """Scores of an estimate of a log; degrees, metres, biases in rad/s and m/s².
 
     Relative errors are keyed by their distance in metres; a figure that the log does not show is null.
     """

@@ -23,7 +23,7 @@ FOLDER = "catalog"  # below the fleet's folder, for the layers' files
 
 
 class Measure(NamedTuple):
-    """Measure of how bad a log is: its property, meaning, and whether larger is worse."""
+    """Measure of a log: its property, the meaning, and whether a larger value is worse."""
 
     column: str
     meaning: str

@@ -27,7 +27,7 @@ def frame(
     play_state: Literal["following"] | None = "following",
     recordings: Literal["collapsed", "expanded"] = "collapsed",
 ) -> rrb.Blueprint:
-    """Blueprint around views and containers, with `elapsed` as the timeline."""
+    """Blueprint around views: `elapsed` as the timeline, side panels collapsed."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(

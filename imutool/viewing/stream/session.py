@@ -45,7 +45,7 @@ def run(
     each: Corrected | None = None,
     seconds: float | None = None,
 ) -> StreamStatistics:
-    """Debias a stream until it ends, `seconds` have passed or Ctrl-C.
+    """Debias a stream until it ends, `seconds` have passed or Ctrl-C is pressed.
 
     The start bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
     samples until then are corrected late and are not counted in the delay.

@@ -30,7 +30,7 @@ Vector = tuple[float, float, float]
 
 
 class Sample(NamedTuple):
-    """Sample of an IMU: stamp (ns), rad/s, m/s², and its arrival by `time.perf_counter` (s)."""
+    """Sample of an IMU: stamp (ns), rad/s, m/s², time of arrival (s of `time.perf_counter`)."""
 
     stamp_ns: int
     gyro: Vector
@@ -93,7 +93,7 @@ DECODER = msgspec.json.Decoder(_Message)
 
 
 def sample(text: bytes | str, arrival_s: float) -> Sample:
-    """Sample from JSON: `t_ns` or `t_s` with `gyro` and `accel`, or a sensor_msgs/Imu.
+    """Sample from JSON with t_ns or t_s, gyro and accel, or from a sensor_msgs/Imu in JSON.
 
     Raises:
         ValueError: it is none.

@@ -6,7 +6,7 @@ from imutool.report import Section
 
 
 class Delay(Section, frozen=True):
-    """Delay from the arrival of a sample to its corrected value, in ms, after the start."""
+    """Delay from a sample's arrival to its corrected value, in ms, after the start."""
 
     median: float
     p99: float
