@@ -119,7 +119,7 @@ class DebiasedImu(Section, frozen=True):
     gyro_bias: list[float]
     accel_bias: list[float]
     std: list[float]
-    fit: Fitness
+    fit: Fitness | UnsetType = UNSET  # of the model; older reports have none
     left_out: dict[str, int] | UnsetType = UNSET  # samples that are no measurement, by reason
     stretches: list[StretchEntry] | UnsetType = UNSET  # each but the first: gaps and jumps of the clock
 
@@ -183,7 +183,7 @@ def _say(report: DebiasReport, summary: DebiasSummary) -> None:
         gyro = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias)
         accel = ", ".join(f"{b:+.4f}" for b in imu.accel_bias)
         say(f"{topic}: {imu.model}, start bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
-        say(f"{topic}: {imu.fit.sentence('the model')}")
+        say(f"{topic}: {report.fits[topic].sentence('the model')}")
     counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
     say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
     verified = summary.verified

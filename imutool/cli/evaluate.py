@@ -15,7 +15,7 @@ from imutool.bias_start.verdict import Fitness
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.errors import ImutoolError
-from imutool.report import Report, Section
+from imutool.report import UNSET, Report, Section, UnsetType
 
 logger = logging.getLogger(__name__)
 
@@ -23,8 +23,8 @@ ALIGNED_HELP = "Also print evo's orientation error after an alignment of the pos
 TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
-class Score(Section, frozen=True):
-    """Scores of an estimate of a log; angles in degrees, lengths in metres, biases in rad/s and m/s².
+class Score(Section, frozen=True, kw_only=True):
+    """Scores of an estimate of a log; degrees, metres, biases in rad/s and m/s².
 
     Relative errors are keyed by their distance in metres; a figure that the log does not show is null.
     """
@@ -35,7 +35,7 @@ class Score(Section, frozen=True):
     init: str | None
     init_how: str | None
     smooth: bool
-    fit: Fitness | None
+    fit: Fitness | UnsetType | None = UNSET
     samples: int
     duration_s: float
     aoe_deg: float

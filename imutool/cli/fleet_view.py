@@ -45,7 +45,7 @@ class NotShown(Section, frozen=True):
 
 
 class CatalogReport(Report, frozen=True, tag="imutool.catalog/1"):
-    """Report of `imutool fleet view`: address, number of segments, and the worst logs by a measure."""
+    """Report of `imutool fleet view`: address, number of segments, and the worst logs."""
 
     url: str
     segments: int

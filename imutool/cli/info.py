@@ -69,7 +69,6 @@ def _described(
     log: str, quick: bool, max_chunk: int | None, noise: bool, settings: Mapping[str, str | None]
 ) -> tuple[LogInfo, IdentifiedNoise | None]:
     """Report on a log, and its noise if requested; the log is opened once."""
-    from imutool.bias.io import shipped_for
     from imutool.log_info.inspection import describe
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
@@ -78,7 +77,11 @@ def _described(
         fix = f"Name its logs, or report on all of them with: imutool fleet info {place} OUT"
         raise ConfigError("is a folder", where=place, expected="an MCAP log", fix=fix)
     with RecoveredLog(place, max_chunk=max_chunk) as opened:
-        report = replace(describe(opened, check=not quick), models=shipped_for(opened.metadata().get("imutool", {})))
+        report, about = describe(opened, check=not quick), opened.metadata().get("imutool", {})
+        if "dataset" in about:
+            from imutool.bias.io import shipped_for
+
+            report = replace(report, models=shipped_for(about))
         if not noise:
             return report, None
         from imutool import noise_identification

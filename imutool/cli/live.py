@@ -14,7 +14,7 @@ from imutool.cli.app import RRD, Imu, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import err, log_to_stderr, plain, say, tell_warning, write_json
 from imutool.report import Report
 from imutool.viewing import Output
-from imutool.viewing.stream.session import StreamStatistics
+from imutool.viewing.stream.statistics import StreamStatistics
 
 if TYPE_CHECKING:
     import numpy as np

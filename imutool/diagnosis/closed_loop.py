@@ -32,7 +32,7 @@ METRIC_S = 600.0  # that a metric may take
 def closed_loop(
     first: Diagnosis, again: Diagnosis, log: Path, *, metric: Callable[[Path], float] | None = None, before: Path | None = None
 ) -> ClosedLoop:
-    """Figures of a recording and two simulations: the one that was given, and the one with the physics that was found.
+    """Figures of a recording and two simulations: the given one, and one with found physics.
 
     `metric` maps a simulation's log to the user's figure.
     """

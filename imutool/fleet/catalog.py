@@ -23,7 +23,7 @@ FOLDER = "catalog"  # below the fleet's folder, for the layers' files
 
 
 class Measure(NamedTuple):
-    """Measure by which a log is worse than another: its property, the meaning, and whether a larger value is worse."""
+    """Measure of a log: its property, the meaning, and whether a larger value is worse."""
 
     column: str
     meaning: str

@@ -50,7 +50,7 @@ class Layers(NamedTuple):
 
 
 def logs_of(folders: Sequence[Path]) -> list[FleetLog]:
-    """Logs in the results of fleets, by name; a log that several fleets name has the facts of all.
+    """Logs in the results of fleets, by name; a log of several fleets has the facts of all.
 
     Raises:
         ConfigError: a folder without fleet.parquet.
@@ -113,7 +113,7 @@ def _joined(before: FleetLog | None, log: FleetLog) -> FleetLog:
 
 
 def build(logs: Sequence[FleetLog], cache: Path, *, workers: int | None = None) -> Iterator[Layers]:
-    """Write the layers of each log as .rrd files, in worker processes; complete ones of an earlier call stay.
+    """Write the layers of each log as .rrd files, in worker processes; complete ones stay.
 
     Raises:
         ConfigError: `cache` cannot be written.
@@ -135,7 +135,7 @@ def build(logs: Sequence[FleetLog], cache: Path, *, workers: int | None = None) 
 
 
 def layers(log: FleetLog, cache: Path) -> Layers:
-    """Layers of one log: raw, debiased and diagnosis, each in a file; without an IMU there are none."""
+    """Layers of one log, each in a file; without an IMU there are none."""
     from imutool.viewing.rerun.importer import load_first_imu
 
     try:

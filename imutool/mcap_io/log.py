@@ -1,4 +1,4 @@
-"""Read an MCAP log: whole columns at a time in file order, one chunk in memory, CRCs checked."""
+"""Read an MCAP log in file order: whole columns, one chunk in memory, every CRC checked."""
 
 from __future__ import annotations
 

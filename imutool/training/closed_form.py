@@ -53,7 +53,7 @@ class Solution:
 
 
 def carried_attitudes(model: BiasNetwork, windows: Windows) -> Float[Tensor, "batch n 3 3"]:
-    """Attitudes under the accelerometer: from the true one at each window's start, along the debiased gyro."""
+    """Attitudes under the accelerometer: the debiased gyro from each window's true start."""
     segment = windows.segment
     return attitudes(windows.R_start, segment.gyro - model.sensor_bias("gyro", segment), windows.dt)
 

@@ -77,7 +77,7 @@ def large(folder: Path, gb: float) -> Iterator[Row]:
         yield Row(f"cp, {packing}", ["cp", str(log), str(out)], "cp", (out,))
         for command in ("info", "repair", "debias"):
             words = [command, log] if command == "info" else [command, log, out]
-            words += ["-q", "--model", MODEL] if command == "debias" else []
+            words += ["-q", "--force", "--model", MODEL] if command == "debias" else []
             yield Row(f"{command}, {packing}", [IMUTOOL, *map(str, words)], "cp", (out,))
         log.unlink()
 

@@ -197,8 +197,8 @@ def race(names: list[str], source: Path, packing: str, rounds: int) -> dict[str,
     known = {
         "cp": ["cp", str(source), str(target)],
         "cp, sync": ["sh", "-c", 'cp "$0" "$1" && sync "$1"', str(source), str(target)],
-        "debias": [imutool, "debias", str(source), str(target), "-q", "--model", "euroc-adis16448-hybrid"],
-        "debias linear": [imutool, "debias", str(source), str(target), "-q", "--model", "euroc-adis16448-linear"],
+        "debias": [imutool, "debias", str(source), str(target), "-q", "--force", "--model", "euroc-adis16448-hybrid"],
+        "debias linear": [imutool, "debias", str(source), str(target), "-q", "--force", "--model", "euroc-adis16448-linear"],
     }
     for count in range(rounds + 1):
         for name in names:

@@ -81,7 +81,7 @@ def simulator_faults(sim: Recording, real: Recording | None, sheet: datasheet.No
 
 
 def simulator_remarks(sim: Recording) -> list[str]:
-    """Remarks on what a simulation does wrong by its own poses; none where it has no usable ones."""
+    """Remarks on a simulation's errors by its own poses; none without usable poses."""
     try:
         faults = simulator_faults(sim, None, datasheet.read("none"))
     except ImutoolError:

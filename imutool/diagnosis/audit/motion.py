@@ -66,7 +66,7 @@ class Kinematics:
 
 @dataclass(frozen=True, eq=False)
 class KinematicFit:
-    """Fitted model of both sensors: estimates by name, frames, axes and the residual (gyro, accel)."""
+    """Fitted model of both sensors: estimates, frames, axes and residual (gyro, accel)."""
 
     estimates: dict[str, Estimate]
     world: tuple[bool, bool]

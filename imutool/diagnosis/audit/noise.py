@@ -41,7 +41,7 @@ WALK_BLOCKS, WALK_P_VALUE, WALK_FACTOR = 8, 1e-4, 4.0  # blocks of a log; the wa
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Expected noise: density and walk by column, the rate of the recording that shows it, its samples."""
+    """Expected noise: density and walk by column, the recording's rate, its samples."""
 
     density: Float64[np.ndarray, "6"]
     walk: Float64[np.ndarray, "6"]
@@ -66,7 +66,7 @@ class Expected:
 
 
 def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndarray, " k"]:
-    """White noise of a sample (standard deviation) from the spectrum's median where no body moves."""
+    """White noise of a sample (deviation) from the spectrum's median where no body moves."""
     f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
     return np.asarray(np.sqrt(np.median(power[(f_hz > 0.25 * rate_hz) & (f_hz < 0.48 * rate_hz)], axis=0) * rate_hz / 2.0))
 

@@ -31,7 +31,7 @@ Matrix = Float64[np.ndarray, "p p"]
 
 
 def log_p_value(gain: float, parameters: int) -> float:
-    """Log p-value of a gain in squares under H0, by chi-square (leading term far out); 0 without parameters."""
+    """Log p-value of a gain in squares under H0, by chi-square; 0 without parameters."""
     if parameters == 0:  # all of them implausible: what is left of the effect does nothing
         return 0.0
     half, k = 0.5 * max(gain, 0.0), 0.5 * parameters

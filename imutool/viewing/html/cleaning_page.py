@@ -22,7 +22,7 @@ MIN_WIDTH = 0.002  # of the strip, so that one sample in an hour is visible
 
 
 def write(surveys: Sequence[Survey], path: Path, *, overwrite: bool = False) -> None:
-    """Write the page as one file without requests, with text from the log escaped (ConfigError: the target)."""
+    """Write the page as one file without requests (ConfigError: a bad target)."""
     with Target(path, overwrite=overwrite) as target:
         target.write(html(surveys).encode())
 

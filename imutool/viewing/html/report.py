@@ -125,7 +125,7 @@ def name_by_topic(logs: Sequence[RunData], topics: Sequence[str]) -> list[RunDat
 
 
 def check_target(path: Location, *, overwrite: bool = False) -> None:
-    """Check before the work that a page can be written (ConfigError: no matplotlib, or a bad target)."""
+    """Check before the work that a page can be written (else a ConfigError)."""
     require_matplotlib()
     Target(path, overwrite=overwrite).abandon()
 

@@ -91,7 +91,7 @@ def _is_mcap(path: Path) -> bool:
 
 
 def load_first_imu(path: Location, findings: Path | None = None) -> RunData | None:
-    """Data of the first IMU of a log, with the events of a diagnosis in `findings`; None without an IMU.
+    """Data of the first IMU of a log, with the events of `findings`; None without an IMU.
 
     Raises:
         ConfigError, LogError, DataError: as `imutool.viewing.model.runs.load`.

@@ -54,7 +54,7 @@ def live_blueprint(scopes: Mapping[str, Scope], boxes: Mapping[str, Box] | None 
 
 
 def fleet_blueprint() -> rrb.Blueprint:
-    """Layout for any log of a fleet: paths and errors beside tabs of signals, biases, events and reports."""
+    """Layout for any log of a fleet: paths and errors, and tabs of all else."""
     import rerun.blueprint as rrb
 
     paths = rrb.Spatial3DView(

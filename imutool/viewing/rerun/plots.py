@@ -27,7 +27,7 @@ def frame(
     play_state: Literal["following"] | None = "following",
     recordings: Literal["collapsed", "expanded"] = "collapsed",
 ) -> rrb.Blueprint:
-    """Blueprint around views and containers: `elapsed` as the timeline, the list of recordings on the left, all else folded."""
+    """Blueprint around views: `elapsed` as the timeline, side panels collapsed."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(

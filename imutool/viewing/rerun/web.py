@@ -51,7 +51,7 @@ def site(logs: Sequence[RunData], *, source: bool = True, at_s: float | None = N
 
 
 def catalog_site(title: str, urls: Sequence[str], origin: str) -> dict[str, bytes]:
-    """Files of a web page that shows segments of a catalog on this machine, which listens at `origin`.
+    """Files of a web page that shows segments of a catalog, which listens at `origin`.
 
     Raises:
         ConfigError: Rerun is not installed, or its program does not run.

@@ -21,8 +21,8 @@ from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
-from imutool.report import Section
 from imutool.viewing.stream.sources import Malformed, Sample, Samples
+from imutool.viewing.stream.statistics import Delay, StreamStatistics
 
 START_S = 2.0  # of the stream, from which the start bias is taken
 BATCH_S = 0.1  # shown together
@@ -36,31 +36,6 @@ Corrected = Callable[[Sample, np.ndarray, np.ndarray], None]
 Show = Callable[[DebiasedBlock], None]
 
 
-class Delay(Section, frozen=True):
-    """Delay from the arrival of a sample to its corrected value, in ms, from the end of the start on."""
-
-    median: float
-    p99: float
-    max: float
-
-
-class StreamStatistics(Section, frozen=True):
-    """Statistics of a live stream; `start` says where the start bias comes from."""
-
-    samples: int
-    seconds: float
-    rate_hz: float
-    delay_ms: Delay | None
-    start: str
-    gaps: int
-    out_of_order: int
-    not_measured: int
-    malformed: int
-    not_shown: int
-    gyro_bias: list[float]
-    accel_bias: list[float]
-
-
 def run(
     source: Samples,
     model: BiasModel,
@@ -70,7 +45,7 @@ def run(
     each: Corrected | None = None,
     seconds: float | None = None,
 ) -> StreamStatistics:
-    """Debias a stream until it ends, `seconds` have passed or Ctrl-C; `each` gets every corrected sample.
+    """Debias a stream until it ends, `seconds` have passed or Ctrl-C is pressed.
 
     The start bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
     samples until then are corrected late and are not counted in the delay.

@@ -30,7 +30,7 @@ Vector = tuple[float, float, float]
 
 
 class Sample(NamedTuple):
-    """Sample of an IMU: stamp (ns), rad/s, m/s², and the time of its arrival (s of `time.perf_counter`)."""
+    """Sample of an IMU: stamp (ns), rad/s, m/s², time of arrival (s of `time.perf_counter`)."""
 
     stamp_ns: int
     gyro: Vector
@@ -93,7 +93,7 @@ DECODER = msgspec.json.Decoder(_Message)
 
 
 def sample(text: bytes | str, arrival_s: float) -> Sample:
-    """Sample from JSON: `{"t_ns": …, "gyro": [x, y, z], "accel": [x, y, z]}` (or `t_s`), or a sensor_msgs/Imu.
+    """Sample from JSON with t_ns or t_s, gyro and accel, or from a sensor_msgs/Imu in JSON.
 
     Raises:
         ValueError: it is none.
@@ -126,7 +126,7 @@ Samples = Iterator[Sample | None]  # None: nothing came for a while
 
 
 def open_source(name: str, malformed: Malformed, *, imu: str | None = None, speed: float = 1.0) -> Samples:
-    """Samples of a source as they come; opened at once, so that a wrong address is refused before the work.
+    """Samples of a source as they come; a wrong address is refused at once.
 
     Raises:
         ConfigError: no such source, or it cannot be opened.

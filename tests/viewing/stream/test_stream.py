@@ -193,9 +193,11 @@ def test_standard_input_is_printed_debiased_until_ctrl_c(imu: Imu, tmp_path: Pat
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
-        process.stdin.write("\n".join([*lines(imu), "nonsense", ""]))
-        process.stdin.flush()
+        given = "\n".join([*lines(imu), "nonsense", ""])
+        writer = threading.Thread(target=lambda: (process.stdin.write(given), process.stdin.flush()))  # else both pipes fill up
+        writer.start()
         printed = [json.loads(process.stdout.readline()) for _ in range(len(imu))]
+        writer.join()
         time.sleep(0.2)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()
