@@ -178,7 +178,7 @@ def shown_by_logs(
     own: Float[Tensor, "logs o"],
     prior: Float[Tensor, " p"],
 ) -> Float[Tensor, " o"]:
-    """Prior of a log's own unknowns, as wide as the logs' nuisances scatter beyond their own deviations.
+    """Prior of a log's own unknowns: as wide as the logs scatter beyond their deviations.
 
     The restricted likelihood of all logs decides between widths up to `NUISANCE_STD`: what logs share is the effects', and
     logs that agree keep one clock, one rotation and one lever arm. `H` and `g` are the losses of the logs about a point.
