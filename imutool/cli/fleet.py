@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
-from imutool.cli.debias import VERIFY_HELP
+from imutool.cli.debias import FORCE_HELP, VERIFY_HELP
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
@@ -84,6 +84,7 @@ def debias(
     ] = None,
     init: Init = "auto",
     smooth: Smooth = False,
+    force: Annotated[bool, typer.Option("--force", help=FORCE_HELP)] = False,
     clean: Annotated[bool, typer.Option(help="Also clean the IMU; skip logs that cannot be trusted.")] = True,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
@@ -99,7 +100,8 @@ def debias(
         from imutool.viewing.html.drawing import require_matplotlib
 
         require_matplotlib()
-    settings = Settings(command="debias", model=model, init=init, smooth=smooth, clean=clean, check=verify, pages=pages)
+    start = {"init": init, "smooth": smooth, "force": force}
+    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages)  # type: ignore[arg-type]
     return with_model_hash(settings)
 
 

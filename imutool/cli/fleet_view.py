@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose
+from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written
 from imutool.cli.fleet import fleet
 from imutool.cli.terminal import progress, say, table, tell_warning, write_json
 from imutool.errors import ConfigError
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 WAITS_S = 3600.0  # Ctrl-C ends it at once
 BY_HELP = "Measure of the worst logs: aoe, score, bias, effects or losses; by default the first that a log has."
 CACHE_HELP = "Folder for the layers' files; by default DIR/catalog. They are written once."
+LAYERS = Written(files=("*.rrd", "layout.rbl"), keeps=True)  # named by digests: a file stays, or is the same
 COLUMNS = {"status": "status", "aoe_raw_deg": "AOE raw\n°", "aoe_deg": "AOE\n°", "score": "score"}
 COLUMNS |= {"gyro_bias_deg_s": "gyro bias\n°/s", "effects": "effects", "losses": "losses", "robot": "robot"}
 
@@ -62,7 +63,7 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="Open in a browser on this machine instead of a viewer.")] = False,
     list_only: Annotated[bool, typer.Option("--list", help="Print the worst logs and end.")] = False,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the catalog; else a free one.")] = None,
-    cache: Annotated[Path | None, typer.Option(metavar="DIR", help=CACHE_HELP)] = None,
+    cache: Annotated[Path | None, typer.Option(metavar="DIR", help=CACHE_HELP), LAYERS] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,

@@ -69,10 +69,17 @@ def logs_of(folders: Sequence[Path]) -> list[FleetLog]:
                 fix="Run `imutool fleet debias SRC OUT` first",
             ) from error
         for row in rows:
-            if row["target"]:
+            if row.get("target"):
+                _check_inside(row["target"], table)
                 log = _log(folder, row)
                 logs[log.name] = _joined(logs.get(log.name), log)
     return list(logs.values())
+
+
+def _check_inside(target: str, table: Path) -> None:
+    """Refuse a target outside its fleet's folder: layers are named by it."""
+    if Path(target).is_absolute() or ".." in Path(target).parts:
+        raise ConfigError(f"names the target {target}", where=table, expected="a file in the folder of the fleet")
 
 
 def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:

@@ -263,6 +263,7 @@ def _provenance(settings: Settings) -> Iterator[str]:
     if settings.command == "debias":
         words = {True: "yes", False: "no"}
         entries |= {"init": settings.init, "smooth": words[settings.smooth], "clean": words[settings.clean]}
+        entries |= {"unfit models": "used" if settings.force else "refused"}
         entries["verified"] = f"structure, and contents: {settings.check}"
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):

@@ -144,9 +144,8 @@ def _debias(job: _Job) -> dict[str, Any]:
 
     s = job.settings
     rules = CleaningSettings() if s.clean else None
-    report = debias(
-        job.source, job.target, model=s.model, init=s.init, smooth=s.smooth, clean=rules, check=s.check, overwrite=True
-    )
+    options: dict[str, Any] = {"init": s.init, "smooth": s.smooth, "force": s.force, "clean": rules, "check": s.check}
+    report = debias(job.source, job.target, model=s.model, **options, overwrite=True)
     imus = tuple(
         Imu(topic, report.models[topic], start.how, tuple(start.rest[:3].tolist()), tuple(start.rest[3:].tolist()))
         for topic, start in report.starts.items()
@@ -161,9 +160,10 @@ def _debias(job: _Job) -> dict[str, Any]:
             if finding.severity != "note"
         )
         entries["warnings"] = (*entries.get("warnings", ()), *found)
-    unmeasured = tuple(f"{topic}: {text}" for topic, sieve in report.sieves.items() for text in sieve.warnings())
-    if unmeasured:
-        entries["warnings"] = (*entries.get("warnings", ()), *unmeasured)
+    unmeasured = [f"{topic}: {text}" for topic, sieve in report.sieves.items() for text in sieve.warnings()]
+    unfit = [f"{topic}: {fit.sentence('the model')}" for topic, fit in report.fits.items() if fit.verdict != "fits"]
+    if unmeasured or unfit:
+        entries["warnings"] = (*entries.get("warnings", ()), *unmeasured, *unfit)
     if s.pages:
         entries |= _page(job, list(report.starts), entries.get("warnings", ()))
     return entries

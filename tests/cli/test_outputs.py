@@ -38,8 +38,10 @@ NEEDS = {
     "evaluate": ["in.mcap"],
     "vio": ["in.mcap"],
     "view": ["in.mcap", "--html", "out.html"],
+    "live": ["--from", "in.mcap"],
     "simulate": ["in.mcap", "out.mcap"],
     "diagnose": ["in.mcap"],
+    "audit": ["in.mcap"],
     "conceal": ["--open", "in.mcap"],
     "export": ["in.mcap", "out", "--format", "euroc"],
     "models": [],
@@ -48,6 +50,7 @@ NEEDS = {
     "fleet repair": ["in.mcap", "out"],
     "fleet info": ["in.mcap", "out"],
     "fleet diagnose": ["in.mcap", "out"],
+    "fleet view": ["in.mcap"],
 }
 ALSO = {"noise_plot": ["--noise"], "noise_toml": ["--noise"]}  # words that an option needs
 SILENT = {"schema", "new-converter"}  # one prints on stdout, the other makes a new folder or refuses
@@ -67,6 +70,9 @@ READ = {
     "model",
     "noise",
     "map_",
+    "real",
+    "metric",
+    "folders",
 }
 WORDS = {
     *("format", "sequence", "compression", "imu", "truth", "rule", "no_rule", "init", "verify", "connect", "method", "set_"),
@@ -84,6 +90,7 @@ WORDS = {
         "memory",
         "robot_from",
         "encoding",
+        "by",
     ),
 }
 

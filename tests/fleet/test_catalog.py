@@ -102,6 +102,12 @@ def test_a_segment_has_its_layers_and_a_query_finds_the_worst(out: Path, diagnos
             Catalog(built, cache, int(served.origin.rpartition(":")[2]))
 
 
+def test_a_target_outside_its_fleet_is_refused(tmp_path: Path) -> None:
+    results.write([Result(key="k", source="a.mcap", target="../a.mcap", status="ok")], tmp_path / results.NAME)
+    with pytest.raises(ConfigError, match=r"\.\./a\.mcap"):
+        logs_of([tmp_path])
+
+
 def test_what_cannot_be_shown_is_named(tmp_path: Path, out: Path) -> None:
     (log,) = build([FleetLog("gone", str(tmp_path / "gone.mcap"), "")], tmp_path / "cache")
     assert not log.files

@@ -52,6 +52,16 @@ def test_a_debiased_log_is_what_debias_makes_of_it(done: Result, logs: Path, tmp
     assert (imu.topic, imu.model) == ("/imu0", "linear")
 
 
+def test_a_model_of_another_sensor_is_refused_or_warned_of(logs: Path, tmp_path: Path) -> None:
+    settings = Settings(command="debias", model="tum_vi-bmi160-linear")
+    refused = work(task(logs / "flight_1.mcap", tmp_path / "out", settings))
+    assert (refused.status, refused.exit_code) == ("failed", 6)
+    assert "does not fit this log" in refused.error
+    forced = work(task(logs / "flight_1.mcap", tmp_path / "out", msgspec.structs.replace(settings, force=True)))
+    assert forced.status == "ok"
+    assert any("the model is unfit" in warning for warning in forced.warnings)
+
+
 def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
     """Nothing in it tells of the time, the machine or the place."""
     moved = tmp_path / "elsewhere" / "flight_1.mcap"
