@@ -43,7 +43,7 @@ DEPENDENT = (
 MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
 MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
 STUDENT = 7.0  # degrees of freedom of the innovations' likelihood, so that one jolt does not decide
-GRAVITY_RANGE = (0.8, 1.2)  # of the mean specific force to gravity; a sensor in g has 0.1
+GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 
 
 @dataclass(frozen=True)

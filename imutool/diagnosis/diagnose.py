@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ from imutool.diagnosis.signals.compared_signals import with_signals
 from imutool.diagnosis.to_physics_file import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
+from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
 from imutool.recording import Recording
@@ -74,9 +76,8 @@ def diagnose(
         DataError: no truth and no simulation, too little shared time, another motion, no usable axis.
     """
     report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
-    if signals and (sim is None or len(reals) != 1):
-        raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
     report(0, 4, "reading")
+    _check_signals(signals, reals, sim)
     if sim is not None and not all(_has_imu(log) for log in (reals[0], sim)):
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
     logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
@@ -125,6 +126,15 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         why = f"How much closer it comes is computed, not simulated again: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
+
+
+def _check_signals(signals: Sequence[str], reals: Sequence[Location], sim: Location | None) -> None:
+    """Refuse signals without a simulation, and names that a log lacks, before the search."""
+    if signals and (sim is None or len(reals) != 1):
+        raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
+    for name, place in product(signals, (reals[0], sim)):
+        if place is not None:
+            read_field(place, name)
 
 
 def _has_imu(path: Location) -> bool:

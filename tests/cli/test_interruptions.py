@@ -159,7 +159,7 @@ def test_no_child_is_left_soon_after_sigterm(tmp_path: Path, command: str) -> No
     assert all(path.suffix == ".mcap" for path in (tmp_path / "out").rglob("*"))
 
 
-IMPORTED_FIRST = ("imutool.cli.parameters", "typer.core", "rich.console", "imutool.cli.app", "imutool.fleet.task")
+IMPORTED_FIRST = ("imutool.cli.parameters", "typer.core", "rich.console", "imutool.cli.app", "imutool.report")
 
 
 @pytest.mark.parametrize("module", IMPORTED_FIRST)

@@ -275,7 +275,7 @@ def test_a_cut_log_says_inside_which_record(foreign: Foreign, flight: list[Messa
     with Log(path) as log:
         chunk = log.index.blocks[1]
     path.write_bytes(path.read_bytes()[: chunk.offset + 5000])
-    expected = rf"byte {chunk.offset + 5000}, inside the Chunk record that begins at byte {chunk.offset}; .*imutool repair"
+    expected = rf"byte {chunk.offset + 5000}, inside the Chunk record at byte {chunk.offset}; .*imutool repair"
     with pytest.raises(LogError, match=expected):
         read(path)
 

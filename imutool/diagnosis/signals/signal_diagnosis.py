@@ -112,6 +112,9 @@ def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) ->
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
+    named = select_effects([log], candidates, [driven], always=always)
+    if named.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
+        return named  # a term may fit as well as a name, and says less
     equations = [effect for k in columns for effect in terms(signal, k)]
     selection = select_effects([log], candidates, [driven, equations], always=always)
     if selection.whole.reduced_chi_square < signal.settings.search.explained_chi_square:

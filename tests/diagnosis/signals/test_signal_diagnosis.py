@@ -195,22 +195,24 @@ def test_what_drives_is_named_and_decoys_are_not(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("variable", ["x", "dx/dt"])
-def test_what_has_no_name_is_given_none_but_a_curve(variable: str, seed: int) -> None:
+def test_what_has_no_name_is_given_none_but_an_equation(variable: str, seed: int) -> None:
     cubic = variable == "x"
     d = diagnosed(lambda x, t, c: x(t) + (0.03 * x(t) ** 3 if cubic else 0.002 * x.rate(t) ** 2), seed)
     assert names(d) == {"unknown"}
-    (one,) = d.findings
-    assert one.curve is not None
-    assert one.curve.variable == variable
-    assert one.share > 0.9
-    x, y = np.array(one.curve.x), np.array(one.curve.y)[:, 0]
-    planted = 0.03 * x**3 if cubic else 0.002 * x**2
-    middle = np.abs(x) < 0.5 * np.abs(x).max()
-    off = (y - planted)[middle]
-    if cubic:
-        assert np.ptp(off) < 0.2 * np.ptp(planted)  # a straight line apart, which is the gain's
-    else:
-        assert off.std() < 0.05 * np.ptp(planted[middle])
+    (finding,) = d.findings
+    assert finding.variable == ("x^3" if cubic else "dx/dt^2")
+    assert finding.python.endswith("x ** 3" if cubic else "dx_dt ** 2")
+    (coefficient,) = finding.parameters.values()
+    assert coefficient.value == pytest.approx(0.03 if cubic else 0.002, rel=0.05)
+    assert finding.share > 0.9
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_where_no_form_fits_a_curve_is_given(seed: int) -> None:
+    d = diagnosed(lambda x, t, c: x(t) + 0.2 * np.maximum(x(t) - 0.4, 0.0) * np.exp(-x(t)), seed)
+    (finding,) = (f for f in d.findings if f.effect == "unknown")
+    assert finding.curve is not None
+    assert finding.curve.variable == "x"
 
 
 @pytest.mark.parametrize("seed", range(20))
