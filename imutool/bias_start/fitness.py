@@ -66,7 +66,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     """
     if model.method == static.Model.method:
         units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
-        return Fitness("fits", (f"no trained model but a constant bias of this log; models ship for {', '.join(units)}",))
+        return Fitness("fits", (f"it is a constant bias of this log, not a trained one; models ship for {', '.join(units)}",))
     samples = _head(batches)
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))

@@ -209,7 +209,7 @@ def _outlier(outlier: Outlier) -> str:
 def _spread(statistics: Statistics) -> Iterator[str]:
     if len(statistics.seconds) < 2:
         return
-    yield "<h2>How it is spread</h2>"
+    yield "<h2>Distribution over the logs</h2>"
     for k, (signal, values) in enumerate(statistics.biases.items()):
         if len(values) > 1:
             rows = np.array(values)

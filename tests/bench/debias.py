@@ -141,7 +141,9 @@ def as_a_command(seconds_long: float, rounds: int) -> None:
         write_random_model(weights, 1.0 / recording.imu.period_s)
         flags = ("--model", weights, "--init", "stationary", "--overwrite", "--quiet")
         racing = {
-            "debias() in a running process": lambda: debias(log, inside, model=weights, init="stationary", overwrite=True),
+            "debias() in a running process": lambda: debias(
+                log, inside, model=weights, init="stationary", force=True, overwrite=True
+            ),
             "imutool debias": process(imutool, "debias", log, work / "out.mcap", *flags),
             "python -c 'import torch'": process(sys.executable, "-c", "import torch"),
             "cp": process(cp, log, work / "copy.mcap"),

@@ -148,7 +148,22 @@ class Spent(NamedTuple):
 def debiased(source: Path, out: Path, workers: int) -> Spent:
     """The same logs through `imutool fleet debias`."""
     imutool = Path(sys.executable).with_name("imutool")
-    words = ["fleet", "debias", source, out, "--model", MODEL, "--init", "prior", "--workers", workers, "-q", "--json", "-"]
+    words = [
+        "fleet",
+        "debias",
+        source,
+        out,
+        "--model",
+        MODEL,
+        "--init",
+        "prior",
+        "--force",
+        "--workers",
+        workers,
+        "-q",
+        "--json",
+        "-",
+    ]
     began = time.perf_counter()
     done = subprocess.run([imutool, *map(str, words)], check=True, capture_output=True, text=True)
     whole = time.perf_counter() - began

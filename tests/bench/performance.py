@@ -57,8 +57,8 @@ def small(folder: Path) -> Iterator[Row]:
         ("info", ["info", log], ()),
         ("clean", ["clean", log, out], (out,)),
         ("repair", ["repair", log, out], (out,)),
-        ("debias, linear", ["debias", log, out, "-q", "--model", MODEL.replace("hybrid", "linear")], (out,)),
-        ("debias, hybrid", ["debias", log, out, "-q", "--model", MODEL], (out,)),
+        ("debias, linear", ["debias", log, out, "-q", "--force", "--model", MODEL.replace("hybrid", "linear")], (out,)),
+        ("debias, hybrid", ["debias", log, out, "-q", "--force", "--model", MODEL], (out,)),
         ("evaluate", ["evaluate", log, "--model", MODEL, "-q"], ()),
         ("simulate", [*simulate[:2], out, *simulate[3:]], (out,)),
         ("view --html", ["view", log, "--html", page], (page,)),
@@ -91,7 +91,7 @@ def many(folder: Path, logs: int, mb: float) -> Iterator[Row]:
         shutil.copy(source / "0.mcap", source / f"{k}.mcap")
     loop = ["sh", "-c", 'mkdir "$1"; for f in "$0"/*.mcap; do cp "$f" "$1"/; done', str(source), str(out)]
     yield Row("cp in a loop", loop, "cp in a loop", (out,))
-    for command, words in (("debias", ["--model", MODEL]), ("info", []), ("repair", [])):
+    for command, words in (("debias", ["--force", "--model", MODEL]), ("info", []), ("repair", [])):
         line = [IMUTOOL, "fleet", command, str(source), str(out), "--workers", "2", "-q", *words]
         yield Row(f"fleet {command}", line, "cp in a loop", (out,))
 

@@ -49,7 +49,7 @@ def main() -> None:
         if options.log is None:
             write(flight(1, duration_s=100.0), log)
         out = str(Path(folder) / "out.mcap")
-        debias = ["debias", str(log), out, "--overwrite", "--quiet"]
+        debias = ["debias", str(log), out, "--overwrite", "--quiet", "--force"]
         commands = {
             ("imutool debias, hybrid", NUMERIC): [*debias, "--model", MODEL],
             ("imutool debias, linear", NUMERIC): [*debias, "--model", MODEL.replace("hybrid", "linear")],
