@@ -24,7 +24,7 @@ from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.sensor import physics_file
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Three, Value
-from imutool.units import AXES, SENSORS
+from imutool.units import AXES, SENSORS, Sensor
 
 PHYSICS, NOISE = "physics.toml", "noise.toml"
 RATE_HZ = 200.0  # of a noise without a rate
@@ -38,7 +38,7 @@ class Twin:
     """Sensor of a fleet: physics, spread of the bias, noise; `used` are the effects that a format could express."""
 
     physics: PhysicsFile
-    bias_std: Mapping[str, Vector]
+    bias_std: Mapping[Sensor, Vector]
     noise: Noise
     units: int
     used: set[str] = field(default_factory=set)
@@ -68,13 +68,13 @@ class Twin:
         """Attitude of the sensor on its body."""
         return Rotation.from_rotvec(self.vector("mount_rotation"))
 
-    def bias(self, sensor: str) -> Vector:
+    def bias(self, sensor: Sensor) -> Vector:
         """Mean bias of a sensor."""
         return np.zeros(3) if self.physics.bias is None else np.array(getattr(self.physics.bias, sensor))
 
-    def std(self, sensor: str) -> Vector:
+    def std(self, sensor: Sensor) -> Vector:
         """Standard deviation of a sample's noise."""
-        return np.nan_to_num(self.noise.values(f"{sensor}_density")) * np.sqrt(self.rate_hz)
+        return np.asarray(np.nan_to_num(self.noise.values(f"{sensor}_density")) * np.sqrt(self.rate_hz))
 
     def ranges(self) -> dict[str, tuple[float, float, float, str]]:
         """Value, low, high and unit of every parameter with a name."""
@@ -133,7 +133,7 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     biases = {s: np.array([getattr(file.bias, s) for file in files if file.bias is not None]).reshape(-1, 3) for s in SENSORS}
     known = {s: rows for s, rows in biases.items() if len(rows)}
     mean = Bias(**{s: _three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
-    std = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
+    std: dict[Sensor, Vector] = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
     physics = files[0] if len(files) == 1 else _of_fleet(files)
     return Twin(msgspec.structs.replace(physics, bias=mean), std, sheet, len(files))
 
@@ -180,7 +180,8 @@ def _mujoco(twin: Twin) -> str:
     """MJCF with a site and its sensors: `noise` is a note to the reader, `cutoff` clips (MuJoCo's XML reference, sensor)."""
     site = f'pos="{_numbers(twin.vector("lever_arm"))}" quat="{_numbers(twin.rotation().as_quat(scalar_first=True))}"'
     lines = []
-    for sensor, element in (("gyro", "gyro"), ("accel", "accelerometer")):
+    for sensor in SENSORS:
+        element = "gyro" if sensor == "gyro" else "accelerometer"
         limit = twin.value("saturation", f"{sensor}_limit")
         cutoff = "" if limit is None else f' cutoff="{limit:.9g}"'
         noise = float(np.sqrt((twin.std(sensor) ** 2).mean()))
@@ -215,7 +216,8 @@ def _gazebo(twin: Twin) -> str:
     """
     pose = _numbers(np.concatenate([twin.vector("lever_arm"), twin.rotation().as_euler("xyz")]))
     lines = []
-    for sensor, element in (("gyro", "angular_velocity"), ("accel", "linear_acceleration")):
+    for sensor in SENSORS:
+        element = "angular_velocity" if sensor == "gyro" else "linear_acceleration"
         lsb, walk = twin.value("quantization", f"{sensor}_lsb"), np.nan_to_num(twin.noise.values(f"{sensor}_walk"))
         lines.append(f"        <{element}>")
         for k, axis in enumerate(AXES):

@@ -119,7 +119,7 @@ _DEGREE, _HOUR, _G = np.pi / 180.0, 3600.0, 9.80665  # data sheets write deg, h 
 
 SHEETS: Mapping[str, Noise] = MappingProxyType(
     {
-        "none": Noise(**{name: _each(0.0) for name in UNITS}, sources=dict.fromkeys(UNITS, "none")),
+        "none": build(Noise, {**{name: _each(0.0) for name in UNITS}, "sources": dict.fromkeys(UNITS, "none")}),
         "adis16448": Noise(
             gyro_density=_each(0.66 * _DEGREE / np.sqrt(_HOUR)),
             accel_density=_each(0.11 / np.sqrt(_HOUR)),
