@@ -1,4 +1,4 @@
-"""MCAP of any encoding: IMUs and poses in protobuf, FlatBuffers or JSON become those of ROS 2, all else stays.
+"""MCAP of any encoding: IMUs and poses become those of ROS 2, all else stays.
 
 The translated topic has the name of the source's; the original messages are on TOPIC/as_recorded.
 """

@@ -189,7 +189,7 @@ def test_poses_in_another_encoding_have_a_kind_and_serve_as_truth(convert, imuto
         for n in range(COUNT):
             t_ns = START_NS + n * 5_000_000
             writer.add_message(imu, t_ns, as_json(n, t_ns), t_ns)
-            place = {"position": dict(x=n / 100, y=0, z=1), "orientation": dict(x=0, y=0, z=0, w=1)}
+            place = {"position": {"x": n / 100, "y": 0, "z": 1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
             stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
             for channel in poses:
                 message = json.dumps({"timestamp": stamp, "frame_id": "world", "pose": place}).encode()

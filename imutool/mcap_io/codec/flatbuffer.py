@@ -6,6 +6,7 @@ message: its tables are those of reflection.fbs.
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -134,7 +135,7 @@ class FlatBuffer:
         tree: dict[str, Any] = {}
         for path, value in values:
             inner = tree
-            for key, following in zip(path, path[1:], strict=False):
+            for key, following in itertools.pairwise(path):
                 inner = inner.setdefault(key, [] if isinstance(following, int) else {})
             if isinstance(inner, list):
                 inner.append(value)
