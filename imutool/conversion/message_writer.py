@@ -103,8 +103,8 @@ class _Stream:
     def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
         """Define a topic; an IMU or a pose in protobuf or the like becomes CDR under its name, its original gets another."""
         if first is not None and (found := _reflected(topic, bytes(first))) is not None:
-            kind = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name == schemas.POSE else ()
-            cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", kind))
+            marks = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name == schemas.POSE else ()
+            cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", marks))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
             number = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
             self._channels[topic] = number

@@ -6,10 +6,10 @@ message: its tables are those of reflection.fbs.
 
 from __future__ import annotations
 
-import itertools
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 # Base types of reflection.fbs with a fixed size, and the kinds that refer to others.
@@ -132,17 +132,8 @@ class FlatBuffer:
 
     def new(self, values: Sequence[tuple[Sequence[str | int], Any]]) -> bytes:
         """Bytes of a message with these fields; required ones are there, all others keep their default."""
-        tree: dict[str, Any] = {}
-        for path, value in values:
-            inner = tree
-            for key, following in itertools.pairwise(path):
-                inner = inner.setdefault(key, [] if isinstance(following, int) else {})
-            if isinstance(inner, list):
-                inner.append(value)
-            else:
-                inner[str(path[-1])] = value
         out = bytearray(4)
-        struct.pack_into("<I", out, 0, self._write_table(out, self._root, tree))
+        struct.pack_into("<I", out, 0, self._write_table(out, self._root, nested(values)))
         return bytes(out)
 
     def _write_table(self, out: bytearray, kind: Object, tree: Mapping[str, Any]) -> int:
@@ -205,6 +196,20 @@ class FlatBuffer:
         if field.base == OBJECT and self._objects[field.index].is_struct:
             return self._objects[field.index].size
         return struct.calcsize(SCALARS.get(field.base, "I"))
+
+
+def nested(values: Sequence[tuple[Sequence[str | int], Any]]) -> dict[str, Any]:
+    """Fields by their paths as nested objects and lists."""
+    tree: dict[str, Any] = {}
+    for path, value in values:
+        inner: Any = tree
+        for key, following in pairwise(path):
+            inner = inner.setdefault(key, [] if isinstance(following, int) else {})
+        if isinstance(path[-1], int):
+            inner.append(value)
+        else:
+            inner[path[-1]] = value
+    return tree
 
 
 def _object(table: _Table) -> Object:

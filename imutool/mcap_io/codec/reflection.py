@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,7 +23,7 @@ from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.described_cdr import DescribedCdr
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.flatbuffer import FlatBuffer
+from imutool.mcap_io.codec.flatbuffer import FlatBuffer, nested
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
 from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, NS_PER_S, POSE, runs
 
@@ -68,7 +68,7 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Reflected:
-    """Fields of an IMU or a pose in the messages of a topic, and the translation to and from CDR."""
+    """Fields of an IMU or a pose in the messages of a topic; translates to and from CDR."""
 
     schema_name: str  # of the messages in CDR: an Imu or a PoseStamped
     format: Format
@@ -285,13 +285,4 @@ class _Json:
         return message
 
     def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
-        message: dict[str, Any] = {}
-        for path, value in values:
-            inner: Any = message
-            for key, following in pairwise(path):
-                inner = inner.setdefault(key, [] if isinstance(following, int) else {})
-            if isinstance(path[-1], int):
-                inner.append(value)
-            else:
-                inner[path[-1]] = value
-        return json.dumps(message).encode()
+        return json.dumps(nested(values)).encode()
