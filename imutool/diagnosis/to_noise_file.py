@@ -12,7 +12,6 @@ from scipy.signal import welch
 
 from imutool.diagnosis.estimation.whitening import autoregression
 from imutool.diagnosis.result import Diagnosis
-from imutool.inertial.stationary import white_noise
 from imutool.noise.datasheet import Colour, Filters, Levels, Noise
 from imutool.units import SENSORS
 
@@ -20,6 +19,7 @@ ORDER = 40  # of the autoregression: lines of a vibration need many
 WINDOW_S = 1.0  # over which the size of the noise comes and goes
 QUANTILES = 21
 SEGMENT = 1024  # of a spectrum
+BANDS = 10  # of it, of which the lowest is the white noise
 LEAST_POWER = 1e-6  # of the highest density, which is taken for nothing
 LEAST_REST = 1e-3  # of the power, below which all of it is white
 
@@ -36,8 +36,10 @@ def to_noise_file(d: Diagnosis) -> Noise | None:
     std = np.sqrt((left**2 * known).sum(axis=0) / known.sum(axis=0))
     if not (std > 0.0).all():
         return None
-    white = np.minimum(white_noise(left) / std, 1.0)
-    filters = [_filter((left / std)[:, k], known[:, k], float(white[k]), rate_hz) for k in range(6)]
+    powers = [welch(left[:, k] / std[k], rate_hz, nperseg=min(SEGMENT, len(left)))[1] / known[:, k].mean() for k in range(6)]
+    floors = np.array([min(band.mean() for band in np.array_split(power, BANDS)) for power in powers])
+    white = np.sqrt(np.minimum(0.5 * floors * rate_hz, 1.0))  # of a density from both sides
+    filters = [_filter(power, floor, rate_hz) for power, floor in zip(powers, floors.tolist(), strict=True)]
     parts = (slice(0, 3), slice(3, 6))
     levels = [_levels((left / std)[:, part], known[:, part], white[part], rate_hz) for part in parts]
     names = ", ".join(trace.log for trace in d.traces)
@@ -58,10 +60,8 @@ def to_noise_file(d: Diagnosis) -> Noise | None:
     )
 
 
-def _filter(x: Float64[np.ndarray, " n"], known: Bool[np.ndarray, " n"], white: float, rate_hz: float) -> tuple[float, ...]:
+def _filter(power: Float64[np.ndarray, " f"], floor: float, rate_hz: float) -> tuple[float, ...]:
     """Autoregression of what stands above the white noise."""
-    _, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)))
-    floor = 2.0 * white**2 * float(known.mean()) / rate_hz
     a, _ = autoregression(np.maximum(power - floor, LEAST_POWER * power.max()), rate_hz, ORDER)
     return tuple(a[1:].tolist())
 
