@@ -20,6 +20,7 @@ WINDOW_S = 1.0  # over which the size of the noise comes and goes
 QUANTILES = 21
 SEGMENT = 1024  # of a spectrum
 BANDS = 10  # of it, of which the lowest is the white noise
+WHITE = 0.7  # of the lowest band: an autoregression fills valleys
 LEAST_POWER = 1e-6  # of the highest density, which is taken for nothing
 LEAST_REST = 1e-3  # of the power, below which all of it is white
 
@@ -37,7 +38,7 @@ def to_noise_file(d: Diagnosis) -> Noise | None:
     if not (std > 0.0).all():
         return None
     powers = [welch(left[:, k] / std[k], rate_hz, nperseg=min(SEGMENT, len(left)))[1] / known[:, k].mean() for k in range(6)]
-    floors = np.array([min(band.mean() for band in np.array_split(power, BANDS)) for power in powers])
+    floors = WHITE * np.array([min(band.mean() for band in np.array_split(power, BANDS)) for power in powers])
     white = np.sqrt(np.minimum(0.5 * floors * rate_hz, 1.0))  # of a density from both sides
     filters = [_filter(power, floor, rate_hz) for power, floor in zip(powers, floors.tolist(), strict=True)]
     parts = (slice(0, 3), slice(3, 6))
