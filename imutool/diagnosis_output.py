@@ -81,7 +81,7 @@ def write(
 
 
 def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
-    """Write findings.json with the closed loop, and the page of the second diagnosis with figures of both simulations."""
+    """Write findings.json with the closed loop, and a page with figures of both simulations."""
     (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
     if find_spec("matplotlib") is not None:
         _page(again, folder / CLOSED, d)

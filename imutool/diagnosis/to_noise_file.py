@@ -26,7 +26,7 @@ LEAST_REST = 1e-3  # of the power, below which all of it is white
 
 
 def to_noise_file(d: Diagnosis) -> Noise | None:
-    """Noise with its colour, of all logs; None where the diagnosis has no samples of an IMU, or none that vary."""
+    """Noise of all logs with its colour; None without samples that vary."""
     if not d.traces:
         return None
     rate_hz = 1.0 / float(np.median([np.median(np.diff(trace.t_s)) for trace in d.traces]))
