@@ -34,6 +34,7 @@ class Recording:
     lists: set[ChunkKey] | None = None  # the chunks in its summary, which are all it has
     ended: bool = False  # its footer was met
     anonymous: bool = False  # no record in the file defines its ids
+    headless: bool = False  # its begin is lost, and may lie ahead of `start`
     ids: dict[int, int] = field(default_factory=dict)  # channel ids of the whole file by its own
     moved: bool = False  # its definitions cannot stay as they are in its chunks
     sizes: dict[int, tuple[int, int]] = field(default_factory=dict)  # the shortest and the longest message of a channel
