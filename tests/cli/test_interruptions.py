@@ -49,7 +49,11 @@ WRITERS: dict[str, tuple[Sequence[str], str]] = {
     "train": (["train", "in.mcap", "--method", "linear", "-o", "out.safetensors"], "out.safetensors"),
     "trajectories": (["evaluate", "in.mcap", "--trajectories", "out"], "out"),
     "pictures": (["view", "in.mcap", "--png", "out"], "out"),
+    "diagnose": (["diagnose", "in.mcap", "-o", "out"], "out"),
+    "conceal": (["conceal", "in.mcap", "out"], "out"),
+    "live": (["live", "--from", "in.mcap", "--speed", "100", "--save", "out.rrd"], "out.rrd"),
 }
+RERUN = ("save", "live")  # their files are Rerun's: tests/test_bad_input.py
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +199,7 @@ def full_disk() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "save"])  # Rerun's files: tests/test_bad_input.py
+@pytest.mark.parametrize("name", [name for name in WRITERS if name not in RERUN])
 def test_a_full_disk_leaves_nothing(here: Path, imutool: Run, name: str) -> None:
     before = digests(here)
     words, _ = WRITERS[name]
