@@ -198,7 +198,7 @@ class Recordings:
         """The recording of a block, which may be a new one."""
         own = parsed(found.definitions, found.block.offset, self.losses) if found.definitions else []
         rest = set(found.block.counts or {}) - {record.id for record in own if isinstance(record, Channel)}
-        agreeing = [r for r in (self._now, *self.each) if r.agrees(own)]
+        agreeing = [r for r in (self._now, *self.each) if r.agrees(own, proven=bool(found.crc))]
         listed = [r for r in agreeing if r.lists and found.key in r.lists]
         if not agreeing:
             chosen = self._new_behind_gap(found)
