@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,11 +13,13 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
-from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effect import Effect, Stage, Theta
 
 RIDGE = 1e-9
+FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
+KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +174,7 @@ class Candidates:
         self.log_choices: dict[str, float] = {}
         self.score: CandidateScore | None = None
         self.scores: dict[str, Scored] = {}
-        self.linear: dict[str, list[_Linear]] = {}
+        self.linear: dict[frozenset[str], dict[str, list[_Linear]]] = {}  # by the filters that acted
         pair = logs[0].pair
         for effect in effects:
             if effect.key not in self.starts:
@@ -193,36 +195,48 @@ class Candidates:
     def ranked(self, now: Fit, candidates: Sequence[Effect], count: int | None = None) -> list[Scored]:
         """Candidates beside a fit by their score, each from its best start: at least the `count` best of them.
 
-        Derivatives change little from fit to fit, so those of an earlier one tell which candidates need new ones: all whose
-        score might be among the best if it were twice as good.
+        Derivatives change little from fit to fit with the same filters (a mount that rings, a low pass), so those of an earlier
+        one tell which candidates need new ones: all whose score might be among the best if it were twice as good.
         """
         if self.score is None or self.score.now is not now:
             self.score, self.scores = CandidateScore(self.logs, now), {}
+        derived = self._derived(now)
         allowed = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
-        guesses = [(-np.inf if count is None else self._guess(self.score, effect).log_p, effect) for effect in allowed]
+        guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
         best: list[Scored] = []
         for guess, effect in sorted(guesses, key=lambda entry: entry[0]):
-            if count is not None and len(best) >= max(count, 1) and guess > min(UNSURE * best[max(count, 1) - 1].log_p, UNLIKELY):
+            if (
+                count is not None
+                and len(best) >= max(count, 1)
+                and guess > min(UNSURE * best[max(count, 1) - 1].log_p, UNLIKELY)
+            ):
                 break
             if effect.key not in self.scores:
-                self.scores[effect.key] = self._scored(self.score, effect)
+                linear = [self.score.linear(effect, start) for start in self.starts[effect.key]]
+                derived[effect.key] = [each.short() for each in linear]
+                self.scores[effect.key] = self._best(self.score, effect, linear)
             best = sorted([*best, self.scores[effect.key]], key=lambda entry: entry.log_p)
         return best
 
-    def _guess(self, score: CandidateScore, effect: Effect) -> Scored:
+    def _derived(self, now: Fit) -> dict[str, list[_Linear]]:
+        """Candidates derived beside fits with the same filters; those of the last few such sets are kept."""
+        filters = frozenset(effect.key for effect, _ in now.chosen if effect.stage in FILTERS and not effect.linear)
+        derived = self.linear.pop(filters, {})
+        while len(self.linear) >= KEPT:
+            self.linear.pop(next(iter(self.linear)))
+        self.linear[filters] = derived
+        return derived
+
+    def _guess(self, score: CandidateScore, effect: Effect, derived: Mapping[str, Sequence[_Linear]]) -> Scored:
         """Score with derivatives beside an earlier fit; the best of all without any."""
         if effect.key in self.scores:
             return self.scores[effect.key]
-        if effect.key not in self.linear:
+        if effect.key not in derived:
             return Scored(-np.inf, effect, self.starts[effect.key][0], np.inf)
-        return self._best(effect, [(score.gain(effect, linear), linear.start) for linear in self.linear[effect.key]])
+        return self._best(score, effect, derived[effect.key])
 
-    def _scored(self, score: CandidateScore, effect: Effect) -> Scored:
-        linear = [score.linear(effect, start) for start in self.starts[effect.key]]
-        self.linear[effect.key] = [each.short() for each in linear]
-        return self._best(effect, [(score.gain(effect, each), each.start) for each in linear])
-
-    def _best(self, effect: Effect, gains: Sequence[tuple[float, Theta]]) -> Scored:
+    def _best(self, score: CandidateScore, effect: Effect, linear: Sequence[_Linear]) -> Scored:
+        gains = [(score.gain(effect, each), each.start) for each in linear]
         gain, start = max(gains, key=lambda pair: pair[0])
         return Scored(self.log_p(effect, gain), effect, start, gain)
 
