@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from imutool.viewing.rerun.live import Live
-    from imutool.viewing.stream.sources import Sample
+    from imutool.viewing.stream.samples import Sample
 
 FROM_HELP = "stdin (JSON lines), udp://HOST:PORT, zenoh://[HOST:PORT]/KEY, rosbridge://HOST:PORT/TOPIC, or a log."
 MODEL_HELP = "Model file, a name that ships, or static: the bias at rest in the first two seconds."
