@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.robot_cases.cases import conceal_robot
+from support.robot_cases.log import write
 
-from imutool.blind_cases.robots.cases import conceal_robot
-from imutool.blind_cases.robots.log import write
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.signals.pairing import paired
