@@ -41,7 +41,7 @@ TIERS = (
     ("diagnosis_output",),
     ("fleet",),
     ("api",),
-    ("cli",),
+    ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
 FOR_CONVERTERS = {"converters", "errors", "geometry", "recording", "bag"}
