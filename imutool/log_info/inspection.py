@@ -12,13 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.cleaning import raw_batches
+from imutool.cleaning import CleaningSettings, raw_batches
+from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
+from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.rules.units import unit_findings
+from imutool.cleaning.rules.units import Units
+from imutool.cleaning.samples import Motion, Samples
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
+from imutool.log_info.conventions import conventions
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
@@ -129,10 +133,11 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
-    rest = _rest(imu)
+    rest, whole = _rest(imu), _summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, truth),
+        warnings=_imu_warnings(counts, imu, whole),
+        conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
         samples=len(t_ns),
         **_clock(t_ns)._asdict(),
@@ -204,7 +209,7 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> list[str]:
+def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary) -> list[str]:
     words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
@@ -213,12 +218,21 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> l
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    return [*warnings, *_unit_warnings(imu, truth)] if len(imu) else [*warnings, "no samples"]
+    return [*warnings, *_convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 
-def _unit_warnings(imu: Imu, truth: Truth | None) -> list[str]:
-    """Warnings about units, by the same rule as `clean`; its notes are no warnings."""
-    return [finding.what for finding in unit_findings(imu, truth) if finding.severity != "note"]
+def _summary(imu: Imu, truth: Truth | None) -> TopicSummary:
+    """Totals for the rules about conventions, by which `clean` judges too; nothing is converted."""
+    motion = Motion()
+    motion.see(Samples(np.arange(len(imu)), imu.t_ns, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1)))
+    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+
+
+def _convention_warnings(whole: TopicSummary) -> list[str]:
+    """Warnings about units, axes and frames, with the way to correct them; a note without one is no warning."""
+    findings = [*Units().findings(whole), *Axes().findings(whole)]
+    fix = "; imutool convert LOG OUT --fix corrects it"
+    return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
 
 
 def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
