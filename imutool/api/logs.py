@@ -99,6 +99,7 @@ def convert(
     kinds: Sequence[str] = (),
     mapping: str | Path | None = None,
     imu: str = "",
+    fix: bool = False,
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
@@ -118,6 +119,7 @@ def convert(
         kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
         mapping: TOML file that states what the columns of a table mean.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
+        fix: Correct units, axes and frames where the log's motion shows them to be wrong.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
@@ -143,6 +145,7 @@ def convert(
         kinds=kinds,
         mapping=None if mapping is None else local(mapping, "mapping"),
         imu=imu,
+        fix=fix,
         workers=workers,
         progress=progress,
     )

@@ -1,4 +1,4 @@
-"""Clean IMU messages of a surveyed log, batch by batch: defects dropped, units and axes converted."""
+"""Clean IMU messages batch by batch: defects dropped, units and axes converted."""
 
 from __future__ import annotations
 

@@ -253,9 +253,9 @@ def _gyro_against_poses(
 def _nearest(choice: _Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
     """Of the readings that fit about as well as the best, the one nearest to the log's axes; it is no proposal."""
     close = choice.misfit < choice.misfit.min() / CLEARLY
-    good = [row for row in np.flatnonzero(close) if readings[row][0] == readings[choice.best][0]]
+    good = [row for row in np.flatnonzero(close).tolist() if readings[row][0] == readings[choice.best][0]]
     nearest = max(good, key=lambda row: float(np.trace(readings[row][1])), default=choice.best)
-    return _reading(choice._replace(best=int(nearest)), readings)._replace(sole=False)
+    return _reading(choice._replace(best=nearest), readings)._replace(sole=False)
 
 
 def _accel_against_poses(
@@ -290,7 +290,7 @@ def _accel_against_poses(
         return None, None
     P, up = readings[choice.best]
     as_is = float(np.sqrt(np.median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - R[use].apply(f)) ** 2, axis=1))))
-    alike = [readings[row] for row in np.flatnonzero(choice.alike)]
+    alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_up = all((up == other).all() for _, other in alike)
     one_axes = all((other == P).all() for other, _ in alike)
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None

@@ -1,4 +1,4 @@
-"""Delay of the poses' stamps, by the cross-correlation of angular rates, whatever the frames and units."""
+"""Delay of the poses' stamps, by the cross-correlation of angular rates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Delay(NamedTuple):
 
 
 def pose_delay(motion: Motion, truth: Truth) -> Delay | None:
-    """Delay of the poses' stamps, by the cross-correlation of the angular rates' lengths; None where it is not shown."""
+    """Delay of the poses' stamps by the lengths of the rates; None where it is not shown."""
     first, last, rate = turning(truth)
     step, mean = motion.table()
     start = motion.middle_ns

@@ -56,13 +56,13 @@ def every() -> tuple[str, ...]:
     return tuple(registry.names(GROUP))
 
 
-def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> CleaningSettings:
+def chosen(only: Iterable[str], without: Iterable[str], force: bool = False, fix: bool = False) -> CleaningSettings:
     """Settings for the rules of a command line.
 
     Raises:
         ConfigError: a name that is no rule, or one both asked for and left out.
     """
-    rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force)
+    rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force, fix=fix)
     rules.names()
     if both := set(rules.only) & set(rules.without):
         raise ConfigError(f"{min(both)} is asked for and left out", where="rule", fix="Give `rule` or `no_rule`")

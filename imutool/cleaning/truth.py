@@ -81,7 +81,7 @@ def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " 
 
 
 def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Rotation, Float64[np.ndarray, "m 3"]]:
-    """Time, orientation and acceleration (m/s², world) at each inner pose, from second differences."""
+    """Time, orientation and acceleration (m/s², world) at inner poses, by second differences."""
     from scipy.spatial.transform import Rotation
 
     t_s = seconds(truth.t_ns, int(truth.t_ns[0]))

@@ -1,4 +1,4 @@
-"""Sizes that settle units: gravity as the accel reads it, and the gyro's rate beside the true one."""
+"""Sizes that settle units: gravity as accel reads it, the gyro's rate beside the true one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CALM_SCATTER = 0.03  # of the reading
 
 
 class AccelReading(NamedTuple):
-    """Gravity as the accel reads it, whether at rest, and the unit in which that is gravity; empty where none is."""
+    """Gravity as accel reads it, whether at rest, and its unit; empty where none fits."""
 
     level: float | None
     at_rest: bool

@@ -71,6 +71,7 @@ def convert(
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
     ] = None,
+    fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames shown wrong by the motion.")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
@@ -93,6 +94,7 @@ def convert(
             kinds=kind or (),
             mapping=map_,
             imu=imu,
+            fix=fix,
             workers=workers,
             progress=tell,
         )

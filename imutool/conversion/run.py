@@ -73,6 +73,7 @@ def convert(
     kinds: Sequence[str] = (),
     mapping: Path | None = None,
     imu: str = "",
+    fix: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
@@ -81,6 +82,7 @@ def convert(
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
     are worth. `mapping` is a file that states what the columns of a table mean.
     `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
+    With `fix`, units, axes and frames are corrected where the log's motion shows them to be wrong.
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
@@ -91,14 +93,23 @@ def convert(
     """
     labels = Labels(sensor, parse_kinds(kinds), parse_parts(imu))
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
-        return _from_stream(module, source, out, sequences, labels, compression, images, overwrite, progress)
+        return _from_stream(module, source, out, sequences, labels, compression, images, overwrite, fix, progress)
     source_sequences = _find(source, format)
     if sequences:
         source_sequences = _only(source_sequences, sequences)
     names = source_sequences.names()
     targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
     jobs = [
-        replace(job, target=target, compression=compression, images=images, overwrite=overwrite, labels=labels, mapping=mapping)
+        replace(
+            job,
+            target=target,
+            compression=compression,
+            images=images,
+            overwrite=overwrite,
+            labels=labels,
+            mapping=mapping,
+            fix=fix,
+        )
         for job, target in zip(source_sequences.jobs, targets, strict=True)
     ]
     if len(names) == 1 and source_sequences.errors:
@@ -254,6 +265,7 @@ def _from_stream(
     compression: str,
     images: bool,
     overwrite: bool,
+    fix: bool,
     progress: Progress | None,
 ) -> ConvertReport:
     """Convert one after the other, with a converter that only has `read`.
@@ -269,7 +281,7 @@ def _from_stream(
     for recording in chain(first, recordings):
         (target,) = _targets([recording.name], out, many=len(first) > 1)
         kept = replace(recording, frames={}) if isinstance(recording, Recording) and not images else recording
-        report.add(target, write_content(kept, target, labels, compression=compression, overwrite=overwrite))
+        report.add(target, write_content(kept, target, labels, compression=compression, overwrite=overwrite, fix=fix))
         if progress is not None:
             progress(len(report.written), len(report.written), recording.name)
     missing = set(wanted) - {path.stem for path in report.written} if len(first) > 1 else set(wanted) - {first[0].name}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
+from imutool.conversion.corrections import write_corrected
 from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
@@ -31,6 +33,7 @@ class Job:
     images: bool = True
     overwrite: bool = False
     labels: Labels = field(default_factory=Labels)
+    fix: bool = False  # correct units, axes and frames
     mapping: Path | None = None  # what the columns of a table mean
 
 
@@ -59,19 +62,25 @@ def _convert_one(job: Job) -> Outcome:
         if given and "mapping" not in inspect.signature(module.read_sequence).parameters:
             raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
         content = module.read_sequence(job.sequence, images=job.images, **given)
-        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite)
+        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite, fix=job.fix)
     except ImutoolError as error:
         return Outcome(error)
 
 
 def write_content(
-    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool
+    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool, fix: bool = False
 ) -> Outcome:
-    """Write what a converter has read, with the user's labels.
+    """Write what a converter has read, with the user's labels; with `fix` corrected as its motion shows.
 
     Raises:
         ImutoolError: it cannot be written.
     """
+    if fix:
+        with TemporaryDirectory(prefix=".imutool-", dir=target.parent) as folder:
+            as_recorded = Path(folder) / target.name
+            outcome = write_content(content, as_recorded, labels, compression=compression, overwrite=False)
+            notes = write_corrected(as_recorded, target, compression=compression, overwrite=overwrite)
+            return replace(outcome, notes=(*outcome.notes, *notes))
     labelled = labels.put_on(content)
     if isinstance(labelled, Recording):
         write(labelled, target, compression=compression, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""Conventions of an IMU in words: units, axes, the poses' world and clock, each with its evidence."""
+"""Conventions of an IMU in words: units, axes, the poses' world and clock."""
 
 from __future__ import annotations
 

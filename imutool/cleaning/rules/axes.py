@@ -1,4 +1,4 @@
-"""Axes that contradict the poses or gravity: permuted, mirrored, turned; and poses whose world has another axis up.
+"""Axes that contradict poses or gravity, and poses whose world has another axis up.
 
 The poses decide where they can. Without them gravity, as the accelerometer reads it, decides how the gyro's axes lie to the
 accelerometer's; which of the two is wrong it cannot say, and the proposal changes the gyro.
