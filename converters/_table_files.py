@@ -1,60 +1,23 @@
-"""Columns of numbers from table files: CSV, TSV, Parquet, .npz, MATLAB .mat and HDF5.
-
-A matrix of three columns `gyro` becomes the columns `gyro[0]`, `gyro[1]`, `gyro[2]`, whichever way it lies.
-"""
+"""Table files: CSV, TSV, Parquet, .npz, MATLAB .mat and HDF5, by their first bytes."""
 
 from __future__ import annotations
 
-import csv
-import re
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from imutool.errors import ConfigError, DataError
-from imutool.recording.message_log import Remarks
 
 from ._archive import refusing
+from ._table_text import Columns, is_text_table, read_csv, text_of
 
 LIMIT = 4 << 30  # bytes of numbers in one file
-WIDEST = 64  # columns of a matrix; wider ones are images
-MAX_LINE = 65_536
-DELIMITERS = (",", ";", "\t")
 HDF5, MAT5, PARQUET, ZIP = b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file", b"PAR1", b"PK\x03\x04"
-COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-
-
-@dataclass
-class Columns:
-    """Columns by name, rotation matrices, the texts of decimals, and remarks."""
-
-    values: dict[str, np.ndarray] = field(default_factory=dict)
-    matrices: dict[str, np.ndarray] = field(default_factory=dict)
-    texts: dict[str, list[str]] = field(default_factory=dict)
-    remarks: Remarks = field(default_factory=Remarks)
-
-    def add(self, name: str, array: Any) -> None:
-        """Take in an array of numbers of one, two or three dimensions."""
-        array = np.asarray(array)
-        if array.dtype.kind not in "iufb" or array.ndim > 3 or not array.size:
-            return
-        if array.ndim == 3:
-            if array.shape[:2] == (3, 3):
-                self.matrices[name] = np.moveaxis(array, 2, 0).astype(float)
-            elif array.shape[1:] == (3, 3):
-                self.matrices[name] = array.astype(float)
-            return
-        if array.ndim == 2 and array.shape[0] < array.shape[1]:
-            array = array.T
-        if array.ndim == 2 and array.shape[1] > 1:
-            for number in range(array.shape[1] if array.shape[1] <= WIDEST else 0):
-                self.values[f"{name}[{number}]"] = array[:, number]
-        elif array.size > 1:
-            self.values[name] = array.reshape(-1)
+OLD_EXCEL = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+SHEETS = "xl/workbook.xml", "xl/workbook.bin", "content.xml"  # members of Excel's and LibreOffice's files
 
 
 def kind_of(head: bytes, path: Path) -> str:
@@ -66,8 +29,11 @@ def kind_of(head: bytes, path: Path) -> str:
     if head.startswith(PARQUET):
         return "parquet"
     if head.startswith(ZIP):
-        return "npz" if _is_npz(path) else ""
-    return "csv" if _is_text_table(head) else ""
+        names = _members(path)
+        return "npz" if any(name.endswith(".npy") for name in names) else "sheet" if names & {*SHEETS} else ""
+    if head.startswith(OLD_EXCEL):
+        return "sheet"
+    return "csv" if is_text_table(head) else ""
 
 
 def load(path: Path, kind: str) -> Columns:
@@ -85,102 +51,16 @@ def load(path: Path, kind: str) -> Columns:
     return columns
 
 
-def _is_npz(path: Path) -> bool:
+def _members(path: Path) -> set[str]:
     try:
         with zipfile.ZipFile(path) as archive:
-            return any(name.endswith(".npy") for name in archive.namelist())
+            return set(archive.namelist())
     except (OSError, zipfile.BadZipFile):
-        return False
-
-
-def _is_text_table(head: bytes) -> bool:
-    """Whether text has a row of at least seven numbers, or four with a header that names them."""
-    try:
-        lines = head.decode("utf-8-sig", "strict" if len(head) < 4096 else "ignore").splitlines()
-    except UnicodeDecodeError:
-        return False
-    rows = [line for line in lines[:-1] or lines if line.strip()]
-    delimiter = _delimiter(rows)
-    return any(sum(map(_is_number, row.split(delimiter))) >= 4 for row in rows[:20])
-
-
-def _delimiter(rows: list[str]) -> str | None:
-    """What separates the fields; None for white space."""
-    counts = {mark: min((row.count(mark) for row in rows[1:20]), default=0) for mark in (";", "\t", ",")}
-    return next((mark for mark, count in counts.items() if count >= 3), None)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return bool(COMMA_NUMBER.fullmatch(text.strip()))
-    return True
+        return set()
 
 
 def _load_csv(path: Path, columns: Columns) -> None:
-    read_csv(path.read_text(encoding="utf-8-sig", errors="replace"), columns, path)
-
-
-def read_csv(text: str, columns: Columns, path: Path) -> None:
-    """Add the columns of a table of text; `path` is its address for messages.
-
-    Raises:
-        DataError: a line is too long for a table.
-    """
-    lines = [line for line in text.splitlines() if line.strip()]
-    if any(len(line) > MAX_LINE for line in lines):
-        raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
-    delimiter = _delimiter(lines)
-    first = next((n for n, line in enumerate(lines) if sum(map(_is_number, line.split(delimiter))) >= 4), len(lines))
-    rows = _fields(lines[first:], delimiter)
-    width = max(map(len, rows), default=0)
-    names = _distinct([name.strip().strip('"') for name in lines[first - 1].lstrip("# ").split(delimiter)]) if first else []
-    if len(names) != width:
-        names = [f"column {number}" for number in range(1, width + 1)]
-    whole = [row for row in rows if len(row) == width]
-    if len(whole) < len(rows):
-        columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
-    for name, fields in zip(names, zip(*whole, strict=True), strict=True):
-        texts = [text.strip().strip('"') for text in fields]
-        if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
-            texts[:] = [text.replace(",", ".") for text in texts]
-            columns.remarks.notes.append(f"{name}: decimal commas are read as points")
-        if (values := _numbers(texts)) is not None:
-            columns.values[name], columns.texts[name] = values, texts
-
-
-def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:
-    """Fields of each line; in quotes the delimiter is text."""
-    if delimiter is not None and any('"' in line for line in lines[:20]):
-        return list(csv.reader(lines, delimiter=delimiter))
-    return [line.split(delimiter) for line in lines]
-
-
-def _distinct(names: list[str]) -> list[str]:
-    """Names of columns; one that repeats stands below the last that does not, as in a bag's messages written as a table.
-
-    `angular_velocity,x,y,z,linear_acceleration,x,y,z` has `angular_velocity.x`, `linear_acceleration.x`, ....
-    """
-    above, distinct = "", []
-    for text in names:
-        if names.count(text) > 1:
-            distinct.append(f"{above}.{text}" if above else text)
-        else:
-            above = text
-            distinct.append(text)
-    return distinct
-
-
-def _numbers(texts: list[str]) -> np.ndarray | None:
-    try:
-        return np.array(list(map(int, texts)), np.int64)
-    except (ValueError, OverflowError):
-        pass
-    try:
-        return np.array([float(text) if text else np.nan for text in texts])
-    except ValueError:
-        return None
+    read_csv(text_of(path.read_bytes()), columns, path)
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:
@@ -234,10 +114,16 @@ def _load_hdf5(path: Path, columns: Columns) -> None:
         if node.external or node.is_virtual:
             raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
         _check_size(path, node.size * 8)
-        columns.add(name, node[()])
+        unit = node.attrs.get("units", node.attrs.get("unit", ""))
+        columns.add(name, node[()], unit if isinstance(unit, str) else "")
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)
+
+
+def _refuse_sheet(path: Path, columns: Columns) -> None:
+    fix = "Save the sheet as CSV (UTF-8), and convert that"
+    raise DataError("is a spreadsheet", where=path, expected="a table of text, Parquet, .npz, .mat or HDF5", fix=fix)
 
 
 def _check_size(path: Path, size: int) -> None:
@@ -263,4 +149,5 @@ LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "npz": _load_npz,
     "mat": _load_mat,
     "hdf5": _load_hdf5,
+    "sheet": _refuse_sheet,
 }

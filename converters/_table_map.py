@@ -16,7 +16,7 @@ import numpy as np
 from imutool.errors import ConfigError
 from imutool.recording.message_log import KINDS
 
-from ._table_files import Columns
+from ._table_text import Columns
 
 TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
@@ -26,12 +26,14 @@ PLAUSIBLE_HZ = 5.0, 10_000.0
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
 WORDS = {
-    "gyro": r"gyro(scope)?|gyr|gyros|omega|w|g|angular_?velocity|ang_?vel|rotation_?rate|rate|w_rs_s",
-    "accel": r"accel(eration|erometer)?|acce?|a|linear_?acceleration|specific_?force|a_rs_s",
+    "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
+    r"|dreh(rate|geschwindigkeit)",
+    "accel": r"accel(eration|erometer)?|acce?|ac|a|linear_?acceleration|specific_?force|(linear)?beschleunigung|a_rs_s",
 }
 ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
 TIME_WORDS = (
-    r"(time|timestamp|time_?stamp|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec))"
+    r"(times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
+    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed|sample_?time_?fine)"
 )
 UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps",
@@ -127,6 +129,9 @@ class Proposal(msgspec.Struct):
         lines.append(
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
         )
+        lines.append(
+            '# poses in the table: position = [x, y, z], quaternion_wxyz = [w, x, y, z] (m), pose_kind = "truth" or "estimate"'
+        )
         return "\n".join(lines)
 
 
@@ -136,11 +141,17 @@ def propose(columns: Columns) -> Proposal:
     if {"synced/time", "synced/gyro_uncalib[0]", "synced/acce[0]"} <= columns.values.keys():
         poses = RONIN_POSES if {"pose/tango_pos[0]", "pose/tango_ori[3]"} <= columns.values.keys() else {}
         return Proposal({**RONIN, **poses}, [], ["its arrays are those of RoNIN"])
-    names = {column: split_name(column) for column in columns.values}
+    names = {column: _named(column, columns.units.get(column, "")) for column in columns.values}
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
     return proposal
+
+
+def _named(column: str, beside: str) -> tuple[str, str]:
+    """Name and unit of a column; a unit `beside` the column counts where its name has none."""
+    name, unit = split_name(column)
+    return name, unit or next((known for known, pattern in UNITS.items() if re.fullmatch(pattern, beside.lower())), "")
 
 
 def split_name(column: str) -> tuple[str, str]:
@@ -200,6 +211,9 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
     found = [c for c, (name, _) in names.items() if re.fullmatch(rf"(.*_)?{TIME_WORDS}", name or names[c][1])]
     found = [c for c in found if length in (None, len(columns.values[c])) and _rises(columns.values[c])]
+    if not found and len(rising := [c for c, v in columns.values.items() if length in (None, len(v)) and _rises(v)]) == 1:
+        proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
+        found = rising
     if not found:
         proposal.open += ["time", "time_unit"]
         proposal.reasons.append("no column that rises looks like a time")

@@ -1,4 +1,4 @@
-"""MCAP of any encoding: IMUs in protobuf or JSON become sensor_msgs/Imu, all else stays.
+"""MCAP of any encoding: IMUs and poses become those of ROS 2, all else stays.
 
 The translated topic has the name of the source's; the original messages are on TOPIC/as_recorded.
 """

@@ -26,8 +26,8 @@ from imutool.recording.two_sensors import in_order, joined
 from . import Sequence
 from ._archive import is_zip, list_members, read_bounded, refusing
 from ._files import find_folders, name
-from ._table_files import Columns, read_csv
 from ._table_map import STANDARD_GRAVITY, split_name
+from ._table_text import Columns, read_csv
 
 GENERAL = True
 IMU_TOPIC = "/imu0"

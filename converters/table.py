@@ -22,8 +22,9 @@ from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._files import head, name
-from ._table_files import Columns, kind_of, load
+from ._table_files import kind_of, load
 from ._table_map import ACCEL_SI, GYRO_SI, TIME_NS, TableMap, propose, read_map
+from ._table_text import Columns
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics

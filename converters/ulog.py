@@ -73,7 +73,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         remarks.losses.append("the file is damaged: some of its messages could not be read")
     if ulog.dropouts:
         lost_s = sum(dropout.duration for dropout in ulog.dropouts) * 1e-3
-        remarks.notes.append(f"PX4 reports {len(ulog.dropouts)} dropouts, {lost_s:.3f} s: the topics have gaps there")
+        remarks.notes.append(f"PX4's dropouts: {len(ulog.dropouts)}, {lost_s:.3f} s in all: the topics have gaps there")
+    if unstamped := sum(int((columns["timestamp"] == 0).sum()) for columns in topics.values()):
+        remarks.notes.append(f"messages that PX4 gave no stamp: {unstamped}; they are logged at the start of the log")
     poses = {topic: p for topic, p in _all_poses(topics, remarks).items() if p is not None}
     return MessageLog(
         sequence.name,
@@ -82,7 +84,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         messages=partial(_logged, [(m.timestamp, m.log_level_str(), m.message) for m in ulog.logged_messages]),
         imus=_imus(topics, remarks),
         poses=poses,
-        tables={f"/{name}": _table(name, columns) for name, columns in topics.items()},
+        tables={f"/{name}": _table(name, columns, 1000 * ulog.start_timestamp) for name, columns in topics.items()},
         kinds={topic: "truth" if topic.startswith("/ground_truth") else "estimate" for topic in poses},
         metadata=_metadata(sequence, ulog),
         remarks=remarks,
@@ -218,7 +220,7 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
     return Poses(t_ns, p_wb, quaternion.unit(q_wb), v_w)
 
 
-def _table(name: str, columns: Columns) -> Table:
+def _table(name: str, columns: Columns, start_ns: int) -> Table:
     """Columns of a PX4 topic as a message; `q[0]`, `q[1]`, ... are one field."""
     groups: dict[str, list[str]] = {}
     for column in columns:
@@ -234,6 +236,7 @@ def _table(name: str, columns: Columns) -> Table:
     for field, value in values.items():
         rows[field] = value
     t_ns = _ns(columns)
+    t_ns[t_ns == 0] = start_ns  # never published: the stamp 0 is kept in the message
     order = np.argsort(t_ns, kind="stable")
     message = "".join(part.capitalize() for part in name.partition("/")[0].split("_"))
     return Table(t_ns[order], rows[order], f"px4_msgs/msg/{message}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,9 @@ from imutool.report import json_values
 if TYPE_CHECKING:
     from imutool.log_info.report import LogInfo
     from imutool.noise_identification import IdentifiedNoise
+
+
+IS_EPOCH_NS = 10**9 * 365 * 86400  # an earlier first stamp is no date, but time since a start
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
@@ -59,7 +63,7 @@ def info(
         _write_noise(identified, noise_plot, noise_toml, overwrite)
     if not write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to, overwrite=overwrite):
         for log, (report, identified) in zip(logs, described, strict=True):
-            say(log)
+            say(f"{log}: {_span(report)}")
             _print(report, identified)
     if any(report.losses["stretches"] for report in reports):
         raise typer.Exit(LOST)
@@ -119,9 +123,21 @@ def _write_noise(identified: IdentifiedNoise, plot: Path | None, toml: Path | No
         write(identified.noise, toml, overwrite=overwrite)
 
 
+def _span(report: LogInfo) -> str:
+    """Size of a log, its messages, and the time that they span."""
+    size = f"{report.bytes / 1e6:.1f} MB, {report.messages} messages"
+    if report.first_ns is None or report.duration_s is None:
+        return size
+    begin = f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    if report.first_ns < IS_EPOCH_NS:
+        begin = f"{report.first_ns * 1e-9:.3f} s on its own clock"
+    return f"{size}, {report.duration_s:.3f} s from {begin}"
+
+
 def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
-    """Rows of the topic table, the header first."""
-    header = ("topic", "type", "count", "rate Hz", "jitter ms", "largest gap s", "first s", "last s")
+    """Rows of the topic table, the header first; times count from the log's first message."""
+    start_ns = report.first_ns or 0
+    header = ("topic", "type", "count", "rate Hz", "jitter ms", "gap s", "from s", "to s")
     rows = [
         (
             topic.name,
@@ -130,8 +146,7 @@ def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
             _number(topic.rate_hz, ".2f"),
             _number(topic.jitter_s, ".3f", 1e3),
             _number(topic.largest_gap_s, ".3f"),
-            _number(topic.first_ns, ".3f", 1e-9),
-            _number(topic.last_ns, ".3f", 1e-9),
+            *("–" if ns is None else f"{(ns - start_ns) * 1e-9:.3f}" for ns in (topic.first_ns, topic.last_ns)),
         )
         for topic in report.topics
     ]

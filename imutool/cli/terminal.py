@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from imutool.training.fit import Epoch
 
 LONGEST = 2000  # letters of an error message
+LONGEST_ROW = 10_000  # letters of a table's row where nobody looks at a terminal
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
 
 logger = logging.getLogger("imutool")
@@ -35,7 +37,12 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-out, err = _Console(), _Console(stderr=True)
+def _width() -> int | None:
+    """Width of a table on stdout: the terminal's; without a terminal a line is as long as it needs to be."""
+    return None if sys.stdout.isatty() or "COLUMNS" in os.environ else LONGEST_ROW
+
+
+out, err = _Console(width=_width()), _Console(stderr=True)
 
 
 def plain(text: str) -> str:

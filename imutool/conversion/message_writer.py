@@ -19,11 +19,11 @@ from imutool.conversion.table_messages import encode_table, table_topic
 from imutool.errors import ConfigError, DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
-from imutool.mcap_io.codec.encode import encode_float, encode_imu, encode_pose, encode_vector3
-from imutool.mcap_io.codec.reflection import ReflectedImu, reflect
-from imutool.mcap_io.read import RECORD, UNIT_KEY, VELOCITY_KEY
-from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
-from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.codec.reflection import Reflected, reflect
+from imutool.mcap_io.read import RECORD
+from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY, named_kind
+from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks, scalar_series, velocity_series
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageLog, MessageTopic
 
@@ -69,7 +69,7 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
         _write_metadata(log, source)
         pairs = SensorPairs(source)
         stream = _Stream(log, source, pairs)
-        groups = [_imus(log, source) + _poses(log, source) + _scalars(log, source), _tables(log, source)]
+        groups = [_imus(log, source) + _poses(log, source) + scalar_series(log, source.scalars, BODY), _tables(log, source)]
         streams: list[Iterator[tuple[Chunk, str | None]]] = [((chunk, None) for chunk in chunks(g)) for g in groups]
         for chunk, packing in heapq.merge(*streams, stream.chunks(), key=lambda item: item[0].start_ns):
             log.chunk(chunk, packing)
@@ -94,21 +94,23 @@ class _Stream:
         self._buffers: dict[int, _Buffer] = {}  # by channel
         self._shared = _Buffer(packed=False), _Buffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
-        self._reflected: dict[int, tuple[int, ReflectedImu]] = {}  # channel of the CDR, by that of the original
+        self._reflected: dict[int, tuple[int, Reflected]] = {}  # channel of the CDR, by that of the original
         self._lacking = Counter[str]()  # messages without a sample, by topic
         self.counts = Counter[str]()
         for topic in source.topics:
             self._define(topic)
 
     def _define(self, topic: MessageTopic, first: bytes | memoryview | None = None) -> int:
-        """Define a topic; an IMU in protobuf or JSON becomes CDR under its name, and its original gets another."""
-        if first is not None and (imu := _reflected(topic, bytes(first))) is not None:
-            cdr = self._define(MessageTopic(topic.name, schemas.IMU, "ros2msg", b"", "cdr"))
+        """Define a topic; an IMU or a pose in protobuf or the like becomes CDR under its name, its original gets another."""
+        if first is not None and (found := _reflected(topic, bytes(first))) is not None:
+            marks = ((KIND_KEY, named_kind(topic.name, topic.schema_name)),) if found.schema_name == schemas.POSE else ()
+            cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", marks))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
             number = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
             self._channels[topic] = number
-            self._reflected[number] = cdr, imu
-            note = f"{topic.name}: {topic.message_encoding} became {schemas.IMU}, taken as rad/s and m/s^2"
+            self._reflected[number] = cdr, found
+            units = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
+            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
             self._source.remarks.notes.append(note)
             return number
         kind = self._source.kinds.get(topic.name)
@@ -142,7 +144,7 @@ class _Stream:
         for topic, number in self._channels.items():
             self.counts[topic.name] += self._sequence[number]
         for name, count in self._lacking.items():
-            self._source.remarks.losses.append(f"{count} messages of {name} hold no sample of an IMU: see {name}/as_recorded")
+            self._source.remarks.losses.append(f"{count} messages of {name} hold no sample: see {name}/as_recorded")
 
     def _put(self, number: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> _Buffer:
         buffer = self._buffers[number]
@@ -156,25 +158,24 @@ class _Stream:
         return buffer
 
     def _put_as_cdr(self, number: int, topic: MessageTopic, log_time: int, publish_time: int, payload: bytes) -> None:
-        """Put the sample in a message of a reflected IMU, ahead of the message itself."""
-        channel, imu = self._reflected[number]
+        """Put the sample in a message of a reflected IMU or pose, ahead of the message itself."""
+        channel, reflected = self._reflected[number]
         try:
-            stamp_ns, frame, values = imu.sample(payload, log_time)
+            sample = reflected.sample(payload, log_time)
         except ValueError:
             self._lacking[topic.name] += 1
             return
-        row = np.array([values])
-        self._put(channel, log_time, publish_time, encode_imu(np.array([stamp_ns]), row[:, :3], row[:, 3:], frame).tobytes())
+        self._put(channel, log_time, publish_time, reflected.encode([sample]).tobytes())
 
 
-def _reflected(topic: MessageTopic, first: bytes) -> ReflectedImu | None:
-    """Fields of an IMU in a topic of another encoding.
+def _reflected(topic: MessageTopic, first: bytes) -> Reflected | None:
+    """Fields of an IMU or a pose in a topic of another encoding.
 
     Raises:
         ConfigError: its messages are protobuf, which is not installed.
     """
     try:
-        return reflect(topic.message_encoding, topic.schema_name, topic.schema, first)
+        return reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
     except ImportError as error:
         fix = "Install it with: pip install 'imutool[protobuf]'"
         raise ConfigError("reading protobuf messages needs protobuf", where=topic.name, fix=fix) from error
@@ -202,22 +203,7 @@ def _poses(log: LogWriter, source: MessageLog) -> list[Series]:
         t_ns, kind = poses.t_ns, {KIND_KEY: source.kinds.get(topic, "unknown")}
         columns = (t_ns, poses.p_wb, poses.q_wb_wxyz)
         series.append(Series(log.channel(topic, schemas.POSE, kind), t_ns, columns, partial(encode_pose, frame_id=WORLD)))
-        if poses.v_w is not None:
-            velocity = {VELOCITY_KEY: topic, UNIT_KEY: "m/s"}
-            channel = log.channel(f"{topic.removesuffix('/pose')}/velocity", schemas.VECTOR3, velocity)
-            series.append(Series(channel, t_ns, (t_ns, poses.v_w), partial(encode_vector3, frame_id=WORLD)))
-    return series
-
-
-def _scalars(log: LogWriter, source: MessageLog) -> list[Series]:
-    series: list[Series] = []
-    for topic, scalars in source.scalars.items():
-        t_ns, values, unit = scalars.t_ns, scalars.values, {UNIT_KEY: scalars.unit}
-        if values.shape[1] == 1:
-            series.append(Series(log.channel(topic, schemas.FLOAT, unit), t_ns, (values[:, 0],), encode_float))
-        else:
-            channel = log.channel(topic, schemas.VECTOR3, unit)
-            series.append(Series(channel, t_ns, (t_ns, values), partial(encode_vector3, frame_id=BODY)))
+        series += velocity_series(log, topic, poses)
     return series
 
 

@@ -266,6 +266,6 @@ def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
         return ["no IMU topic"]
     usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
     if not usable:
-        others = ", ".join(f"{truth.topic} is {truth.kind}" for truth in truths)
+        others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
         return [f"no true poses: {others}" if others else "no true poses"]
     return [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]

@@ -15,11 +15,11 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import TwistColumns, decode_imu, decode_poses, decode_scalars, decode_twist
 from imutool.mcap_io.codec.messages import Messages, Rows
-from imutool.mcap_io.codec.reflection import ReflectedImu, reflect, reflect_cdr
+from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 from imutool.mcap_io.index import LogIndex
 
 ENCODINGS = ("cdr", "ros1")
-REFLECTED = ("protobuf", "json")  # encodings whose messages are searched for those of an IMU
+REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
 DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool from this topic
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
@@ -77,7 +77,7 @@ class ScalarBatch(NamedTuple):
 class Topic:
     """A topic as its Channel record describes it; several channels of one topic count as one.
 
-    An IMU in a type of its own (`reflected`) counts as sensor_msgs/msg/Imu, and its messages come as CDR.
+    An IMU or a pose in a type of its own (`reflected`) counts as an Imu or PoseStamped of ROS 2, and its messages come as CDR.
     """
 
     name: str
@@ -86,8 +86,8 @@ class Topic:
     message_encoding: str
     count: int
     metadata: Mapping[str, str]
-    reflected: ReflectedImu | None = None
-    own_schema: str = ""  # name in the log of the type of a reflected IMU
+    reflected: Reflected | None = None
+    own_schema: str = ""  # name in the log of the type of a reflected IMU or pose
 
     @property
     def is_derived(self) -> bool:
@@ -100,18 +100,17 @@ class Topic:
 
         The channel's metadata state it (`convert --kind`); else the words of the topic's name, then the message type.
         """
-        if (stated := self.metadata.get(KIND_KEY)) is not None:
-            return stated
-        words = "_".join(filter(None, re.split(r"[^a-z0-9]+", self.name.lower())))
-        for kind, pattern in KIND_WORDS.items():
-            if re.search(rf"(^|_)({pattern})(_|$)", words):
-                return kind
-        return "odometry" if self.schema_name == schemas.ODOMETRY else "unknown"
+        return self.metadata.get(KIND_KEY) or named_kind(self.name, self.own_schema or self.schema_name)
 
     @property
     def is_read(self) -> bool:
         """Whether imutool reads the topic's encoding."""
         return self.reflected is not None or self.message_encoding in ENCODINGS
+
+    @property
+    def _encoding(self) -> str:
+        """Encoding of the messages as they come from `cut`."""
+        return self.message_encoding if self.reflected is None else "cdr"
 
     def cut(
         self, found: Messages, mask: Bool[np.ndarray, " n"]
@@ -125,10 +124,9 @@ class Topic:
         Raises:
             LogError: a payload that is no such message.
         """
-        encoding = self.message_encoding if self.reflected is None else "cdr"
-        for part, layout in schemas.runs(rows.payload, schemas.IMU, encoding):
+        for part, layout in schemas.runs(rows.payload, schemas.IMU, self._encoding):
             cut = rows.where(part)
-            columns = decode_imu(cut.payload, encoding, layout)
+            columns = decode_imu(cut.payload, self._encoding, layout)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
     def decode_poses(self, rows: Rows) -> Iterator[PoseBatch]:
@@ -137,9 +135,9 @@ class Topic:
         Raises:
             LogError: a payload that is no such message, NaN or infinite values.
         """
-        for part, layout in schemas.runs(rows.payload, self.schema_name, self.message_encoding):
+        for part, layout in schemas.runs(rows.payload, self.schema_name, self._encoding):
             cut = rows.where(part)
-            for columns in decode_poses(cut.payload, self.schema_name, self.message_encoding, layout):
+            for columns in decode_poses(cut.payload, self.schema_name, self._encoding, layout):
                 check_finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
                 yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
@@ -164,6 +162,15 @@ class Topic:
         """
         for part, layout in schemas.runs(rows.payload, schemas.TWIST, self.message_encoding):
             yield decode_twist(rows.where(part).payload, self.message_encoding, layout)
+
+
+def named_kind(topic: str, schema_name: str) -> str:
+    """What poses are worth by the words of their topic's name, then by their type."""
+    words = "_".join(filter(None, re.split(r"[^a-z0-9]+", topic.lower())))
+    for kind, pattern in KIND_WORDS.items():
+        if re.search(rf"(^|_)({pattern})(_|$)", words):
+            return kind
+    return "odometry" if re.search(r"[/.]Odometry$", f"/{schema_name}") else "unknown"
 
 
 def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
@@ -248,33 +255,33 @@ def topics_of(index: LogIndex) -> dict[str, Topic]:
 
 
 def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callable[[str], bytes | None]) -> dict[str, Topic]:
-    """IMUs among the topics whose type is not that of ROS.
+    """IMUs and poses among the topics whose type is not that of ROS.
 
     `first` gives the first message of a topic.
     Types of ROS 2 count only where the log has no other IMU: drivers publish their own message beside that of ROS.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
-    imus: dict[str, Topic] = {}
+    found: dict[str, Topic] = {}
     for name, topic in topics.items():
         if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
             continue
         definition = definitions[name]
         try:
             raw = first(name) if topic.message_encoding == "json" else None
-            imu = reflect(topic.message_encoding, topic.schema_name, definition.data if definition else b"", raw)
+            message = reflect(topic.message_encoding, name, topic.schema_name, definition.data if definition else b"", raw)
         except ImportError:
             continue
-        if imu is not None:
-            imus[name] = _as_imu(topic, imu)
-    if imus or any(topic.schema_name == schemas.IMU for topic in topics.values()):
-        return imus
+        if message is not None:
+            found[name] = _as_ros(topic, message)
+    if any(topic.schema_name == schemas.IMU for topic in (*found.values(), *topics.values())):
+        return found
     for name, topic in topics.items():
         described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr")
         definition = definitions[name] if described else None
         if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
-            imus[name] = _as_imu(topic, imu)
-    return imus
+            found[name] = _as_ros(topic, imu)
+    return found
 
 
-def _as_imu(topic: Topic, imu: ReflectedImu) -> Topic:
-    return replace(topic, schema_name=schemas.IMU, reflected=imu, own_schema=topic.schema_name)
+def _as_ros(topic: Topic, message: Reflected) -> Topic:
+    return replace(topic, schema_name=message.schema_name, reflected=message, own_schema=topic.schema_name)

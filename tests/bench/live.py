@@ -29,7 +29,7 @@ def main() -> None:
         log = Path(folder) / "log.mcap"
         write(flight(1, duration_s=options.seconds, rate_hz=RATE_HZ), log)
         words = ["taskset", "-c", str(options.core), *(["chrt", "-f", "50"] if options.first else [])]
-        words += [sys.executable, "-m", "imutool.cli", "live", "--from", str(log), "--json", "-"]
+        words += [sys.executable, "-m", "imutool", "live", "--from", str(log), "--json", "-"]
         for view in (["--no-view"], ["--save", f"{folder}/live.rrd"]):
             done = subprocess.run([*words, *view], check=True, stdout=subprocess.PIPE, text=True)
             print(json.dumps({"view": view[0], **json.loads(done.stdout)["stream"]["delay_ms"]}))

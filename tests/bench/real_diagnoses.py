@@ -128,7 +128,7 @@ def _cpu_s() -> float:
 
 def diagnosed(logs: Sequence[Path], words: Sequence[str] = ()) -> dict[str, Any]:
     """What the command says."""
-    command = [sys.executable, "-m", "imutool.cli", "diagnose", *map(str, logs), "--quiet", "--json", "-", *words]
+    command = [sys.executable, "-m", "imutool", "diagnose", *map(str, logs), "--quiet", "--json", "-", *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         return {"failed": done.stderr.strip()[-500:]}

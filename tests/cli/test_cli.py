@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -207,7 +208,7 @@ def test_names_of_files_are_shown_as_they_are(tmp_path: Path, logs: Path, imutoo
     done = imutool("info", odd, "./gone.mcap", cwd=tmp_path)
     assert done.stderr.startswith("error: gone.mcap: ")
     done = imutool("info", odd, cwd=tmp_path)
-    assert done.stdout.splitlines()[0] == r"a [bold]b[] \x1b[31m.mcap"
+    assert done.stdout.startswith(r"a [bold]b[] \x1b[31m.mcap: ")
 
 
 # ── tables and progress ──
@@ -229,6 +230,11 @@ def test_tables_hold_every_figure_and_no_line_is_wider_than_the_terminal(
         figures = [one[name] for name in names] + [*one["roe_deg"].values(), *one["rpe_m"].values()]
         assert {f"{figure:.2f}" for figure in figures if figure is not None} <= cells
         assert {one["log"], one["model"]} <= cells
+
+
+def test_python_runs_the_package_as_the_command() -> None:
+    said = subprocess.run([sys.executable, "-m", "imutool", "--version"], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["imutool", version("imutool")]
 
 
 def test_a_table_too_wide_goes_on_below_with_its_keys(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
+BFBS = b64decode(json.loads((Path(__file__).parents[1] / "fixtures" / "flatbuffer.json").read_text())["bfbs"])
 START_NS = 1_600_000_000_000_000_123
 COUNT = 500
 GYRO = np.random.default_rng(3).normal(0, 0.003, (COUNT, 3))
@@ -57,6 +60,13 @@ def as_protobuf(n: int, t_ns: int) -> bytes:
     return message.SerializeToString()
 
 
+def as_flatbuffer(n: int, t_ns: int) -> bytes:
+    stamp = zip((("header", "stamp", "sec"), ("header", "stamp", "nsec")), divmod(t_ns, 10**9), strict=True)
+    vectors = (("angular_velocity", GYRO), ("linear_acceleration", ACCEL))
+    values = [((name, axis), row[n, k]) for name, row in vectors for k, axis in enumerate("xyz")]
+    return FlatBuffer.of("acme.ImuSample", BFBS).new([*stamp, *values])
+
+
 def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:
     """Log of an IMU with a topic beside it; the message `lacking` has no acceleration."""
     with path.open("wb") as file:
@@ -64,11 +74,13 @@ def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:
         writer.start()
         if encoding == "json":
             schema = writer.register_schema("Imu", "jsonschema", b'{"type": "object"}')
+        elif encoding == "flatbuffer":
+            schema = writer.register_schema("acme.ImuSample", "flatbuffer", BFBS)
         else:
             schema = writer.register_schema("robot.Inertial", "protobuf", protobuf_type()[0])
         imu = writer.register_channel("/robot/imu", encoding, schema)
         note = writer.register_channel("/notes", "text", 0)
-        make = as_json if encoding == "json" else as_protobuf
+        make = {"json": as_json, "protobuf": as_protobuf, "flatbuffer": as_flatbuffer}[encoding]
         for n in range(COUNT):
             t_ns = START_NS + n * 5_000_000
             payload = make(n, t_ns) if n != lacking else b"{}" if encoding == "json" else b""
@@ -79,7 +91,7 @@ def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:
     return path
 
 
-@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+@pytest.mark.parametrize("encoding", ["json", "protobuf", "flatbuffer"])
 def test_an_imu_in_another_encoding_becomes_one_that_every_command_reads(convert, imutool, tmp_path, encoding):
     done = convert(write_log(tmp_path / "in.mcap", encoding), tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr
@@ -101,11 +113,11 @@ def test_an_imu_in_another_encoding_becomes_one_that_every_command_reads(convert
 def test_a_message_without_a_sample_is_a_loss(convert, tmp_path):
     done = convert(write_log(tmp_path / "in.mcap", "protobuf", lacking=7), tmp_path / "out.mcap")
     assert done.returncode == 3
-    assert "1 messages of /robot/imu hold no sample of an IMU: see /robot/imu/as_recorded" in done.stderr
+    assert "1 messages of /robot/imu hold no sample: see /robot/imu/as_recorded" in done.stderr
     assert len(read(tmp_path / "out.mcap").imu) == COUNT - 1
 
 
-@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+@pytest.mark.parametrize("encoding", ["json", "protobuf", "flatbuffer"])
 def test_a_log_in_another_encoding_is_read_and_debiased_without_conversion(imutool, tmp_path, encoding):
     source = write_log(tmp_path / "in.mcap", encoding)
     recording = read(source)
@@ -165,6 +177,33 @@ def test_a_ros2_type_with_rates_and_accelerations_is_an_imu_where_the_log_has_no
     with Log(tmp_path / "d.mcap") as log:
         assert log.topics["/fmu/out/sensor_combined/debiased"].schema_name == "sensor_msgs/msg/Imu"
         assert log.topics["/fmu/out/sensor_combined/debiased"].reflected is None
+
+
+def test_poses_in_another_encoding_have_a_kind_and_serve_as_truth(convert, imutool, tmp_path):
+    """foxglove.PoseInFrame in JSON on a topic of motion capture, and an odometry beside it."""
+    with (tmp_path / "in.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.PoseInFrame", "jsonschema", b'{"type": "object"}')
+        imu, *poses = (writer.register_channel(t, "json", schema) for t in ("/imu", "/mocap/body", "/wheels/odom"))
+        for n in range(COUNT):
+            t_ns = START_NS + n * 5_000_000
+            writer.add_message(imu, t_ns, as_json(n, t_ns), t_ns)
+            place = {"position": {"x": n / 100, "y": 0, "z": 1}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+            stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
+            for channel in poses:
+                message = json.dumps({"timestamp": stamp, "frame_id": "world", "pose": place}).encode()
+                writer.add_message(channel, t_ns, message, t_ns)
+        writer.finish()
+    recording = read(tmp_path / "in.mcap")
+    assert recording.truths["/mocap/body"].p_wb[7].tolist() == [0.07, 0.0, 1.0]
+    assert recording.other_poses == {"/wheels/odom": "odometry"}
+    assert convert(tmp_path / "in.mcap", tmp_path / "out.mcap").returncode == 0
+    converted = read(tmp_path / "out.mcap")
+    assert converted.truths["/mocap/body"] == recording.truths["/mocap/body"]
+    assert converted.other_poses == recording.other_poses
+    done = imutool("evaluate", "in.mcap", "--init", "truth", "--json", "-", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_log_cut_in_its_summary_is_debiased_in_its_encoding(imutool, tmp_path):

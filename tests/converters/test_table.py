@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import zipfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +68,85 @@ def test_names_and_units_are_recognised(convert, tmp_path, header):
     assert done.returncode == 0, done.stderr
     assert "columns: " in done.stderr  # what was recognised is shown
     same(tmp_path / "out.mcap", 1e-12)
+
+
+def rows_of(times: list[str], values: np.ndarray, mark: str = ",") -> str:
+    return "".join(f"{mark.join([t, *map(repr, row)])}\n" for t, row in zip(times, values.tolist(), strict=True))
+
+
+def iso(t_ns: int, form: str) -> str:
+    moment = datetime.fromtimestamp(t_ns // 10**9, UTC)
+    return moment.strftime(form).replace("FRACTION", f"{t_ns % 10**9:09d}")
+
+
+VALUES = np.column_stack([GYRO, ACCEL])
+PLAIN = ["t_ns", *(f"gyro_{a}_rads" for a in "xyz"), *(f"acc_{a}_ms2" for a in "xyz")]
+GERMAN = ["Zeit [ns]", *(f"Drehrate {a} [rad/s]" for a in "XYZ"), *(f"Beschleunigung {a} [m/s²]" for a in "XYZ")]
+STAMPS = list(map(str, T_NS.tolist()))
+SHAPES = {
+    "comments above the header": ("# made by a logger\n# v2\n" + ",".join(PLAIN) + "\n" + rows_of(STAMPS, VALUES)).encode(),
+    "a percent sign": ("% exported\n%\n" + ",".join(PLAIN) + "\n" + rows_of(STAMPS, VALUES)).encode(),
+    "units in a row of their own": (
+        "t,wx,wy,wz,ax,ay,az\nns,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2\n" + rows_of(STAMPS, VALUES)
+    ).encode(),
+    "commas in quoted names": (
+        ",".join(['"time [ns]"', *(f'"rate, {a} [rad/s]"' for a in "xyz"), *(f'"acceleration, {a} [m/s^2]"' for a in "xyz")])
+        + "\n"
+        + rows_of(STAMPS, VALUES)
+    ).encode(),
+    "calendar times in UTC": (
+        ",".join(["Timestamp", *PLAIN[1:]])
+        + "\n"
+        + rows_of([iso(t, "%Y-%m-%dT%H:%M:%S.FRACTIONZ") for t in T_NS.tolist()], VALUES)
+    ).encode(),
+    "calendar times with an offset": (
+        ",".join(["time", *PLAIN[1:]])
+        + "\n"
+        + rows_of([iso(t + 7200 * 10**9, "%Y-%m-%d %H:%M:%S.FRACTION+02:00") for t in T_NS.tolist()], VALUES)
+    ).encode(),
+    "German Excel in Windows' code page": (";".join(GERMAN) + "\n" + rows_of(STAMPS, VALUES, ";").replace(".", ",")).encode(
+        "cp1252"
+    ),
+    "German dates": (
+        ";".join(["Zeitstempel", *GERMAN[1:]])
+        + "\n"
+        + rows_of([iso(t, "%d.%m.%Y %H:%M:%S,FRACTION") for t in T_NS.tolist()], VALUES, ";")
+    ).encode(),
+    "UTF-16": ("\t".join(PLAIN) + "\n" + rows_of(STAMPS, VALUES, "\t")).encode("utf-16"),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tables_of_text_come_in_many_shapes(tmp_path, shape):
+    (tmp_path / "log.csv").write_bytes(SHAPES[shape])
+    (sequence,) = table.sequences(tmp_path / "log.csv")
+    imu = table.read_sequence(sequence).imus["/imu0"]
+    assert imu.t_ns.tolist() == T_NS.tolist()
+    assert np.array_equal(imu.gyro, GYRO)
+    assert np.array_equal(imu.accel, ACCEL)
+
+
+def test_the_unit_beside_an_array_in_hdf5_counts(tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["imu/t_ns"] = T_NS
+        file.create_dataset("imu/gyro", data=GYRO).attrs["units"] = "deg/s"
+        file.create_dataset("imu/accel", data=ACCEL).attrs["units"] = "g"
+    (sequence,) = table.sequences(tmp_path / "log.h5")
+    imu = table.read_sequence(sequence).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(GYRO))
+    np.testing.assert_allclose(imu.accel, ACCEL * G)
+
+
+def test_a_spreadsheet_is_refused_with_what_to_do(convert, tmp_path):
+    with zipfile.ZipFile(tmp_path / "log.xlsx", "w") as archive:
+        archive.writestr("[Content_Types].xml", "<Types/>")
+        archive.writestr("xl/workbook.xml", "<workbook/>")
+    done = convert(tmp_path / "log.xlsx", tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "is a spreadsheet" in done.stderr
+    assert "as CSV" in done.stderr
 
 
 def test_seconds_in_decimals_are_exact_and_further_columns_become_topics(convert, tmp_path):

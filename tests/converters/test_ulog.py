@@ -89,6 +89,7 @@ def flight() -> Writer:
         for sensor, shift in (("sensor_gyro", 0), ("sensor_accel", 700)):
             rows = [(t + shift, t + shift, float(instance), 1.0, 2.0, 25.0 + instance) for t in times]
             writer.topic(sensor, SENSOR, rows, instance)
+    writer.topic("parameter_update", "uint64_t timestamp;uint32_t changes", [(0, 7)])
     writer.log("Takeoff detected", times[50])
     writer.dropout(12)
     return writer
@@ -126,12 +127,14 @@ def test_every_topic_parameter_and_text_arrives(log):
     with log.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         found: dict[str, list[Any]] = {}
-        for _, channel, _, content in reader.iter_decoded_messages():
+        for _, channel, message, content in reader.iter_decoded_messages():
             found.setdefault(channel.topic, []).append(content)
+            assert message.log_time >= START_US * 1000  # PX4 gave one message the stamp 0
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert found["/sensor_combined"][9].accelerometer_m_s2 == [1.0, 2.0, -9.75]  # PX4's own frame
     assert [len(found[f"/sensor_gyro/{n}"]) for n in (0, 1)] == [250, 250]
     assert found["/sensor_accel/1"][0].temperature == 26.0
+    assert [(m.timestamp, m.changes) for m in found["/parameter_update"]] == [(0, 7)]
     (line,) = found["/logged_messages"]
     assert (line.msg, line.level, line.stamp.sec) == ("Takeoff detected", 30, 5)
     assert metadata["px4/parameters"] == {"IMU_GYRO_CUTOFF": "40.0"}

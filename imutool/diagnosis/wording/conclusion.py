@@ -14,7 +14,7 @@ from imutool.units import UNITS
 
 NO_EXPLANATION = "has no explanation yet"
 QUIET = "nothing else stands above the noise"
-UNKNOWN = "This log has no reference, and its samples alone show no defect."
+UNKNOWN = "This log has no usable reference, and its samples alone show no defect."
 NULL = "Nothing but a constant bias and noise separates the two."
 SHOWN = 3  # intervals in a line
 WITH_ALL = "With everything that was found"

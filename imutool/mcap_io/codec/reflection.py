@@ -1,8 +1,9 @@
-"""IMU messages of other types and encodings, found by reflection on their fields.
+"""IMU messages and poses of other types and encodings, found by reflection on their fields.
 
-Fields come from protobuf descriptors, `ros2msg` definitions, or the first JSON message.
+Fields come from protobuf descriptors, FlatBuffers schemas, `ros2msg` definitions, or the first JSON message.
 A message is that of an IMU if it holds an angular velocity and a linear acceleration of three numbers each, by the names of its
-fields. Values count as rad/s and m/s². A message that lacks them has NaN, so that `clean` can leave it out.
+fields, in rad/s and m/s². It is a pose if its type or topic says so and it holds a position (m) and a quaternion.
+A message that lacks them has NaN, so that `clean` can leave it out.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -21,13 +22,17 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.described_cdr import DescribedCdr
-from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.codec.flatbuffer import FlatBuffer, nested
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
-from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, NS_PER_S, runs
+from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, NS_PER_S, POSE, runs
 
 UNIT = r"(_?(rad(_?p?_?s)?|rads|m_?s_?2|mps2|si))?"
 GYRO = rf"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega){UNIT}"
 ACCEL = rf"(linear_?acceleration|accel(eration|erometer)?|acc|specific_?force){UNIT}"
+POSITION = r"position|pos|translation|p"
+ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
+POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
 STAMP = r"timestamp|stamp|time|sensor_?time"
 COUNTED = {r"(time|timestamp|stamp|t)_?ns(ec)?": 1, r"(time|timestamp|stamp|t)_?us(ec)?|utime": 1000}  # stamps of one number
 FRAME = r"frame_?id|frame"
@@ -54,7 +59,7 @@ class Format(Protocol):
 
 
 class Sample(NamedTuple):
-    """IMU sample in a message: stamp in ns, frame, rates and accelerations."""
+    """Sample in a message: stamp in ns, frame, and its numbers."""
 
     stamp_ns: int
     frame_id: str
@@ -62,14 +67,15 @@ class Sample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ReflectedImu:
-    """Fields of an IMU in the messages of a topic, and the translation from and to CDR."""
+class Reflected:
+    """Fields of an IMU or a pose in the messages of a topic; translates to and from CDR."""
 
+    schema_name: str  # of the messages in CDR: an Imu or a PoseStamped
     format: Format
-    vectors: tuple[Path, ...]  # of six numbers: rates, then accelerations
+    vectors: tuple[Path, ...]  # of six numbers, rates, then accelerations; or of seven, position, then wxyz
     stamp: tuple[tuple[Path, int], ...]  # fields that add up to the stamp, with their nanoseconds
     frame: Path | None
-    covariances: tuple[Path | None, Path | None]
+    covariances: tuple[Path | None, ...] = ()
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
         """Sample in a message; at its log time where it has no stamp.
@@ -85,6 +91,12 @@ class ReflectedImu:
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the message lacks {error}") from error
 
+    def encode(self, samples: Sequence[Sample]) -> UInt8[np.ndarray, "n L"]:
+        """Samples of one frame as CDR."""
+        values, stamps = np.array([sample.values for sample in samples]), np.array([s.stamp_ns for s in samples], np.int64)
+        encode = encode_imu if self.schema_name == IMU else encode_pose
+        return encode(stamps, values[:, :3], values[:, 3:], samples[0].frame_id)
+
     def cut(
         self, found: Messages, mask: Bool[np.ndarray, " n"]
     ) -> Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]:
@@ -96,13 +108,11 @@ class ReflectedImu:
             try:
                 samples.append(self.sample(found.data[first : first + size - FIXED].tobytes(), time))
             except ValueError:
-                samples.append(Sample(time, "", [np.nan] * 6))
+                samples.append(Sample(time, "", [np.nan] * len(self.vectors)))
         start = 0
-        for frame, group in groupby(samples, key=lambda sample: sample.frame_id):
+        for _, group in groupby(samples, key=lambda sample: sample.frame_id):
             part = list(group)
-            values = np.array([sample.values for sample in part])
-            stamps = np.array([sample.stamp_ns for sample in part], np.int64)
-            yield heads[start : start + len(part)], encode_imu(stamps, values[:, :3], values[:, 3:], frame)
+            yield heads[start : start + len(part)], self.encode(part)
             start += len(part)
 
     def from_cdr(self, rows: UInt8[np.ndarray, "n L"]) -> list[bytes]:
@@ -135,29 +145,37 @@ def _parts(stamp_ns: int, places: Sequence[tuple[Path, int]]) -> Iterator[tuple[
         yield path, count
 
 
-def reflect(encoding: str, schema_name: str, schema: bytes, first: bytes | None) -> ReflectedImu | None:
-    """Fields of an IMU in messages of a schema; None of any other message.
+def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: bytes | None) -> Reflected | None:
+    """Fields of an IMU or a pose in messages of a schema; None of any other message.
 
-    JSON goes by the `first` message, protobuf by the descriptors in the schema.
+    JSON goes by the `first` message, protobuf and FlatBuffers by the schema.
 
     Raises:
         ImportError: the schema is of protobuf, which is not installed.
     """
+    form: Format | None = None
+    tree: Any = None
     if encoding == "json" and first is not None:
         try:
             tree, form = _tree_of(json.loads(first), DEPTH), _Json()
         except (ValueError, RecursionError):
             return None
-        return _found(tree, form) if isinstance(tree, Mapping) else None
-    if encoding == "protobuf":
+    elif encoding == "protobuf":
         from imutool.mcap_io.codec.protobuf import Protobuf
 
-        protobuf = Protobuf.of(schema_name, schema)
-        return None if protobuf is None else _found(protobuf.tree(DEPTH), protobuf)
-    return None
+        form = Protobuf.of(schema_name, schema)
+        tree = form and form.tree(DEPTH)
+    elif encoding == "flatbuffer":
+        form = FlatBuffer.of(schema_name, schema)
+        tree = form and form.tree(DEPTH)
+    if form is None or not isinstance(tree, Mapping):
+        return None
+    if (imu := _found(tree, form)) is not None:
+        return imu
+    return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
-def reflect_cdr(schema_name: str, schema: bytes) -> ReflectedImu | None:
+def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
     """Fields of an IMU in a `ros2msg` definition; None of any other message."""
     try:
         form = DescribedCdr(ros2_definition.parse(schema_name, schema))
@@ -166,7 +184,7 @@ def reflect_cdr(schema_name: str, schema: bytes) -> ReflectedImu | None:
     return _found(form.tree(DEPTH), form)
 
 
-def _found(tree: Tree, form: Format) -> ReflectedImu | None:
+def _found(tree: Tree, form: Format) -> Reflected | None:
     """Fields of an IMU in the tree of a message's fields."""
     fields = [(path, _spelled(path[-1]), node) for path, node in _walk(tree, ())]
     gyro, accel = (_vector(fields, pattern) for pattern in (GYRO, ACCEL))
@@ -177,7 +195,22 @@ def _found(tree: Tree, form: Format) -> ReflectedImu | None:
         next((path for path, name, node in fields if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
         for pattern in (GYRO, ACCEL)
     ]
-    return ReflectedImu(form, (*gyro, *accel), _stamp(fields), frame, (covariances[0], covariances[1]))
+    return Reflected(IMU, form, (*gyro, *accel), _stamp(fields), frame, tuple(covariances))
+
+
+def _pose(tree: Tree, form: Format) -> Reflected | None:
+    """First position with a quaternion beside it in the tree of a message's fields."""
+    fields = [(path, _spelled(path[-1]), node) for path, node in _walk(tree, ())]
+    for path, name, node in fields:
+        if not (isinstance(node, Mapping) and re.fullmatch(ORIENTATION, name)):
+            continue
+        beside = [field for field in fields if field[0][:-1] == path[:-1]]
+        position = _vector(beside, POSITION)
+        parts = next(([f"{q}{axis}" for axis in "wxyz"] for q in ("", "q") if {f"{q}{a}" for a in "wxyz"} <= node.keys()), None)
+        if position is not None and parts is not None:
+            frame = next((p for p, text, kind in fields if kind == TEXT and re.fullmatch(FRAME, text)), None)
+            return Reflected(POSE, form, (*position, *((*path, part) for part in parts)), _stamp(fields), frame)
+    return None
 
 
 def _walk(tree: Tree, above: Path) -> Iterator[tuple[Path, Any]]:
@@ -252,13 +285,4 @@ class _Json:
         return message
 
     def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
-        message: dict[str, Any] = {}
-        for path, value in values:
-            inner: Any = message
-            for key, following in pairwise(path):
-                inner = inner.setdefault(key, [] if isinstance(following, int) else {})
-            if isinstance(path[-1], int):
-                inner.append(value)
-            else:
-                inner[path[-1]] = value
-        return json.dumps(message).encode()
+        return json.dumps(nested(values)).encode()

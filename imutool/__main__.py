@@ -1,4 +1,4 @@
-"""`python -m imutool.cli`."""
+"""`python -m imutool`."""
 
 from imutool.cli import main
 
