@@ -1,4 +1,4 @@
-"""Correct a converted log: units and axes of its IMUs, world and clock of its poses.
+"""Correct a converted log: units, axes and stamps of IMUs, world and clock of poses.
 
 Messages are patched where they stand, so everything else of them stays: covariances turn with their vectors, and the poses in
 the judged poses' frame turn with it. The record `imutool_corrections` says what was changed.
@@ -6,17 +6,20 @@ the judged poses' frame turn with it. The record `imutool_corrections` says what
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from imutool import registry
-from imutool.cleaning import CleaningSettings, Survey, look
+from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
 from imutool.cleaning.conventions import axis_names
+from imutool.cleaning.stamp_line import read_stamps, restamped
 from imutool.conversion.message_writer import write_log
+from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
@@ -27,6 +30,7 @@ from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 RECORD = "imutool_corrections"
+CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
 XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
@@ -37,6 +41,7 @@ class Corrections:
     Attributes:
         imus: by topic, the matrices that lead from its gyro and accel to right ones.
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
+        stamps: new stamps of an IMU's messages, in file order.
         notes: what is corrected, by topic.
     """
 
@@ -44,6 +49,7 @@ class Corrections:
     world: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     frame_id: str = ""
     late_ns: int = 0
+    stamps: Mapping[str, Int64[np.ndarray, "..."]] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
@@ -55,7 +61,19 @@ class Corrections:
         said = [f"{topic}: {note}" for topic, note in self.notes.items()]
         content.remarks.notes.extend(said)
         metadata = {**content.metadata, RECORD: dict(self.notes)}
-        return replace(content, messages=lambda: map(self._corrected, content.messages()), metadata=metadata)
+        return replace(content, messages=lambda: self._each(content.messages()), metadata=metadata)
+
+    def _each(self, messages: Iterator[Message]) -> Iterator[Message]:
+        seen = Counter[str]()
+        for message in messages:
+            name, stamps = message.topic.name, self.stamps.get(message.topic.name)
+            if stamps is None:
+                yield self._corrected(message)
+                continue
+            patch = _Patch(message.topic, bytes(message.payload))
+            patch.move_stamp(int(stamps[seen[name]]) - patch.stamp_ns())
+            seen[name] += 1
+            yield self._corrected(message._replace(payload=bytes(patch.data)))
 
     def _corrected(self, message: Message) -> Message:
         topic = message.topic
@@ -101,12 +119,18 @@ class _Patch:
         at, count = self.layout.numbers[which]
         return np.frombuffer(self.data, f"{self.layout.order}f8", count, at)
 
+    def stamp_ns(self, which: int = 0) -> int:
+        """Stamp of one element."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        return int(seconds[0]) * schemas.NS_PER_S + int(np.frombuffer(self.data, f"{order}u4", 1, at + 4)[0])
+
     def move_stamp(self, by_ns: int, which: int = 0) -> None:
         """Shift a stamp."""
         at, order = self.layout.stamps[which], self.layout.order
         seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
         nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
-        seconds[0], nanos[0] = divmod(int(seconds[0]) * schemas.NS_PER_S + int(nanos[0]) + by_ns, schemas.NS_PER_S)
+        seconds[0], nanos[0] = divmod(self.stamp_ns(which) + by_ns, schemas.NS_PER_S)
 
 
 def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:
@@ -130,26 +154,50 @@ def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], 
     return bytes(patch.data)
 
 
-def corrections(path: Path) -> Corrections:
-    """Corrections that a log's own motion shows to be needed.
+def parse_corrections(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of corrections.
+
+    Raises:
+        ConfigError: another name.
+    """
+    for name in names:
+        if name not in (CONVENTIONS, STAMPS):
+            raise ConfigError(f"{name!r}", where="correct", expected=f"{CONVENTIONS} or {STAMPS}")
+    return tuple(names)
+
+
+def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
+    """Corrections that a log shows to be needed.
 
     Raises:
         LogError: damage.
     """
-    imus, notes = {}, {}
+    imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
+    stamps: dict[str, Int64[np.ndarray, "..."]] = {}
+    notes: dict[str, list[str]] = defaultdict(list)
     world, frame_id, late_ns = np.eye(3), "", 0
     with Log(path) as log:
         for topic in log.imu_topics:
-            if log.topics[topic].reflected is not None:
+            if log.topics[topic].message_encoding not in ENCODINGS or log.topics[topic].reflected is not None:
+                continue
+            if STAMPS in wanted:
+                before = np.concatenate([np.zeros(0, np.int64), *(batch.stamp_ns for batch in raw_batches(log, topic))])
+                stamps[topic] = restamped(before)
+                moved_s = 1e-9 * float(np.abs(stamps[topic] - before).max(initial=0))
+                said = "; ".join(read_stamps(before).told)
+                line = f"stamps are now on a line under them, moved by {moved_s:.6f} s at most"
+                notes[topic].append(f"{said}; {line}" if said else line)
+            if CONVENTIONS not in wanted:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
             if (survey.matrices != np.eye(3)).any():
-                imus[topic], notes[topic] = survey.matrices, _imu_note(survey)
+                imus[topic] = survey.matrices
+                notes[topic].append(_imu_note(survey))
             if not frame_id and (survey.pose_delay_ns or (survey.world != np.eye(3)).any()):
                 world, late_ns = survey.world, survey.pose_delay_ns
                 frame_id = next(log.pose_batches(survey.pose_topic)).frame_id
-                notes[survey.pose_topic] = _pose_note(survey)
-    return Corrections(imus, world, frame_id, late_ns, notes)
+                notes[survey.pose_topic].append(_pose_note(survey))
+    return Corrections(imus, world, frame_id, late_ns, stamps, {topic: "; ".join(said) for topic, said in notes.items()})
 
 
 def _imu_note(survey: Survey) -> str:
@@ -164,13 +212,13 @@ def _pose_note(survey: Survey) -> str:
     return "; ".join(parts)
 
 
-def write_corrected(log: Path, target: Path, *, compression: str, overwrite: bool) -> tuple[str, ...]:
+def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
     """Write a log with what its motion shows to be wrong corrected; notes say what.
 
     Raises:
         ImutoolError: damage, or the target cannot be written.
     """
-    found = corrections(log)
+    found = find_corrections(log, wanted)
     if not found:
         refuse_existing(target, overwrite=overwrite)
         log.replace(target)

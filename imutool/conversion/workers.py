@@ -33,8 +33,8 @@ class Job:
     images: bool = True
     overwrite: bool = False
     labels: Labels = field(default_factory=Labels)
-    fix: bool = False  # correct units, axes and frames
     mapping: Path | None = None  # what the columns of a table mean
+    correct: tuple[str, ...] = ()  # `conventions`, `stamps`
 
 
 @dataclass(frozen=True)
@@ -62,30 +62,29 @@ def _convert_one(job: Job) -> Outcome:
         if given and "mapping" not in inspect.signature(module.read_sequence).parameters:
             raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
         content = module.read_sequence(job.sequence, images=job.images, **given)
-        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite, fix=job.fix)
+        return write_content(content, job)
     except ImutoolError as error:
         return Outcome(error)
 
 
-def write_content(
-    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool, fix: bool = False
-) -> Outcome:
-    """Write what a converter has read, with the user's labels; with `fix` corrected as its motion shows.
+def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
+    """Write what a converter has read, with the user's labels, corrected as the job says.
 
     Raises:
         ImutoolError: it cannot be written.
     """
-    if fix:
-        with TemporaryDirectory(prefix=".imutool-", dir=target.parent) as folder:
-            as_recorded = Path(folder) / target.name
-            outcome = write_content(content, as_recorded, labels, compression=compression, overwrite=False)
-            notes = write_corrected(as_recorded, target, compression=compression, overwrite=overwrite)
+    if job.correct:
+        with TemporaryDirectory(prefix=".imutool-", dir=job.target.parent) as folder:
+            recorded = Path(folder) / job.target.name
+            outcome = write_content(content, replace(job, target=recorded, correct=()))
+            ways = {"compression": job.compression}
+            notes = write_corrected(recorded, job.target, job.correct, overwrite=job.overwrite, **ways)
             return replace(outcome, notes=(*outcome.notes, *notes))
-    labelled = labels.put_on(content)
+    labelled = job.labels.put_on(content)
     if isinstance(labelled, Recording):
-        write(labelled, target, compression=compression, overwrite=overwrite)
+        write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
         return Outcome()
-    write_log(labelled, target, compression=compression, overwrite=overwrite)
+    write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
     return Outcome(None, tuple(labelled.remarks.notes), tuple(labelled.remarks.losses))
 
 

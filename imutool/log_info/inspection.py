@@ -19,6 +19,7 @@ from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import Motion, Samples
+from imutool.cleaning.stamp_line import Stamps, read_stamps
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
@@ -136,7 +137,7 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     rest, whole = _rest(imu), _summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, whole),
+        warnings=_imu_warnings(counts, imu, whole, read_stamps(t_ns)),
         conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
         samples=len(t_ns),
@@ -209,7 +210,7 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary) -> list[str]:
+def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stamps: Stamps) -> list[str]:
     words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
@@ -218,6 +219,7 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary) -> l
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
     return [*warnings, *_convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 

@@ -40,7 +40,7 @@ def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarra
     write(replace(made, imu=wrong, truths={k: in_ned(v) for k, v in made.truths.items()}), tmp_path / "wrong.mcap")
     before = (tmp_path / "wrong.mcap").read_bytes()
     assert [w for w in inspect(tmp_path / "wrong.mcap").warnings if "--fix" in w]
-    report = convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", fix=True)
+    report = convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
     fixed = read(tmp_path / "right.mcap")
     np.testing.assert_allclose(fixed.imu.gyro, made.imu.gyro, rtol=0, atol=1e-13)
     np.testing.assert_allclose(fixed.imu.accel, made.imu.accel, rtol=0, atol=1e-12)
@@ -58,6 +58,18 @@ def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarra
 
 def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
     write(made, tmp_path / "made.mcap")
-    report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", fix=True)
+    report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", correct=["conventions"])
     assert read(tmp_path / "same.mcap").imu == made.imu
     assert report.notes == ["same.mcap: the motion shows nothing to correct"]
+
+
+def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: Path) -> None:
+    last = np.minimum(np.arange(len(made.imu)) // 4 * 4 + 3, len(made.imu) - 1)
+    bunched = Imu(made.imu.t_ns[last] + 20_000 * (np.arange(len(made.imu)) % 4), made.imu.gyro, made.imu.accel)
+    write(replace(made, imu=bunched), tmp_path / "bunched.mcap")
+    assert any("batches of about 4.0" in warning for warning in inspect(tmp_path / "bunched.mcap").warnings)
+    convert(tmp_path / "bunched.mcap", tmp_path / "even.mcap", correct=["stamps"])
+    even = read(tmp_path / "even.mcap").imu
+    assert np.abs(even.t_ns - made.imu.t_ns).max() < 100_000
+    assert (even.gyro == made.imu.gyro).all()
+    assert inspect(tmp_path / "even.mcap").warnings == []
