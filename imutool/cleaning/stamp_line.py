@@ -17,8 +17,9 @@ from jaxtyping import Float64, Int64
 
 from imutool.recording import nanoseconds
 
-WINDOW = 1024  # samples, several batches of any driver
-GAP_NS = nanoseconds(0.5)  # a longer step, or one back, ends a stretch
+WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds
+GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
+GAP_BATCHES = 1.7  # batches: samples are missing in a longer step, which ends a stretch, as one back does
 WRAPS = {
     f"{bits} bit of {unit}": 2**bits * ns for bits in (16, 32) for unit, ns in (("ns", 1), ("us", 1000), ("ms", 1_000_000))
 }
@@ -60,19 +61,27 @@ def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
                 break
     whole = np.concatenate([stamp_ns[:1], stamp_ns[:1] + np.cumsum(steps)]) if len(stamp_ns) else stamp_ns
     near = steps[(steps >= 0) & (steps < GAP_NS)]
-    share = float((near < BUNCHED * near.mean()).mean()) if len(near) > WINDOW // 4 else 0.0
+    share = float((near < BUNCHED * near.mean()).mean()) if len(near) > WINDOW else 0.0
     return Stamps(whole, wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0)
 
 
 def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Stamps on the line under them, by stretches; in each they increase."""
-    whole = read_stamps(stamp_ns).stamp_ns
-    steps = np.diff(whole)
-    edges = [0, *(np.flatnonzero((steps > GAP_NS) | (steps < -GAP_NS)) + 1).tolist(), len(whole)]
+    """Stamps on the line under them, by stretches without a gap; they increase, but where the clock was set back."""
+    found = read_stamps(stamp_ns)
+    whole, steps = found.stamp_ns, np.diff(found.stamp_ns)
+    near = steps[(steps >= 0) & (steps < GAP_NS)]
+    if not len(near):
+        return whole
+    batch_ns = found.batch * float(near.mean()) if found.batch > 1.0 else float(np.median(near))
+    back = np.flatnonzero(steps < -GAP_NS) + 1
+    ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns) + 1
     out = whole.copy()
-    for first, end in pairwise(edges):
+    for first, end in pairwise([0, *np.union1d(back, ends).tolist(), len(whole)]):
         if end - first > 2:
             out[first:end] = whole[first] + np.rint(_line(whole[first:end] - whole[first])).astype(np.int64)
+    for first, end in pairwise([0, *back.tolist(), len(whole)]):
+        number = np.arange(end - first)
+        out[first:end] = np.maximum.accumulate(out[first:end] - number) + number
     return out
 
 
