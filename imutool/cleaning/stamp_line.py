@@ -28,7 +28,7 @@ BATCHED = 0.3  # share of such steps from which on stamps come in batches
 
 
 class Stamps(NamedTuple):
-    """Stamps of a topic as its counter would have run without wraps, and what is wrong with them.
+    """Stamps of a topic without the wraps of its counter, and what was wrong with them.
 
     Attributes:
         batch: mean samples in a batch; 1 where they come one by one.
@@ -50,7 +50,7 @@ class Stamps(NamedTuple):
 
 
 def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
-    """Stamps with wraps taken up; a wrap goes back by the range of a counter and goes on from there."""
+    """Stamps with wraps taken up: steps back by the range of a counter."""
     steps, wraps = np.diff(stamp_ns), Counter[str]()
     usual = int(np.median(steps)) if len(steps) else 0
     for row in np.flatnonzero(steps < -max(usual, 1)):
@@ -66,7 +66,10 @@ def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
 
 
 def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Stamps on the line under them, by stretches without a gap; they increase, but where the clock was set back."""
+    """Stamps on the line under them, by stretches without a gap.
+
+    They increase, but where the clock was set back.
+    """
     found = read_stamps(stamp_ns)
     whole, steps = found.stamp_ns, np.diff(found.stamp_ns)
     near = steps[(steps >= 0) & (steps < GAP_NS)]

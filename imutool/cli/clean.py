@@ -50,13 +50,8 @@ def clean(
     from imutool.cleaning.rule import chosen
 
     rules = chosen(rule or (), no_rule or (), force, fix)
-    given = {
-        "--model": model,
-        "--smooth": smooth,
-        "--force": force,
-        "--fix": fix,
-        "--overwrite": overwrite and report_to is None and json_to is None,
-    }
+    given = {"--model": model, "--smooth": smooth, "--force": force, "--fix": fix}
+    given["--overwrite"] = overwrite and report_to is None and json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     added: dict[str, int] = {}

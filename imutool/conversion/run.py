@@ -88,12 +88,11 @@ def convert(
 
     Raises:
         DataError: no converter recognises anything in the source.
-        ConfigError: unknown format or sequence, two sequences of one name, a target that exists, is a source, or cannot
-            be made.
+        ConfigError: unknown format, sequence or correction, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    labels = Labels(sensor, parse_kinds(kinds), parse_parts(imu))
-    ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, parse_corrections(correct))
+    labels, corrected = Labels(sensor, parse_kinds(kinds), parse_parts(imu)), parse_corrections(correct)
+    ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)
     source_sequences = _find(source, format)
@@ -109,10 +108,9 @@ def convert(
         raise source_sequences.errors[0][1]
     _check_targets(jobs)
     outcomes: dict[int, Outcome] = {}
-    done = len(source_sequences.errors)
     for number, outcome in run_jobs(jobs, _worker_count(workers, len(jobs))):
         outcomes[number] = outcome
-        done += 1
+        done = len(source_sequences.errors) + len(outcomes)
         if progress is not None:
             progress(done, len(names), jobs[number].sequence.name)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
