@@ -19,7 +19,7 @@ from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import Motion, Samples
-from imutool.cleaning.stamp_line import Stamps, read_stamps
+from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
@@ -127,17 +127,18 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     ordered, first = np.unique(t_ns[finite], return_index=True)
     imu = Imu(ordered, gyro[finite][first], accel[finite][first])
     later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
+    stamps = read_stamps(t_ns)
     counts = {
         "out_of_order": int((t_ns < later).sum()),
         "duplicated": len(t_ns) - len(np.unique(t_ns)),
-        "missing": _missing(np.unique(t_ns)),
+        "missing": _missing(np.unique(restamped(t_ns) if stamps.batch > 1.0 else t_ns)),
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
     rest, whole = _rest(imu), _summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, whole, read_stamps(t_ns)),
+        warnings=_imu_warnings(counts, imu, whole, stamps),
         conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
         samples=len(t_ns),

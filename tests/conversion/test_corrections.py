@@ -67,7 +67,8 @@ def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: P
     last = np.minimum(np.arange(len(made.imu)) // 4 * 4 + 3, len(made.imu) - 1)
     bunched = Imu(made.imu.t_ns[last] + 20_000 * (np.arange(len(made.imu)) % 4), made.imu.gyro, made.imu.accel)
     write(replace(made, imu=bunched), tmp_path / "bunched.mcap")
-    assert any("batches of about 4.0" in warning for warning in inspect(tmp_path / "bunched.mcap").warnings)
+    (warning,) = inspect(tmp_path / "bunched.mcap").warnings
+    assert "batches of about 4.0" in warning
     convert(tmp_path / "bunched.mcap", tmp_path / "even.mcap", correct=["stamps"])
     even = read(tmp_path / "even.mcap").imu
     assert np.abs(even.t_ns - made.imu.t_ns).max() < 100_000
