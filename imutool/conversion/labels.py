@@ -13,7 +13,7 @@ from imutool.mcap_io.topics import MESSAGE_POSES
 from imutool.recording import Recording
 from imutool.recording.message_log import KINDS, MessageLog
 
-POSES = (*MESSAGE_POSES, schemas.TF, "geometry_msgs/msg/PoseWithCovarianceStamped")
+POSES = (*MESSAGE_POSES, schemas.TF)
 
 
 @dataclass(frozen=True)

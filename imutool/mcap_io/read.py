@@ -94,7 +94,11 @@ def read_recording(
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
-        other_poses={name: log.topics[name].pose_kind for name in log.pose_topics if name not in truths},
+        other_poses={
+            name: kind
+            for name in log.pose_topics
+            if (kind := log.topics[name].pose_kind) in ("estimate", "odometry") or name not in truths
+        },
     )
 
 

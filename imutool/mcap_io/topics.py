@@ -35,7 +35,7 @@ DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool fr
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
-MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
+MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
 

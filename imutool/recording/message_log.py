@@ -76,7 +76,9 @@ def named_kind(topic: str, schema_name: str) -> str:
     for kind, pattern in KIND_WORDS.items():
         if re.search(rf"(^|_)({pattern})(_|$)", words):
             return kind
-    return "odometry" if re.search(r"[/.]Odometry$", f"/{schema_name}") else "unknown"
+    if re.search(r"[/.]Odometry$", f"/{schema_name}"):
+        return "odometry"
+    return "estimate" if schema_name.endswith("PoseWithCovarianceStamped") else "unknown"  # a filter states its covariance
 
 
 def no_messages() -> Iterator[Message]:

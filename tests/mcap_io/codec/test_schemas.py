@@ -130,7 +130,7 @@ def test_other_writers_messages_decode_exactly(make: Callable[..., bytes], frame
     )
     assert (imu.gyro.tobytes(), imu.accel.tobytes(), imu.frame_id) == (a.tobytes(), b.tobytes(), frame_id)
     assert np.array_equal(imu.stamp_ns, STAMPS)
-    for kind in (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM):
+    for kind in (schemas.POSE, schemas.POSE_COVARIANCE, schemas.ODOMETRY, schemas.TRANSFORM):
         rows = matrix([make(kind, int(s), a[i], q[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
         (pose,) = decode_poses(rows, kind, encoding)
         assert (pose.p_wb.tobytes(), pose.q_wb_wxyz.tobytes()) == (a.tobytes(), q.tobytes())
