@@ -15,18 +15,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imutool.diagnosis.result import Diagnosis
+from imutool.diagnosis.to_noise_file import to_noise_file
 from imutool.diagnosis.to_physics_file import to_physics_file
 from imutool.errors import ConfigError, ImutoolError
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
+from imutool.noise import datasheet
 from imutool.report import json_text
 from imutool.sensor import physics_file
 
 if TYPE_CHECKING:
     from imutool.viewing.model.run_data import RunData
 
-FINDINGS, EFFECT, REPORT, LOG, VIEW = "findings.json", "physics.toml", "report.html", "log.html", "view.rrd"
+FINDINGS, EFFECT, NOISE = "findings.json", "physics.toml", "noise.toml"
+REPORT, LOG, VIEW = "report.html", "log.html", "view.rrd"
 CLOSED = "closed.html"
-FILES = (FINDINGS, EFFECT, REPORT, LOG, VIEW)
+FILES = (FINDINGS, EFFECT, NOISE, REPORT, LOG, VIEW)
 DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
 NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
 
@@ -87,6 +90,9 @@ def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
     (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
     physics_file.write(to_physics_file(d), folder / EFFECT)
+    noise = to_noise_file(d)
+    if noise is not None:
+        datasheet.write(noise, folder / NOISE)
     drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
     if logs is not None:  # before the report, which says where it is
         drawn = {LOG: lambda path: _logs(logs(folder), path)} | drawn

@@ -19,6 +19,7 @@ from filelock import FileLock
 from hypothesis import settings
 
 os.environ["COLUMNS"] = "80"  # the width of the commands' tables, which are made at import
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # small arrays side by side: a second thread of BLAS or torch only waits
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
 
 # a shell starts background jobs with SIGINT ignored, and they pass that on: the tests of Ctrl-C would test nothing

@@ -9,7 +9,7 @@ from pathlib import Path
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
 from imutool.errors import ConfigError
-from imutool.exporting import ExportReport, euroc, rosbag2
+from imutool.exporting import ExportReport, euroc, rosbag2, twin
 from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
@@ -19,7 +19,7 @@ from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
-FORMATS = ("euroc", "rosbag2")
+FORMATS = ("euroc", "rosbag2", *twin.FORMATS)
 Progress = Callable[[int, int], None]  # bytes done, bytes in all
 NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 
@@ -179,14 +179,14 @@ def export(
     overwrite: bool = False,
     progress: NamedProgress | None = None,
 ) -> ExportReport:
-    """Write a log as a EuRoC (ASL) folder or a rosbag2 folder, for programs that read these.
+    """Write a log as a EuRoC (ASL) or rosbag2 folder, or a diagnosed sensor as a simulator's configuration.
 
     Args:
-        log: MCAP log.
+        log: MCAP log; for a simulator the folder of a diagnosis, or a folder of several, whose spread gives the ranges.
         out: Folder to make.
-        format: `euroc` or `rosbag2`.
+        format: `euroc` or `rosbag2`; `mujoco`, `gazebo`, `isaac` or `toml` for a diagnosed sensor.
         imu: IMU topic for a EuRoC folder; by default the debiased one.
-        noise: Data sheet (`adis16448`, `bmi160`) or TOML file for the folder's `sensor.yaml`.
+        noise: Data sheet (`adis16448`, `bmi160`) or TOML file for `sensor.yaml` or a simulator; by default as diagnosed.
         overwrite: Replace an earlier export of the same format.
         progress: Callback with steps done, steps in all, and the current step.
 
@@ -209,6 +209,9 @@ def export(
     tell: NamedProgress = progress or (lambda done, total, word: None)
     if format == "euroc":
         return euroc.write(source, folder, imu, noise, overwrite, tell)
+    if format in twin.FORMATS and imu is None:
+        return twin.write(source, folder, format, noise, overwrite)
     if imu is not None or noise is not None:
-        raise ConfigError("a rosbag2 folder holds the whole log", where="imu, noise", fix="Leave them out")
+        what = "a rosbag2 folder holds the whole log" if format == "rosbag2" else "a diagnosis is of one IMU"
+        raise ConfigError(what, where="imu, noise" if format == "rosbag2" else "imu", fix="Leave it out")
     return rosbag2.write(source, folder, overwrite, tell)

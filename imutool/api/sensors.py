@@ -117,7 +117,7 @@ def diagnose(
         imu: IMU topic; needed where a log has several.
         truth: Topic of the true poses; by default the first.
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
-        output: Folder for `findings.json`, `physics.toml`, `report.html`, `log.html` and `view.rrd`.
+        output: Folder for `findings.json`, `physics.toml`, `noise.toml`, `report.html`, `log.html` and `view.rrd`.
         overwrite: Replace an earlier diagnosis in `output`.
         progress: Callback with steps done, steps in all, and the current step.
 

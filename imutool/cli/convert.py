@@ -114,19 +114,27 @@ def convert(
 
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")
 def export(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="An MCAP log.")],
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="An MCAP log; for a simulator a diagnosis' folder, or a folder of several.")
+    ],
     target: Annotated[Path, typer.Argument(metavar="OUT", help="New folder."), FOLDER],
-    format: Annotated[str, typer.Option(help="euroc: an ASL folder; rosbag2: a folder around a copy of the log.")],
+    format: Annotated[
+        str,
+        typer.Option(
+            help="euroc: an ASL folder; rosbag2: a folder around a copy of the log; mujoco, gazebo, isaac, toml: "
+            "the diagnosed sensor as a simulator's configuration, with ranges."
+        ),
+    ],
     imu: Annotated[str | None, typer.Option(help="IMU topic of a EuRoC folder; by default the debiased one.")] = None,
     noise: Annotated[
-        str | None, typer.Option(metavar="NAME|F.toml", help="Noise for its sensor.yaml: a data sheet or a file.")
+        str | None, typer.Option(metavar="NAME|F.toml", help="Noise for sensor.yaml or a simulator: a data sheet or a file.")
     ] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a log as a EuRoC folder or a rosbag2 folder, for programs that read those."""
+    """Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor as a simulator's configuration."""
     from imutool.api.logs import export as run
 
     with progress("Exporting", verbose, quiet) as tell:
@@ -134,7 +142,7 @@ def export(
     summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
     if write_json(summary, json_to, overwrite=overwrite):
         return
-    counts = ", ".join(f"{count} on {name}" for name, count in report.written.items())
+    counts = ", ".join(name if "." in name else f"{count} on {name}" for name, count in report.written.items())
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))
     if report.left_out:
         say(f"left out: {', '.join(report.left_out)}")

@@ -18,11 +18,14 @@ if TYPE_CHECKING:
     from imutool.diagnosis.result import Diagnosis
     from imutool.viewing.model.run_data import RunData
 
-FOLDER = Written(files=("findings.json", "physics.toml", "report.html", "log.html", "view.rrd"))
+FOLDER = Written(files=("findings.json", "physics.toml", "noise.toml", "report.html", "log.html", "view.rrd"))
 Folder = Annotated[
     Path | None,
     typer.Option(
-        "-o", "--output", metavar="DIR", help="Folder for findings.json, physics.toml, report.html, log.html and view.rrd."
+        "-o",
+        "--output",
+        metavar="DIR",
+        help="Folder for findings.json, physics.toml, noise.toml, report.html, log.html and view.rrd.",
     ),
     FOLDER,
 ]

@@ -19,11 +19,11 @@ from imutool.conversion.table_messages import encode_table, table_topic
 from imutool.errors import ConfigError, DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
-from imutool.mcap_io.codec.encode import encode_float, encode_imu, encode_pose, encode_vector3
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected, reflect
-from imutool.mcap_io.read import RECORD, UNIT_KEY, VELOCITY_KEY
+from imutool.mcap_io.read import RECORD
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
-from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks
+from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks, scalar_series, velocity_series
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageLog, MessageTopic, named_kind
 
@@ -69,7 +69,7 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
         _write_metadata(log, source)
         pairs = SensorPairs(source)
         stream = _Stream(log, source, pairs)
-        groups = [_imus(log, source) + _poses(log, source) + _scalars(log, source), _tables(log, source)]
+        groups = [_imus(log, source) + _poses(log, source) + scalar_series(log, source.scalars, BODY), _tables(log, source)]
         streams: list[Iterator[tuple[Chunk, str | None]]] = [((chunk, None) for chunk in chunks(g)) for g in groups]
         for chunk, packing in heapq.merge(*streams, stream.chunks(), key=lambda item: item[0].start_ns):
             log.chunk(chunk, packing)
@@ -203,22 +203,7 @@ def _poses(log: LogWriter, source: MessageLog) -> list[Series]:
         t_ns, kind = poses.t_ns, {KIND_KEY: source.kinds.get(topic, "unknown")}
         columns = (t_ns, poses.p_wb, poses.q_wb_wxyz)
         series.append(Series(log.channel(topic, schemas.POSE, kind), t_ns, columns, partial(encode_pose, frame_id=WORLD)))
-        if poses.v_w is not None:
-            velocity = {VELOCITY_KEY: topic, UNIT_KEY: "m/s"}
-            channel = log.channel(f"{topic.removesuffix('/pose')}/velocity", schemas.VECTOR3, velocity)
-            series.append(Series(channel, t_ns, (t_ns, poses.v_w), partial(encode_vector3, frame_id=WORLD)))
-    return series
-
-
-def _scalars(log: LogWriter, source: MessageLog) -> list[Series]:
-    series: list[Series] = []
-    for topic, scalars in source.scalars.items():
-        t_ns, values, unit = scalars.t_ns, scalars.values, {UNIT_KEY: scalars.unit}
-        if values.shape[1] == 1:
-            series.append(Series(log.channel(topic, schemas.FLOAT, unit), t_ns, (values[:, 0],), encode_float))
-        else:
-            channel = log.channel(topic, schemas.VECTOR3, unit)
-            series.append(Series(channel, t_ns, (t_ns, values), partial(encode_vector3, frame_id=BODY)))
+        series += velocity_series(log, topic, poses)
     return series
 
 

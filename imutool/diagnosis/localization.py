@@ -21,6 +21,7 @@ from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings
 from imutool.units import AXES, SENSORS
 
+TIMES = ("after", "in the first")  # how a regime of the time begins, above and below its threshold
 Samples = Float64[np.ndarray, "_ k"]
 
 
@@ -159,7 +160,7 @@ def regime(
     variables: Variables,
     settings: LocalizationSettings,
 ) -> tuple[Extent, str]:
-    """Extent of a misfit, and its regime in words: "angular rate above 0.4 rad/s"."""
+    """Extent of a misfit, and its regime in words: "angular rate above 0.4 rad/s", "after 30 s"."""
     high = inside if not inside.all() else power > np.median(power)
     if high.all() or not high.any():
         return "everywhere", "always"
@@ -171,10 +172,19 @@ def regime(
             index, threshold = _youden(sign * level, high)
             p = float(mannwhitneyu(sign * level[high], sign * level[~high], alternative="greater").pvalue) * 2 * len(variables)
             if p < settings.p_value and index > settings.least_youden and (best is None or index > best[0]):
-                best = index, f"{name} {word} {sign * threshold:.2g} {unit}".strip()
+                best = index, _words(name, word, sign * threshold, unit)
     if best is None:
         return ("everywhere", "always") if inside.all() else ("intermittent", "no regime: it comes and goes")
-    return ("everywhere", f"always, most with {best[1]}") if inside.all() else ("regime", best[1])
+    text = best[1]
+    most = "most" if text.startswith(TIMES) else "most with"
+    return ("everywhere", f"always, {most} {text}") if inside.all() else ("regime", text)
+
+
+def _words(name: str, word: str, threshold: float, unit: str) -> str:
+    """A regime in words; of the time it is a part of the log."""
+    if name == "time":
+        return f"{TIMES[word == 'below']} {threshold:.0f} {unit}"
+    return f"{name} {word} {threshold:.2g} {unit}".strip()
 
 
 def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:

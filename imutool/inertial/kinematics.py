@@ -56,15 +56,6 @@ class Motion:
     omega_b: Vectors
     alpha_b: Vectors
 
-    def acceleration(self, r_b: Float[np.ndarray, "3"] | None = None) -> Vectors:
-        """World acceleration (m/s²) of the tracked point, or of the point at `r_b` (m) from it in the body.
-
-        a_w + R_wb (alpha x r + omega x (omega x r)), the rigid-body law.
-        """
-        if r_b is None:
-            return self.a_w
-        return np.asarray(self.a_w + self._rotation().apply(self._lever(r_b)))
-
     def specific_force(self, r_b: Float[np.ndarray, "3"] | None = None, g_w: Float[np.ndarray, "3"] = G_W) -> Vectors:
         """Specific force at `r_b` in the body frame (m/s²): R_wb^T (a_w - g_w); at rest +g up."""
         force = self._rotation().apply(self.a_w - g_w, inverse=True)

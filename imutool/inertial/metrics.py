@@ -60,11 +60,6 @@ def evaluate(estimate: Poses, truth: Poses, valid: Mask, distances_m: Sequence[f
     }
 
 
-def orientation_errors(estimate: Poses, truth: Poses) -> Float64[np.ndarray, " n"]:
-    """Orientation errors at every row, in rad."""
-    return quaternion.angle_between(_unit(estimate), _unit(truth))
-
-
 def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | None]:
     """Absolute errors of orientation, position and velocity: AOE, APE, velocity RMSE.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.writer import Chunk, LogWriter
-from imutool.recording import Frames, Recording
+from imutool.recording import Frames, Poses, Recording, Scalars
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
 WORLD, BODY = "world", "body"
@@ -57,7 +57,7 @@ def write(recording: Recording, path: Location, *, compression: str = "zstd", ov
     """
     with LogWriter(path, compression=compression, overwrite=overwrite) as log:
         _write_metadata(log, recording)
-        groups = [_imu(log, recording), _poses(log, recording), _scalars(log, recording)]
+        groups = [_imu(log, recording), _poses(log, recording), scalar_series(log, recording.scalars, frame_id="")]
         streams: list[Iterator[tuple[Chunk, str | None]]] = [((chunk, None) for chunk in chunks(g)) for g in groups]
         streams += [_images(log, topic, frames) for topic, frames in recording.frames.items()]
         for chunk, packing in heapq.merge(*streams, key=lambda item: item[0].start_ns):
@@ -97,23 +97,28 @@ def _poses(log: LogWriter, recording: Recording) -> list[Series]:
         if which == 0:
             encode = partial(encode_transform, frame_id=WORLD, child_frame_id=BODY)
             found.append(Series(log.channel("/tf", schemas.TF), t_ns, columns, encode))
-        if poses.v_w is not None:
-            velocity = f"{topic.removesuffix('/pose')}/velocity"
-            channel = log.channel(velocity, schemas.VECTOR3, {VELOCITY_KEY: topic, UNIT_KEY: "m/s"})
-            found.append(Series(channel, t_ns, (t_ns, poses.v_w), partial(encode_vector3, frame_id=WORLD)))
+        found += velocity_series(log, topic, poses)
     return found
 
 
-def _scalars(log: LogWriter, recording: Recording) -> list[Series]:
+def velocity_series(log: LogWriter, topic: str, poses: Poses) -> list[Series]:
+    """Velocities of poses, on a topic that names the poses' own."""
+    if poses.v_w is None:
+        return []
+    channel = log.channel(f"{topic.removesuffix('/pose')}/velocity", schemas.VECTOR3, {VELOCITY_KEY: topic, UNIT_KEY: "m/s"})
+    return [Series(channel, poses.t_ns, (poses.t_ns, poses.v_w), partial(encode_vector3, frame_id=WORLD))]
+
+
+def scalar_series(log: LogWriter, scalars: Mapping[str, Scalars], frame_id: str) -> list[Series]:
+    """Topics of one number or of a vector, with their units."""
     found: list[Series] = []
-    for topic, scalars in recording.scalars.items():
-        t_ns, values, unit = scalars.t_ns, scalars.values, {UNIT_KEY: scalars.unit}
+    for topic, numbers in scalars.items():
+        t_ns, values, unit = numbers.t_ns, numbers.values, {UNIT_KEY: numbers.unit}
         if values.shape[1] == 1:
-            channel = log.channel(topic, schemas.FLOAT, unit)
-            found.append(Series(channel, t_ns, (values[:, 0],), encode_float))
+            found.append(Series(log.channel(topic, schemas.FLOAT, unit), t_ns, (values[:, 0],), encode_float))
         else:
-            channel = log.channel(topic, schemas.VECTOR3, unit)
-            found.append(Series(channel, t_ns, (t_ns, values), partial(encode_vector3, frame_id="")))
+            encode = partial(encode_vector3, frame_id=frame_id)
+            found.append(Series(log.channel(topic, schemas.VECTOR3, unit), t_ns, (t_ns, values), encode))
     return found
 
 

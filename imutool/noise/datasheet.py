@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -36,9 +36,53 @@ UNITS = {
 }
 UNKNOWN = "unknown"  # TOML has no null
 
+SAME_RATE = 0.01  # by which two rates may differ and be one
+SETTLED = 4000  # samples in which an autoregression forgets its beginning
+
 Value = Annotated[float, Meta(ge=0.0)]
 Axes = tuple[Value | None, Value | None, Value | None]
 _NONE: Axes = (None, None, None)
+Filters = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+Levels = Annotated[tuple[Value, ...], Meta(min_length=2)]
+
+
+class Colour(Settings, frozen=True, kw_only=True):
+    """Spectrum of the noise, and how its size comes and goes, as recorded at one rate.
+
+    The noise n of an axis is autoregressive, n(k) + a_1 n(k-1) + ... = white, with (a_1, ...) of `gyro` and `accel` (Box and
+    Jenkins, Time Series Analysis, section 3.2); its standard deviation is density * sqrt(rate). In stretches of `window_s` all
+    axes of a sensor are larger or smaller by one factor, drawn from `*_levels`, its quantiles in equal steps of probability.
+    """
+
+    rate_hz: Annotated[float, Meta(gt=0.0)]
+    window_s: Annotated[float, Meta(gt=0.0)]
+    gyro: Filters
+    accel: Filters
+    gyro_levels: Levels
+    accel_levels: Levels
+
+    def holds_at(self, rate_hz: float) -> bool:
+        """Whether samples of this rate can have it."""
+        return abs(self.rate_hz / rate_hz - 1.0) < SAME_RATE
+
+    def shaped(
+        self,
+        white: Float64[np.ndarray, "n 3"],
+        t_s: Float64[np.ndarray, " n"],
+        sensor: Literal["gyro", "accel"],
+        rng: np.random.Generator,
+    ) -> Float64[np.ndarray, "n 3"]:
+        """White noise of standard deviation 1 with this colour, which comes and goes."""
+        from scipy.signal import lfilter
+
+        out, levels = np.empty_like(white), getattr(self, f"{sensor}_levels")
+        for axis, a in enumerate(getattr(self, sensor)):
+            before = white[:SETTLED, axis][::-1]  # its beginning, backwards, in which the filter settles
+            made = lfilter([1.0], [1.0, *a], np.concatenate([before, white[:, axis]]))[len(before) :]
+            out[:, axis] = made / np.linalg.norm(lfilter([1.0], [1.0, *a], np.eye(1, SETTLED)[0]))
+        window = ((t_s - t_s.min()) / self.window_s).astype(int)
+        size = np.interp(rng.uniform(size=int(window.max()) + 1), np.linspace(0.0, 1.0, len(levels)), levels)
+        return np.asarray(out * size[window][:, None])
 
 
 class Noise(Settings, frozen=True, kw_only=True):
@@ -46,7 +90,7 @@ class Noise(Settings, frozen=True, kw_only=True):
 
     `*_density`: white noise; the standard deviation of a sample is density * sqrt(rate). `*_walk`: how far the bias walks,
     walk * sqrt(t) after t seconds. `*_instability`: the B of IEEE 952, whose Allan deviation is flat at 0.664 B.
-    `sources` says in a few words where each comes from.
+    `sources` says in a few words where each comes from. With a `colour` the density is that of the same power, were it white.
     """
 
     gyro_density: Axes = _NONE
@@ -56,6 +100,7 @@ class Noise(Settings, frozen=True, kw_only=True):
     gyro_instability: Axes = _NONE
     accel_instability: Axes = _NONE
     sources: dict[str, str] = msgspec.field(default_factory=dict)
+    colour: Colour | None = None
 
     def values(self, quantity: str) -> Float64[np.ndarray, "3"]:
         """Values of a quantity by axis, NaN if unknown."""
@@ -74,7 +119,7 @@ _DEGREE, _HOUR, _G = np.pi / 180.0, 3600.0, 9.80665  # data sheets write deg, h 
 
 SHEETS: Mapping[str, Noise] = MappingProxyType(
     {
-        "none": Noise(**{name: _each(0.0) for name in UNITS}, sources=dict.fromkeys(UNITS, "none")),
+        "none": build(Noise, {**{name: _each(0.0) for name in UNITS}, "sources": dict.fromkeys(UNITS, "none")}),
         "adis16448": Noise(
             gyro_density=_each(0.66 * _DEGREE / np.sqrt(_HOUR)),
             accel_density=_each(0.11 / np.sqrt(_HOUR)),
@@ -153,6 +198,8 @@ def to_toml(noise: Noise) -> str:
         lines.append(f"{name} = [{axes}]  # {unit}")
     if noise.sources:
         lines += ["", "[sources]", *(f"{_text(key, bare=True)} = {_text(text)}" for key, text in noise.sources.items())]
+    if noise.colour is not None:
+        lines += ["", "[colour]", *(f"{key} = {json.dumps(value)}" for key, value in msgspec.to_builtins(noise.colour).items())]
     return "\n".join([*lines, ""])
 
 
@@ -175,7 +222,8 @@ def write(noise: Noise, path: Path, *, overwrite: bool = False) -> None:
 
 def plain(noise: Noise) -> dict[str, Any]:
     """Noise as plain JSON values, with its units."""
-    return {**{name: list(getattr(noise, name)) for name in UNITS}, "units": dict(UNITS), "sources": dict(noise.sources)}
+    values = {**{name: list(getattr(noise, name)) for name in UNITS}, "units": dict(UNITS), "sources": dict(noise.sources)}
+    return values if noise.colour is None else {**values, "colour": msgspec.to_builtins(noise.colour)}
 
 
-assert set(UNITS) == {field.name for field in msgspec.structs.fields(Noise)} - {"sources"}
+assert set(UNITS) == {field.name for field in msgspec.structs.fields(Noise)} - {"sources", "colour"}

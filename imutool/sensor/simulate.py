@@ -3,7 +3,8 @@
 Poses become a smooth motion (`trajectory`), the motion ideal signals, the effects act on these in the order of their stages
 (`effect`). Noise is added behind the sensor and before its converter; the log holds the samples and the truth.
 White noise has standard deviation density * sqrt(rate), the bias walks by walk * sqrt(dt) a sample from zero (IEEE 952);
-the instability of a data sheet, a floor of the Allan deviation, is not simulated beside a walk.
+the instability of a data sheet, a floor of the Allan deviation, is not simulated beside a walk. A noise with a colour has
+that spectrum at its own rate, and comes and goes as it was recorded.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import IdealMotion, SensorSamples, channels_at
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 from imutool.sensor.unnamed_effects import DRIVEN
+from imutool.units import SENSORS
 
 SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU
@@ -149,7 +151,7 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
             expected=f"{LEAST_S:g} s of poses without a hole, and more",
             fix="Give a longer trajectory",
         )
-    remarks = _remarks(motion, source.truth, noise)
+    remarks = _remarks(motion, source.truth, noise, rate_hz)
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
     needed = _needs_channels(acting)
     if needed:
@@ -211,6 +213,7 @@ def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
     Unknown densities are zero.
     """
     densities = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
+    colour = noise.colour if noise.colour is not None and noise.colour.holds_at(rate_hz) else None
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
         dt = np.diff(samples.stamp_s, prepend=samples.stamp_s[0])[:, None]  # a walk goes on in a hole
@@ -218,14 +221,18 @@ def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
         for k, (name, values) in enumerate((("gyro", samples.gyro), ("accel", samples.accel))):
             white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
             bias = np.cumsum(densities[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
+            if colour is not None:
+                white = colour.shaped(white, samples.stamp_s, SENSORS[k], np.random.default_rng([seed, k, 2]))
             out.append(values + densities[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
         return samples.with_readings(*out)
 
     return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
 
 
-def _remarks(motion: SmoothMotion, poses: Poses, noise: noises.Noise) -> tuple[str, ...]:
+def _remarks(motion: SmoothMotion, poses: Poses, noise: noises.Noise, rate_hz: float) -> tuple[str, ...]:
     remarks = []
+    if noise.colour is not None and not noise.colour.holds_at(rate_hz):
+        remarks.append(f"the colour of the noise is that of {noise.colour.rate_hz:g} Hz, and not simulated at {rate_hz:g} Hz")
     left_out = poses.duration_s - motion.duration_s
     if left_out > 0.05 * poses.duration_s:
         remarks.append(

@@ -2,7 +2,7 @@
 
     python tests/bench/robot_cases.py /tmp/robots --count 40
 
-Each case is drawn by `imutool.blind_cases.robots.cases`, diagnosed as by `imutool diagnose real.mcap --sim sim.mcap`, and
+Each case is drawn by `tests/support/robot_cases`, diagnosed as by `imutool diagnose real.mcap --sim sim.mcap`, and
 compared with its truth. An unnamed case counts as right where the form of the equation is right.
 """
 
@@ -10,12 +10,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from imutool.blind_cases.robots.cases import EFFECTS, ROBOTS, UNNAMED, conceal_robot
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from support.robot_cases.cases import EFFECTS, ROBOTS, UNNAMED, conceal_robot
+
 from imutool.diagnosis.diagnose import diagnose
 
 DEVIATIONS = 3.0

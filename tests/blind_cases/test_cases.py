@@ -85,8 +85,10 @@ POSES = _bench("pose_detectability")
 
 
 def test_the_generator_shares_no_code_with_the_estimator() -> None:
-    modules = [ROOT / "imutool/blind_cases/cases.py", *(ROOT / "imutool/blind_cases").glob("*.py")]
-    assert len(modules) > 8
+    robots = [*(ROOT / "tests/support/robot_cases").glob("*.py")]
+    modules = [*(ROOT / "imutool/blind_cases").glob("*.py"), *robots]
+    assert len(modules) > 12
+    assert len(robots) > 4
     for path in modules:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [n.name for n in node.names] if isinstance(node, ast.Import) else []

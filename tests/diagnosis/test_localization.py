@@ -98,6 +98,12 @@ def test_a_misfit_that_grows_with_a_variable_is_always_there_most_where_that_is_
     assert one.intervals_s == ((0.0, 40.0),)
 
 
+@pytest.mark.parametrize(("rows", "words"), [(T < 23.0, "in the first 23 s"), (T >= 23.0, "after 23 s")])
+def test_a_regime_of_the_time_is_a_part_of_the_log(rows: np.ndarray, words: str) -> None:
+    (one,) = locate(T, acting(4, rows), NOISE, {"time": ("s", T)}, {})
+    assert one.regime == words
+
+
 def test_what_follows_none_of_the_variables_is_given_none() -> None:
     rng = np.random.default_rng(0)
     rows = (rng.random(40) < 0.5)[np.floor(T).astype(int)]

@@ -157,7 +157,8 @@ def test_a_null_case_with_coloured_noise_says_so() -> None:
         ),
         ("intermittent", "no regime: it comes and goes", "The gyro differs off and on: it"),
         ("regime", "when turning", "The gyro differs when turning: it"),
-        ("regime", "time above 30 s", "The gyro differs at time above 30 s: it"),
+        ("regime", "after 30 s", "The gyro differs after 30 s: it"),
+        ("everywhere", "always, most in the first 43 s", "The gyro differs throughout, most in the first 43 s: it"),
         ("regime", "", "The gyro differs: it"),
     ],
 )

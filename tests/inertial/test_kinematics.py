@@ -111,7 +111,6 @@ def test_a_point_of_the_body_feels_what_a_trajectory_of_that_point_feels() -> No
     tracked = follow(p, rotation).at(at)
     directly = follow(lambda t: p(t) + rotation(t).apply(r_b), rotation).at(at)
     np.testing.assert_allclose(tracked.specific_force(r_b), directly.specific_force(), atol=SECOND_DERIVATIVE_TOLERANCE)
-    np.testing.assert_allclose(tracked.acceleration(r_b), directly.a_w, atol=SECOND_DERIVATIVE_TOLERANCE)
 
 
 def test_derivatives_of_an_unnormalised_quaternion_spline_match_differences_of_its_rotations() -> None:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
-import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.evo import statistics
 from support.nees import consistency
 
 from imutool.errors import ConfigError, DataError, NumericsError
@@ -68,8 +67,6 @@ def everything(poses: Poses) -> np.ndarray:
 
 # --- evo ---------------------------------------------------------------------------------------------------------------
 
-EVO = Path(sys.executable).parent
-
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Poses, Poses, np.ndarray, Path]:
@@ -83,53 +80,42 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Poses, Poses, np.nda
     return estimate, truth, valid, folder
 
 
-def evo(command: str, folder: Path, *words: str) -> dict[str, float]:
-    """Statistics that evo's own command writes; its settings go to the folder, not to the user's home."""
-    if not (EVO / command).exists():
-        pytest.skip(f"{command} is not installed beside {sys.executable}")
-    result = folder / f"{'_'.join([command, *words]).replace('-', '')}.zip"
-    subprocess.run(
-        [EVO / command, "tum", "ref.txt", "est.txt", *words, "--save_results", result, "--no_warnings"],
-        cwd=folder,
-        env={**os.environ, "HOME": str(folder), "MPLBACKEND": "agg"},
-        check=True,
-        capture_output=True,
-        timeout=120,
-    )
-    with zipfile.ZipFile(result) as archive:
-        stats = json.loads(archive.read("stats.json"))
-    assert isinstance(stats, dict)
-    return stats
+ABSOLUTE = {
+    "aoe_deg": ("-r", "angle_deg"),
+    "ape_m": ("-r", "trans_part"),
+    "aoe_aligned_deg": ("--align", "-r", "angle_deg"),
+    "ape_aligned_m": ("--align", "-r", "trans_part"),
+}
+RELATIVE = {
+    (figure, distance_m): ("-r", word, "--delta", distance_m, "--delta_unit", "m", "--all_pairs", "--pairs_from_reference")
+    for figure, word in (("roe_deg", "angle_deg"), ("rpe_m", "trans_part"))
+    for distance_m in ("5", "20")
+}
 
 
-@pytest.mark.parametrize(
-    ("figure", "words"),
-    [
-        ("aoe_deg", ("-r", "angle_deg")),
-        ("ape_m", ("-r", "trans_part")),
-        ("aoe_aligned_deg", ("--align", "-r", "angle_deg")),
-        ("ape_aligned_m", ("--align", "-r", "trans_part")),
-    ],
-)
-def test_absolute_figures_equal_those_of_evo(
-    pair: tuple[Poses, Poses, np.ndarray, Path], figure: str, words: tuple[str, ...]
-) -> None:
-    estimate, truth, valid, folder = pair
+@pytest.fixture(scope="module")
+def evos(pair: tuple[Poses, Poses, np.ndarray, Path]) -> dict[str | tuple[str, str], dict[str, float]]:
+    """evo's statistics of the pair, by our names of the figures."""
+    lines = [("ape", *words) for words in ABSOLUTE.values()] + [("rpe", *words) for words in RELATIVE.values()]
+    return dict(zip([*ABSOLUTE, *RELATIVE], statistics(pair[3], lines), strict=True))
+
+
+@pytest.mark.parametrize("figure", ABSOLUTE)
+def test_absolute_figures_equal_those_of_evo(pair: tuple[Poses, Poses, np.ndarray, Path], evos: Any, figure: str) -> None:
+    estimate, truth, valid, _ = pair
     got = absolute(estimate, truth, valid)[figure]
-    assert got == pytest.approx(evo("evo_ape", folder, *words)["rmse"], rel=EVO_TOLERANCE)
+    assert got == pytest.approx(evos[figure]["rmse"], rel=EVO_TOLERANCE)
     assert got is not None
     assert got > 0.1  # an error there is to measure
 
 
-@pytest.mark.parametrize(("figure", "relation"), [("roe_deg", "angle_deg"), ("rpe_m", "trans_part")])
-@pytest.mark.parametrize("distance_m", ["5", "20"])
+@pytest.mark.parametrize(("figure", "distance_m"), RELATIVE)
 def test_relative_figures_equal_those_of_evo(
-    pair: tuple[Poses, Poses, np.ndarray, Path], figure: str, relation: str, distance_m: str
+    pair: tuple[Poses, Poses, np.ndarray, Path], evos: Any, figure: str, distance_m: str
 ) -> None:
-    estimate, truth, valid, folder = pair
-    words = ("-r", relation, "--delta", distance_m, "--delta_unit", "m", "--all_pairs", "--pairs_from_reference")
+    estimate, truth, valid, _ = pair
     got = relative(estimate, truth, valid)[figure][distance_m]
-    assert got == pytest.approx(evo("evo_rpe", folder, *words)["mean"], rel=EVO_TOLERANCE)
+    assert got == pytest.approx(evos[figure, distance_m]["mean"], rel=EVO_TOLERANCE)
     assert got is not None
     assert got > 0.1
 

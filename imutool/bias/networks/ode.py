@@ -71,10 +71,6 @@ class HermitePath:
         start_rise, rise = self._slope[..., i, :] * h, self._rise[..., i, :]
         return ((1 - s) * (1 - 3 * s) * start_rise + s * (4 - 3 * s) * rise) / h
 
-    def at_knots(self) -> tuple[Float[Tensor, "*batch n k"], Float[Tensor, "*batch n k"]]:
-        """Values and slopes at all knots without a search, for a solver that steps from knot to knot."""
-        return self.u, self._slope
-
     def _locate(self, t: Float[Tensor, "*m"]) -> tuple[Tensor, Float[Tensor, "*m 1"], Float[Tensor, "*m 1"]]:
         """Interval index, position in the interval from 0 to 1, and its length, by binary search."""
         inside = t.to(self.t.dtype).clamp(self.t[0], self.t[-1])

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.interpolate import make_interp_spline
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import label, maximum, uniform_filter1d
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +29,7 @@ from imutool.sensor.samples import IdealMotion, channels_at
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
 MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there are at least
 TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
+MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and power that chance does not reach in any band
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
@@ -202,7 +203,7 @@ def rotation_matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
 def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DEFAULT.alignment) -> Float64[np.ndarray, " n"]:
     """Wiener filter: multiply each frequency by 1 - noise / power.
 
-    The top of the spectrum shows the white noise.
+    The top of the spectrum shows the white noise. Bands in which nothing stands clearly above it are chance, and go.
     """
     n = len(x)
     if nothing_but_noise(x):  # its ends would be taken for a ramp
@@ -213,7 +214,11 @@ def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DE
     power = uniform_filter1d(np.abs(spectrum) ** 2, settings.smoothed_bins, mode="nearest")
     floor = float(np.median(power[int(settings.noise_band * len(power)) :]))
     gain = np.clip(1.0 - floor / np.maximum(power, 1e-300), 0.0, 1.0)
-    gain[power < 2.0 * floor] = 0.0  # what is noise for the most part goes altogether
+    gain[power < MOSTLY * floor] = 0.0  # what is noise for the most part goes altogether
+    bands, count = label(gain > 0.0)
+    if count:
+        highest = maximum(power, bands, np.arange(count + 1))
+        gain[highest[bands] < CLEARLY * floor] = 0.0
     return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
 
 

@@ -21,7 +21,8 @@ from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
-from imutool.viewing.stream.sources import Malformed, Sample, Samples
+from imutool.viewing.stream.samples import Malformed, Sample
+from imutool.viewing.stream.sources import Samples
 from imutool.viewing.stream.statistics import Delay, StreamStatistics
 
 START_S = 2.0  # of the stream, from which the start bias is taken

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from imutool.blind_cases.robots import arm as robot_arm
-from imutool.blind_cases.robots import vehicle as robot_vehicle
-from imutool.blind_cases.robots.log import write
+from support.robot_cases import arm as robot_arm
+from support.robot_cases import vehicle as robot_vehicle
+from support.robot_cases.log import write
 
 Generator = np.random.Generator
 Planted = tuple[str, str, Mapping[str, float]]  # effect, column, parameters that the diagnosis should find

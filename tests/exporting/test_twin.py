@@ -1,0 +1,149 @@
+"""A twin in a simulator's own words: each format is read by its own parser, and holds the physics with its sign and range."""
+
+from __future__ import annotations
+
+import sys
+import types
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.api.logs import export
+from imutool.errors import ConfigError
+from imutool.noise import datasheet
+from imutool.noise.datasheet import Colour, Noise
+from imutool.sensor import physics_file
+from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
+
+PHI, ARM, RATE_HZ = (0.1, -0.2, 0.3), (0.05, -0.02, 0.01), 250.0
+NOISE = Noise(
+    gyro_density=(1e-3, 2e-3, 3e-3),
+    accel_density=(1e-2, 1e-2, 1e-2),
+    gyro_walk=(1e-5, 1e-5, 1e-5),
+    colour=Colour(
+        rate_hz=RATE_HZ,
+        window_s=1.0,
+        gyro=((-0.9,), (0.0,), (0.5,)),
+        accel=((0.0,), (0.0,), (0.0,)),
+        gyro_levels=(0.5, 1.0, 1.5),
+        accel_levels=(1.0, 1.0),
+    ),
+)
+
+
+def diagnosed(folder: Path, *, arm_x: float = ARM[0], bias_x: float = 0.01) -> Path:
+    """The folder of a diagnosis: a mount, an arm, digits, a limit and a scale."""
+    entries = {
+        "lever_arm": {"x": (arm_x, "m"), "y": (ARM[1], "m"), "z": (ARM[2], "m")},
+        "mount_rotation": {f"phi_{axis}": (v, "rad") for axis, v in zip("xyz", PHI, strict=True)},
+        "quantization": {"gyro_lsb": (0.001, "rad/s")},
+        "saturation": {"accel_limit": (40.0, "m/s²")},
+        "gyro_scale": {"x": (0.02, "-")},
+    }
+    effects = tuple(
+        Entry(name=name, parameters={k: Value(value=v, std=0.001, unit=unit) for k, (v, unit) in values.items()})
+        for name, values in entries.items()
+    )
+    folder.mkdir(parents=True)
+    physics_file.write(PhysicsFile(effect=effects, bias=Bias(gyro=(bias_x, 0.0, -0.02))), folder / "physics.toml")
+    datasheet.write(NOISE, folder / "noise.toml")
+    return folder
+
+
+def test_mujoco_loads_the_site_the_sensors_and_the_ranges(tmp_path: Path) -> None:
+    report = export(diagnosed(tmp_path / "d"), tmp_path / "out", format="mujoco")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "imu.xml"))
+    np.testing.assert_allclose(model.site_pos[0], ARM, atol=1e-8)
+    np.testing.assert_allclose(model.site_quat[0], Rotation.from_rotvec(PHI).as_quat(scalar_first=True), atol=1e-8)
+    assert model.sensor_cutoff.tolist() == [0.0, 40.0]
+    np.testing.assert_allclose(model.sensor_noise[1], 1e-2 * np.sqrt(RATE_HZ))
+    scale = model.numeric("imu.gyro_scale.x").data
+    np.testing.assert_allclose(scale, (0.02, 0.018, 0.022))
+    np.testing.assert_allclose(model.numeric("imu.gyro_noise.y").data, 2e-3 * np.sqrt(RATE_HZ) * np.array([1.0, 0.5, 1.5]))
+    assert report.left_out == ["quantization", "gyro_scale", "the colour of the noise"]
+
+
+def test_mujocos_own_sensor_reads_what_the_forward_model_says(tmp_path: Path) -> None:
+    """A body that rests: the turned accelerometer reads R_bi^T g up."""
+    export(diagnosed(tmp_path / "d"), tmp_path / "out", format="mujoco")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "imu.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.sensordata[3:], Rotation.from_rotvec(PHI).inv().apply([0.0, 0.0, 9.81]), atol=1e-6)
+
+
+def test_gazebo_has_pose_noise_walk_and_digits_by_axis(tmp_path: Path) -> None:
+    export(diagnosed(tmp_path / "d"), tmp_path / "out", format="gazebo")
+    sensor = ElementTree.parse(tmp_path / "out" / "imu.sdf").getroot().find("model/link/sensor")
+    assert sensor is not None
+    pose = np.array([float(x) for x in (sensor.findtext("pose") or "").split()])
+    np.testing.assert_allclose(pose[:3], ARM, atol=1e-8)
+    np.testing.assert_allclose(Rotation.from_euler("xyz", pose[3:]).as_rotvec(), PHI, atol=1e-7)
+    noise = sensor.find("imu/angular_velocity/z/noise")
+    assert noise is not None
+    assert noise.get("type") == "gaussian_quantized"
+    read = {element.tag: float(element.text or "") for element in noise}
+    assert read["mean"] == -0.02
+    assert read["bias_mean"] == 0.0  # Gazebo draws its sign
+    assert read["precision"] == 0.001
+    assert read["dynamic_bias_stddev"] == 1e-5
+    np.testing.assert_allclose(read["stddev"], 3e-3 * np.sqrt(RATE_HZ), rtol=1e-6)
+
+
+class Recorded:
+    """Stands for a class of Isaac Lab, which does not install here: it keeps what it is made of."""
+
+    def __init__(self, **values: Any) -> None:
+        self.values = values
+
+    class OffsetCfg:
+        """Nested as in `ImuCfg`."""
+
+        def __init__(self, pos: tuple[float, ...], rot: tuple[float, ...]) -> None:
+            self.pos, self.rot = pos, rot
+
+
+def test_isaac_is_python_with_the_classes_of_isaac_lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(diagnosed(tmp_path / "d"), tmp_path / "out", format="isaac")
+    for name, classes in {
+        "isaaclab": (),
+        "isaaclab.sensors": ("ImuCfg",),
+        "isaaclab.utils": (),
+        "isaaclab.utils.noise": ("GaussianNoiseCfg", "NoiseModelWithAdditiveBiasCfg", "UniformNoiseCfg"),
+    }.items():
+        module = types.ModuleType(name)
+        for one in classes:
+            setattr(module, one, Recorded)
+        monkeypatch.setitem(sys.modules, name, module)
+    made: dict[str, Any] = {}
+    exec(compile((tmp_path / "out" / "imu.py").read_text(), "imu.py", "exec"), made)
+    assert made["IMU"].values["offset"].pos == ARM
+    assert made["IMU"].values["update_period"] == 1.0 / RATE_HZ
+    bias = made["GYRO_NOISE"].values["bias_noise_cfg"].values
+    np.testing.assert_allclose(bias["n_min"].numpy(), (0.01, 0.0, -0.02), rtol=1e-6)
+    assert made["RANGES"]["gyro_scale.x"] == pytest.approx((0.018, 0.022))
+
+
+def test_a_fleet_gives_means_and_ranges(tmp_path: Path) -> None:
+    for k, x in enumerate((0.04, 0.05, 0.06)):
+        diagnosed(tmp_path / "fleet" / f"robot_{k}", arm_x=x, bias_x=0.01 * k)
+    export(tmp_path / "fleet", tmp_path / "out", format="toml")
+    file = physics_file.read(tmp_path / "out" / "physics.toml")
+    arm = next(entry for entry in file.effect if entry.name == "lever_arm").parameters["x"]
+    assert arm.value == pytest.approx(0.05)
+    assert arm.std == pytest.approx(np.hypot(0.01, 0.001))
+    assert file.bias is not None
+    assert file.bias.gyro[0] == pytest.approx(0.01)
+    assert datasheet.read(tmp_path / "out" / "noise.toml") == NOISE
+
+
+def test_what_is_no_diagnosis_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no diagnosis"):
+        export(tmp_path, tmp_path / "out", format="gazebo")
+    with pytest.raises(ConfigError, match="one IMU"):
+        export(diagnosed(tmp_path / "d"), tmp_path / "out", format="gazebo", imu="/imu0")
