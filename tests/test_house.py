@@ -42,6 +42,7 @@ TIERS = (
     ("fleet",),
     ("api",),
     ("cli",),
+    ("__main__",),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
 FOR_CONVERTERS = {"converters", "errors", "geometry", "recording", "bag"}
