@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +23,14 @@ class Truth(NamedTuple):
     q_wb_wxyz: Float64[np.ndarray, "n 4"]
 
 
-def read_truth(log: Log, refused: Callable[[str, LogError], None] | None = None) -> Truth | None:
-    """Poses of the log's first readable pose topic; None with fewer than three poses.
+def read_truth(
+    log: Log, refused: Callable[[str, LogError], None] | None = None, topics: Sequence[str] | None = None
+) -> Truth | None:
+    """Poses of the first readable one of some topics, by default of the true ones; None with fewer than three poses.
 
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
-    for topic in log.truth_topics:
+    for topic in log.truth_topics if topics is None else topics:
         times, places, turns = [], [], []
         last = -(2**62)
         try:
