@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.joined_imu import whole_of
+from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
 from imutool.mcap_io.read import RECORD
 from imutool.mcap_io.topics import MESSAGE_POSES
 from imutool.recording import Recording
@@ -73,3 +73,14 @@ def parse_kinds(texts: Sequence[str]) -> tuple[tuple[str, str], ...]:
             raise ConfigError(f"{text!r}", where="kinds", expected=f"TOPIC=KIND with one of {', '.join(KINDS)}")
         kinds.append((topic, kind))
     return tuple(kinds)
+
+
+def parse_pair(text: str) -> tuple[str, str] | None:
+    """Topics of `gyro=/a,accel=/b`; None of an empty text.
+
+    Raises:
+        ConfigError: any other text.
+    """
+    if (parts := parse_parts(text)) is None and text:
+        raise ConfigError(f"{text!r}", where="imu", expected="gyro=TOPIC,accel=TOPIC")
+    return parts

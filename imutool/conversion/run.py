@@ -13,10 +13,9 @@ from pathlib import Path
 from types import ModuleType
 
 from imutool import registry
-from imutool.conversion.labels import Labels, parse_kinds
+from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError
-from imutool.mcap_io.codec.joined_imu import parse_parts
 from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -90,10 +89,7 @@ def convert(
             be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    parts = parse_parts(imu)
-    if imu and parts is None:
-        raise ConfigError(f"{imu!r}", where="imu", expected="gyro=TOPIC,accel=TOPIC")
-    labels = Labels(sensor, parse_kinds(kinds), parts)
+    labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, labels, compression, images, overwrite, progress)
     source_sequences = _find(source, format)
