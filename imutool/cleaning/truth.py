@@ -26,7 +26,7 @@ class Truth(NamedTuple):
 def read_truth(
     log: Log, refused: Callable[[str, LogError], None] | None = None, topics: Sequence[str] | None = None
 ) -> Truth | None:
-    """Poses of the first readable one of some topics, by default of the true ones; None with fewer than three poses.
+    """Poses of the first readable topic of the true ones, or of `topics`; None below three.
 
     `refused` is called with each topic before it that cannot be read, and with the error.
     """

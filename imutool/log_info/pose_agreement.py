@@ -1,4 +1,4 @@
-"""How well poses follow the gyroscope: the turns between them against the mean rates that it measured."""
+"""Turns between poses against the mean rates that the gyroscope measured."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 
 
 class Agreement(NamedTuple):
-    """Rms (rad/s) of what the poses do not explain of the gyro, and the share of its motion that they do."""
+    """Rms (rad/s) of the gyro that the poses leave unexplained, and the share that they explain."""
 
     rms_rad_s: float
     explained: float

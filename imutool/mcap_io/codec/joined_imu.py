@@ -1,4 +1,4 @@
-"""Gyroscope and accelerometer on topics of their own, joined to one IMU while the gyroscope's messages are read."""
+"""Gyroscope and accelerometer on topics of their own, joined to one IMU as they are read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Vectors(NamedTuple):
 
 @dataclass(frozen=True)
 class JoinedImu:
-    """Messages of a gyroscope as those of an IMU, with the accelerations interpolated at their stamps."""
+    """Messages of a gyroscope as those of an IMU, with the accelerations at their stamps."""
 
     cut_gyro: Callable[[Messages, Bool[np.ndarray, " n"]], Cut]
     rates: Callable[[Rows], Iterator[Vectors]]
