@@ -72,7 +72,10 @@ def minutes(recordings: list[Recording], starts: list[str], words: list[str]) ->
         scores = [np.mean([values[k] for k in others]) for values in (raw, static)]
         scores += [np.mean([aoe(model, recordings[k], start) for k in others]) for start in starts]
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
-        print(f"| {minute_of.name} | {' | '.join(f'{score:.2f}' for score in scores)} | {found} |", flush=True)
+        print(
+            f"| {minute_of.name} | {' | '.join('–' if np.isnan(score) else f'{score:.2f}' for score in scores)} | {found} |",
+            flush=True,
+        )
 
 
 def at_rest(recording: Recording) -> float:
