@@ -14,6 +14,7 @@ from imutool import __version__, registry
 from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias_start.stretches import measured_recording
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
@@ -60,7 +61,7 @@ def train(
 
     Raises:
         ConfigError: the target exists, unknown method or settings, or a checkpoint of another training.
-        LogError, DataError: a log without IMU or truth, different rates, too little to train on.
+        ConfigError, LogError, DataError: a log without IMU, measurements or truth, different rates, too little to train on.
         NumericsError: the loss diverged.
     """
     if out.exists() and not overwrite:
@@ -81,7 +82,7 @@ def train(
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
-    recordings = [read(log, imu=imu, truth=truth) for log in logs]
+    recordings = [measured_recording(read(log, imu=imu, truth=truth)) for log in logs]
     check_trainable(recordings, Pool.of(recordings))
     say = progress or (lambda epoch: None)
     descent = _Descent(kept, resume, device, say)
