@@ -179,7 +179,7 @@ def export(
     overwrite: bool = False,
     progress: NamedProgress | None = None,
 ) -> ExportReport:
-    """Write a log as a EuRoC (ASL) or rosbag2 folder, or a diagnosed sensor as a simulator's configuration.
+    """Write a log as a EuRoC (ASL) or rosbag2 folder, or a sensor for a simulator.
 
     Args:
         log: MCAP log; for a simulator the folder of a diagnosis, or a folder of several, whose spread gives the ranges.

@@ -9,8 +9,8 @@ from jaxtyping import Bool
 
 from imutool.cleaning.first_pass import Survey, raw_batches
 from imutool.errors import LogError
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import ImuBatch
 
 
 class Cleaner:

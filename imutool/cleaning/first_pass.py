@@ -21,8 +21,8 @@ from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import ImuBatch
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.units import SENSORS
 
@@ -264,10 +264,10 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
     Raises:
         LogError: no such IMU topic, another encoding, or damage.
     """
-    log.topic(topic, (schemas.IMU,))
-    for _, rows in log.rows([topic], start_ns, end_ns):
-        with log.named(topic):
-            yield from log.topics[topic].decode_imu(rows)
+    described = log.topic(topic, (schemas.IMU,))
+    for _, rows in log.rows([described.name], start_ns, end_ns):
+        with log.named(described.name):
+            yield from described.decode_imu(rows)
 
 
 def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:

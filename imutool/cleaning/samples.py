@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import nanoseconds
 
 BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not on how its chunks were cut

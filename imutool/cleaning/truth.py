@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,12 +27,14 @@ class Truth(NamedTuple):
     kind: str = "truth"
 
 
-def read_truth(log: Log, refused: Callable[[str, LogError], None] | None = None) -> Truth | None:
-    """Poses of the log's first readable pose topic; None with fewer than three poses.
+def read_truth(
+    log: Log, refused: Callable[[str, LogError], None] | None = None, topics: Sequence[str] | None = None
+) -> Truth | None:
+    """Poses of the first readable topic of the true ones, or of `topics`; None below three.
 
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
-    for topic in log.truth_topics:
+    for topic in log.truth_topics if topics is None else topics:
         times, places, turns = [], [], []
         last = -(2**62)
         try:

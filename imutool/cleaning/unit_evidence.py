@@ -86,11 +86,12 @@ def rate_ratio(motion: Motion, truth: Truth) -> float | None:
     """
     first, last, rate = turning(truth)
     step, mean = motion.table()
+    if not len(step):
+        return None
     t_s, steps_s = seconds(first, motion.start_ns or 0) + 0.5 * seconds(last - first, 0), 0.1 * step + 0.05
     true, measured = (np.linalg.norm(values - np.median(values, axis=0), axis=1) for values in (rate, mean[:, :3]))
     turns = (true > MIN_TURN_RAD_S) & (last - first < POSES_APART_NS)
-    if len(step):
-        turns &= (t_s >= steps_s[0]) & (t_s <= steps_s[-1])
-    if not len(step) or turns.sum() < FEWEST_TURNS:
+    turns &= (t_s >= steps_s[0]) & (t_s <= steps_s[-1])
+    if turns.sum() < FEWEST_TURNS:
         return None
     return float(np.median(np.interp(t_s[turns], steps_s, measured)) / np.median(true[turns]))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import HTML, LOG, LOST, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.app import HTML, LOG, LOST, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
 from imutool.location import to_location
@@ -27,7 +27,7 @@ def clean(
     source: Annotated[str, typer.Argument(metavar="LOG", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
     target: Annotated[str | None, typer.Argument(metavar="OUT", help="New log with a clean, debiased IMU topic."), LOG] = None,
     model: Annotated[str | None, typer.Option(help="For OUT: model file, physics.toml or a name that ships.")] = None,
-    imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
+    imu: Imus = None,
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="Run only this rule. Repeatable.")] = None,
     no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Skip this rule. Repeatable.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write OUT even if the log cannot be trusted.")] = False,

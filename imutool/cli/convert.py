@@ -145,7 +145,7 @@ def export(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor as a simulator's configuration."""
+    """Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."""
     from imutool.api.logs import export as run
 
     with progress("Exporting", verbose, quiet) as tell:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 # A test compares names and texts with the commands themselves. The order is that of the page.
 COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the first line of the command's help
     "convert": ("convert", "Convert any recording with an IMU to MCAP; its content tells the format."),
-    "export": ("convert", "Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor as a simulator's configuration."),
+    "export": ("convert", "Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."),
     "new-converter": ("convert", "Write a template of a converter, with a test, as a package of its own."),
     "info": ("info", "Report the topics, quality and damage of a log; with --noise, also its IMU noise."),
     "repair": ("repair", "Save the intact messages of a damaged log or ROS 1 bag, and report the losses."),

@@ -14,7 +14,7 @@ from types import ModuleType
 
 from imutool import registry
 from imutool.conversion.corrections import parse_corrections
-from imutool.conversion.labels import Labels, parse_kinds, parse_parts
+from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.storage.system import processors
@@ -91,7 +91,7 @@ def convert(
         ConfigError: unknown format, sequence or correction, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    labels, corrected = Labels(sensor, parse_kinds(kinds), parse_parts(imu)), parse_corrections(correct)
+    labels, corrected = Labels(sensor, parse_kinds(kinds), parse_pair(imu)), parse_corrections(correct)
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)

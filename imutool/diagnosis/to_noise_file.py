@@ -20,7 +20,7 @@ QUANTILES = 11
 
 
 def to_noise_file(d: Diagnosis) -> Noise | None:
-    """Noise with its colour, of all logs; None where the diagnosis has no samples of an IMU, or none that vary."""
+    """Noise with its colour, of all logs; None without samples of an IMU that vary."""
     if not d.traces:
         return None
     rate_hz = 1.0 / float(np.median([np.median(np.diff(trace.t_s)) for trace in d.traces]))

@@ -105,6 +105,8 @@ class TruthInfo(Section, frozen=True):
     longest_gap_s: float = 0.0
     starts_after_s: float | UnsetType = UNSET
     ends_before_s: float | UnsetType = UNSET
+    gyro_rms_rad_s: float | UnsetType = UNSET  # what the poses do not explain of the log's first gyro
+    gyro_explained: float | UnsetType = UNSET  # share of its motion that they do
 
 
 class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):

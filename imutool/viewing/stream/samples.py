@@ -1,4 +1,4 @@
-"""Samples of a live stream, and how a message holds one: in JSON, or as a sensor_msgs/Imu in JSON or CDR."""
+"""Samples of a live stream, and how a message holds one, in JSON or CDR."""
 
 from __future__ import annotations
 
