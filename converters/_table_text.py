@@ -1,4 +1,4 @@
-"""Columns of numbers, and tables of text: delimiters, headers, units, decimals, calendar times.
+"""Columns of numbers and tables of text: delimiters, headers, units, calendar times.
 
 A matrix of three columns `gyro` becomes the columns `gyro[0]`, `gyro[1]`, `gyro[2]`, whichever way it lies.
 """
@@ -30,7 +30,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass
 class Columns:
-    """Columns by name, the units that stand beside them, rotation matrices, the texts of decimals, and remarks."""
+    """Columns by name, with units, rotation matrices, the texts of decimals, and remarks."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)

@@ -12,6 +12,7 @@ import typer
 
 from imutool.cli.app import RRD, Imu, Json, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import err, log_to_stderr, plain, say, tell_warning, write_json
+from imutool.errors import ConfigError
 from imutool.report import Report
 from imutool.viewing import Output
 from imutool.viewing.stream.statistics import StreamStatistics
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from imutool.viewing.rerun.live import Live
-    from imutool.viewing.stream.sources import Sample
+    from imutool.viewing.stream.samples import Sample
 
-FROM_HELP = "A log at its own speed, stdin (JSON lines), udp://HOST:PORT, or rosbridge://HOST:PORT/TOPIC."
+FROM_HELP = "stdin (JSON lines), udp://HOST:PORT, zenoh://[HOST:PORT]/KEY, rosbridge://HOST:PORT/TOPIC, or a log."
 MODEL_HELP = "Model file, a name that ships, or static: the bias at rest in the first two seconds."
 
 
@@ -37,7 +38,8 @@ class LiveReport(Report, frozen=True, tag="imutool.live/1"):
 
 @app.command(epilog="Example: [bold]imutool live --from udp://127.0.0.1:5005 --model m.safetensors[/]")
 def live(
-    source: Annotated[str, typer.Option("--from", metavar="SOURCE", help=FROM_HELP, show_default=False)],
+    log: Annotated[str | None, typer.Argument(metavar="[LOG]", help="An MCAP log to replay at its own speed.")] = None,
+    source: Annotated[str | None, typer.Option("--from", metavar="SOURCE", help=FROM_HELP, show_default=False)] = None,
     model: Annotated[str, typer.Option(help=MODEL_HELP)] = "static",
     imu: Imu = None,
     speed: Annotated[float, typer.Option(min=0.01, help="Speed of a log, times its own.")] = 1.0,
@@ -53,27 +55,32 @@ def live(
 ) -> None:
     """Debias a stream of samples as it comes, show it, and measure the delay.
 
-    A sample is a line of JSON: t_ns (or t_s), gyro in rad/s, accel in m/s², each of three numbers.
+    A sample is a line of JSON: t_ns (or t_s), gyro in rad/s, accel in m/s², each of three numbers. Zenoh also carries
+    sensor_msgs/Imu in CDR.
     """
     from imutool.api.models import load_model
+    from imutool.viewing.stream.samples import Malformed
     from imutool.viewing.stream.session import run
-    from imutool.viewing.stream.sources import Malformed, open_source
+    from imutool.viewing.stream.sources import open_source
 
     log_to_stderr(verbose, quiet)
     malformed = Malformed()
+    origin = source or log
+    if origin is None or (source and log):
+        raise ConfigError("one source is needed", where="live", expected="a log, or --from SOURCE")
     found = load_model(model)
-    samples = open_source(source, malformed, imu=imu, speed=speed)
-    with _view(source, connect, save, overwrite) if not no_view else nullcontext() as show:
+    samples = open_source(origin, malformed, imu=imu, speed=speed)
+    with _view(connect, save, overwrite) if not no_view else nullcontext() as show:
         stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds)
     shown = [] if show is None else show.shown
     if malformed.count:
         tell_warning(f"{malformed.count} messages hold no sample, the first: {malformed.first}")
-    if not write_json(LiveReport(source, model, stream, shown), json_to, overwrite=overwrite):
+    if not write_json(LiveReport(origin, model, stream, shown), json_to, overwrite=overwrite):
         for line in _lines(stream, shown):
             err.print(plain(line), highlight=False, soft_wrap=True) if to_stdout else say(line)
 
 
-def _view(source: str, connect: str | None, save: Path | None, overwrite: bool) -> AbstractContextManager[Live]:
+def _view(connect: str | None, save: Path | None, overwrite: bool) -> AbstractContextManager[Live]:
     from imutool.viewing.rerun.live import live_view
 
     return live_view("live", connect_to=connect, save=save, instead=Path("live.rrd"), overwrite=overwrite)

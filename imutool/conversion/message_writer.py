@@ -12,24 +12,28 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from jaxtyping import Shaped, UInt8
 
 import imutool
 from imutool.conversion.sensor_pairs import SensorPairs
-from imutool.conversion.table_messages import encode_table, table_topic
 from imutool.errors import ConfigError, DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected, reflect
 from imutool.mcap_io.read import RECORD
-from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY, named_kind
+from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks, scalar_series, velocity_series
 from imutool.mcap_io.writer import Chunk, LogWriter
-from imutool.recording.message_log import MessageLog, MessageTopic
+from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind
 
 BULKY = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 SENSORS = (schemas.IMU, schemas.VECTOR3, schemas.TF, schemas.FLOAT, *MESSAGE_POSES)
 PACKED = ("sensor_msgs/msg/CompressedImage",)  # compressing these again costs time and saves nothing
+ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
+    f"{sign}{size}": f"{name}{8 * size}" for sign, name in (("i", "int"), ("u", "uint")) for size in (1, 2, 4, 8)
+}
+ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
 
 
 _encode_body = partial(encode_imu, frame_id=BODY)
@@ -209,9 +213,45 @@ def _poses(log: LogWriter, source: MessageLog) -> list[Series]:
 
 def _tables(log: LogWriter, source: MessageLog) -> list[Series]:
     return [
-        Series(log.define(table_topic(topic, table)), table.t_ns, (table.columns,), encode_table)
+        Series(log.define(_table_topic(topic, table)), table.t_ns, (table.columns,), _encode_table)
         for topic, table in source.tables.items()
     ]
+
+
+def _table_topic(name: str, table: Table) -> MessageTopic:
+    """Topic of a table, with the definition of its messages."""
+    lines = []
+    for column, (kind, shape) in _fields(table.columns.dtype).items():
+        size = "".join(f"[{count}]" for count in shape)
+        lines.append(f"{ROS_NAMES[kind.str[1:]]}{size} {column}\n")
+    return MessageTopic(name, table.schema_name, "ros2msg", "".join(lines).encode(), "cdr")
+
+
+def _encode_table(columns: Shaped[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]:
+    """One message for each row; every field has a fixed size, so all rows lie alike."""
+    fields = _fields(columns.dtype)
+    offsets, position = [], ENCAPSULATION
+    for kind, shape in fields.values():
+        position += -(position - ENCAPSULATION) % kind.itemsize
+        offsets.append(position)
+        position += kind.itemsize * int(np.prod(shape, dtype=int))
+    formats = [(kind.newbyteorder("<"), shape) for kind, shape in fields.values()]
+    layout = np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": position})
+    rows = np.zeros(len(columns), layout)
+    for name in fields:
+        rows[name] = columns[name]
+    raw = rows.view(np.uint8).reshape(len(columns), position)
+    raw[:, 1] = 1  # little endian
+    return raw
+
+
+def _fields(dtype: np.dtype[np.void]) -> dict[str, tuple[np.dtype[np.generic], tuple[int, ...]]]:
+    """Type and shape of every column."""
+    every = {}
+    for name in dtype.names or ():
+        field = dtype[name]
+        every[name] = (field.subdtype[0], field.shape) if field.subdtype else (field, ())
+    return every
 
 
 def _compare(source: MessageLog, written: Counter[str]) -> None:

@@ -26,7 +26,7 @@ LEAST_REST = 1e-3  # of the power, below which all of it is white
 
 
 def to_noise_file(d: Diagnosis) -> Noise | None:
-    """Noise of all logs with its colour; None without samples that vary."""
+    """Noise with its colour, of all logs; None without samples of an IMU that vary."""
     if not d.traces:
         return None
     rate_hz = 1.0 / float(np.median([np.median(np.diff(trace.t_s)) for trace in d.traces]))

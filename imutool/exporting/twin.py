@@ -35,7 +35,7 @@ Vector = Float64[np.ndarray, "3"]
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """Sensor of a fleet: physics, spread of the bias, noise; `used` effects fit the format."""
+    """Sensor of a fleet: physics, spread of the bias, noise; `used`: the effects expressed."""
 
     physics: PhysicsFile
     bias_std: Mapping[Sensor, Vector]

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
+import msgspec
+
 from imutool import __version__
 from imutool.errors import ConfigError
 from imutool.fleet.robots import FleetDiagnosis
@@ -75,7 +77,23 @@ def write(results: Iterable[Result], path: Location) -> None:
     schema = _schema(pa)
     with Target(path, overwrite=True) as target, pa.parquet.ParquetWriter(_Sink(target), schema, compression="zstd") as out:
         for rows in _batches(results):
-            out.write_table(pa.Table.from_pylist(rows, schema))
+            out.write_table(_table(rows, schema, pa))
+
+
+def _table(rows: list[dict[str, Any]], schema: Any, pa: Any) -> Any:
+    """Rows as a table, by way of JSON lines: pyarrow looks at Python objects with pandas, whose import takes a second."""
+    from pyarrow.json import ParseOptions, ReadOptions, read_json
+
+    lines = b"\n".join(map(msgspec.json.encode, rows))
+    columns = ParseOptions(explicit_schema=pa.schema([(column.name, _without_lengths(column.type, pa)) for column in schema]))
+    return read_json(pa.BufferReader(lines), ReadOptions(block_size=len(lines) + 1), columns).cast(schema)
+
+
+def _without_lengths(kind: Any, pa: Any) -> Any:
+    """Type with lists of any length, since JSON knows no others."""
+    if isinstance(kind, pa.StructType):
+        return pa.struct([(part.name, _without_lengths(part.type, pa)) for part in kind])
+    return pa.list_(_without_lengths(kind.value_type, pa)) if hasattr(kind, "value_type") else kind
 
 
 def _schema(pa: Any) -> Any:

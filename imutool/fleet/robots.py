@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.stats import t as student
 
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import value as value_text
@@ -220,6 +219,8 @@ def _outliers(
 
     Each is the most deviating parameter of a robot's effect.
     """
+    from scipy.special import stdtr
+
     tested: list[Outlier] = []
     known = [(np.isfinite(column), *_robust(column[np.isfinite(column)])) for column in x.T]
     for r, robot in enumerate(robots):
@@ -231,7 +232,7 @@ def _outliers(
                 continue
             spread = max(spread, SMALLEST * float(np.median(std[finite, k])))
             sigma = float(abs(x[r, k] - middle) / np.hypot(std[r, k], spread))
-            p = 2.0 * float(student.sf(sigma, EFFICIENCY * (n - 1)))
+            p = 2.0 * float(stdtr(EFFICIENCY * (n - 1), -sigma))
             own = float(x[r, k]), float(std[r, k])
             outlier = Outlier(robot, effect, parameter, *own, middle, spread, units[effect, parameter], sigma, p, 1.0)
             by_effect.setdefault(effect, []).append(outlier)

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
+from imutool.mcap_io.codec.decode import PoseBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
-from imutool.mcap_io.topics import PoseBatch
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions

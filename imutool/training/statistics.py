@@ -27,6 +27,7 @@ from imutool.units import SENSORS, Sensor
 MAD_TO_STD = 1.4826
 TURN_ON_STD = {"gyro": 5e-3, "accel": 0.1}  # of a switching-on: ADIS16448 2e-3 over four months, BMI160 up to 5e-2 (data sheet)
 USUAL_STD = {"gyro": 5e-4, "accel": 2e-2}  # between logs of one switching-on
+MOST_TAIL, LEAST_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of freedom, or fewer, count as three
 SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
 LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
@@ -80,12 +81,15 @@ def turn_on_prior(
 
     Logs of one switching-on are one draw of the turn-on bias. From S sessions with means m_s the next one has the variance
     (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more.
+    Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
+    Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`.
     """
     groups = _sessions(rest, spans_ns)
     means = np.stack([rest[group].mean(axis=0) for group in groups])
     usual, turn_on = (np.repeat([size[sensor] for sensor in SENSORS], 3) for size in (USUAL_STD, TURN_ON_STD))
     squares = sum(((rest[group] - mean) ** 2).sum(axis=0) for group, mean in zip(groups, means, strict=True))
-    within = (squares + usual**2) / (len(rest) - len(groups) + 1)
+    freedom = len(rest) - len(groups) + 1
+    within = (squares + usual**2) / freedom * min(MOST_TAIL, freedom / max(freedom - 2.0, LEAST_FREEDOM))
     mean, count = means.mean(axis=0), len(groups)
     between = (((means - mean) ** 2).sum(axis=0) + turn_on**2) / count * (1 + 1 / count)
     sessions = [

@@ -36,7 +36,7 @@ from imutool.units import AXES
 ARM_M = np.array([0.2, -0.1, 0.05])
 GYRO_BIAS, ACCEL_BIAS = (0.01, -0.02, 0.005), (0.1, 0.05, -0.08)
 WHITE = "gyro_density = [2e-4, 2e-4, 2e-4]\naccel_density = [2e-3, 2e-3, 2e-3]\n"
-RATE_HZ, SECONDS = 100.0, 30.0
+RATE_HZ, SECONDS, NULL_SECONDS = 100.0, 30.0, 15.0
 SIGMAS = 5.0  # of the planted arm, from what is stated
 BIAS_TOLERANCE = np.array([1e-3] * 3 + [1e-2] * 3)  # rad/s, m/s²: thirty seconds of the noise above, and what an arm hides
 EXACT = 1e-9  # of two ways to the same curve, between whose points both are straight
@@ -51,16 +51,16 @@ def run(*words: str | Path) -> Result:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """trajectory.mcap, along it arm.mcap (a lever arm, a bias) and null.mcap (a bias), other.mcap along another motion."""
+    """trajectory.mcap, along it arm.mcap (a lever arm, a bias); null.mcap (a bias) along a short one, other.mcap another."""
     place = tmp_path_factory.mktemp("diagnose")
     (place / "white.toml").write_text(WHITE)
     bias = Bias(gyro=GYRO_BIAS, accel=ACCEL_BIAS)
     arm = {axis: Value(value=r, unit="m") for axis, r in zip("xyz", ARM_M.tolist(), strict=True)}
     physics_file.write(PhysicsFile(effect=(Entry(name="lever_arm", parameters=arm),), bias=bias), place / "arm.toml")
     physics_file.write(PhysicsFile(bias=bias), place / "null.toml")
-    for name, seed in (("trajectory", 5), ("another", 6)):
-        write(flight(seed, duration_s=SECONDS), place / f"{name}.mcap")
-    for name, trajectory, seed in (("arm", "trajectory", 2), ("null", "trajectory", 3), ("other", "another", 4)):
+    for name, seed, duration_s in (("trajectory", 5, SECONDS), ("short", 5, NULL_SECONDS), ("another", 6, SECONDS)):
+        write(flight(seed, duration_s=duration_s), place / f"{name}.mcap")
+    for name, trajectory, seed in (("arm", "trajectory", 2), ("null", "short", 3), ("other", "another", 4)):
         physics = place / ("arm.toml" if name == "arm" else "null.toml")
         path = place / f"{trajectory}.mcap"
         simulate(path, place / f"{name}.mcap", physics=physics, noise=place / "white.toml", rate_hz=RATE_HZ, seed=seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from imutool.bias_start.initial_bias import AT_REST_STD
-from imutool.training.statistics import TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
+from imutool.training.statistics import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
 
 HOUR_NS = 3600 * 10**9
 USUAL = np.array([USUAL_STD["gyro"]] * 3 + [USUAL_STD["accel"]] * 3)
@@ -41,8 +41,20 @@ def test_sessions_are_hours_apart_or_have_other_biases() -> None:
 
 def test_one_log_is_a_session_of_its_own() -> None:
     _, std, (session,) = turn_on_prior(biases(0.01), spans(0.0))
-    np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + USUAL[0] ** 2))
-    np.testing.assert_allclose(session.std, np.sqrt(2) * USUAL)
+    np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + MOST_TAIL * USUAL[0] ** 2))
+    np.testing.assert_allclose(session.std, np.sqrt(2 * MOST_TAIL) * USUAL)
+
+
+def test_the_next_log_of_a_session_lies_within_its_prior_however_few_its_logs() -> None:
+    rng = np.random.default_rng(3)
+    for count in (3, 4, 8):
+        deviations = []
+        for _ in range(400):
+            rest = np.repeat([0.5, 2.0], 3) * USUAL * rng.normal(size=(count + 1, 6))
+            _, _, (session,) = turn_on_prior(rest[:-1], spans(*np.arange(count) / 4))
+            deviations.append((rest[-1] - session.mean) / session.std)
+        outside = (np.abs(deviations) > 1.96).reshape(-1, 2, 3).mean(axis=(0, 2))
+        assert (outside < 0.08).all(), f"{count} logs: {outside} of 0.05; with the variance of the logs alone 0.09 and more"
 
 
 def test_a_shift_at_rest_has_to_be_shown_by_the_logs_together() -> None:

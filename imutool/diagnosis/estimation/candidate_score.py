@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 
 from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters_of, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
-from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effect import Effect, Stage, Theta
 
 RIDGE = 1e-9
+FILTERS = Stage.MOUNT, Stage.BANDWIDTH
+UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
+UNLIKELY = -3.0  # log p-value above which they need not be right
+KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +66,21 @@ class _Axis(NamedTuple):
         return np.asarray(x - (x @ self.bias)[..., None] * self.bias)
 
 
+class _Linear(NamedTuple):
+    """A candidate at a start, linear: by axis its parameters, their derivatives, and what the start adds, less the bias."""
+
+    start: Theta
+    rows: list[tuple[int, Int64[np.ndarray, " q"], Float[np.ndarray, "q _"], Float[np.ndarray, " _"] | None]]
+    N: Float64[np.ndarray, "p p"]
+
+    def short(self) -> _Linear:
+        """The same in half of the memory, to guess scores beside other fits."""
+        half = [
+            (k, js, b.astype(np.float32), None if added is None else added.astype(np.float32)) for k, js, b, added in self.rows
+        ]
+        return self._replace(rows=half)
+
+
 class CandidateScore:
     """Normal equations of a fit, to which the Schur complement of one more effect is added."""
 
@@ -83,33 +102,43 @@ class CandidateScore:
                 self.total += float(axis.r @ axis.r)
         self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
 
-    def gain(self, effect: Effect, start: Theta) -> float:
+    def linear(self, effect: Effect, start: Theta) -> _Linear:
+        """Derivatives of a candidate beside the fit, and what its start adds."""
+        moves = np.array([not parameter.begins for parameter in effect.parameters])  # onsets are searched, not stepped
+        rows, N = [], np.zeros((len(start), len(start)))
+        for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
+            with_it = forward if effect.linear else ForwardPass(log.pair, (*self.now.chosen, (effect, start)), forward)
+            B, added = effect_jacobian(log.whiten, with_it, effect), with_it.added(forward)
+            for column in range(log.pair.columns):
+                axis, js = self.axes[log.pair.columns * k + column], np.flatnonzero(B.on[column] & moves)
+                if len(js) or column in added:
+                    b, more = axis.free(B.white[column, js]), None
+                    N[np.ix_(js, js)] += b @ b.T
+                    if column in added:
+                        more = axis.free(log.whiten.rows(added[column][None], np.array([column]))[0])
+                    rows.append((log.pair.columns * k + column, js, b, more))
+        return _Linear(start, rows, N)
+
+    def gain(self, effect: Effect, linear: _Linear) -> float:
         """Gain in squares of one linear step from a start.
 
         No positive parameter changes by more than a factor of e.
         """
-        chosen, p = (*self.now.chosen, (effect, start)), len(start)
-        moves = np.array([not parameter.begins for parameter in effect.parameters])  # onsets are searched, not stepped
-        N_bb, N_ab, g_b = np.zeros((p, p)), np.zeros((len(self.N), p)), np.zeros(p)
-        g_a, total = self.g.copy(), self.total
-        for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
-            with_it = forward if effect.linear else ForwardPass(log.pair, chosen, forward)
-            B, added = effect_jacobian(log.whiten, with_it, effect), with_it.added(forward)
-            for column in range(log.pair.columns):
-                axis = self.axes[log.pair.columns * k + column]
-                js, r = np.flatnonzero(B.on[column] & moves), axis.r
-                if column in added:
-                    r = r - axis.free(log.whiten.rows(added[column][None], np.array([column]))[0])
-                    total += float(r @ r - axis.r @ axis.r)
-                    g_a[axis.where] += axis.A @ (r - axis.r)
-                if len(js):
-                    b = axis.free(B.white[column, js])
-                    N_bb[np.ix_(js, js)] += b @ b.T
-                    N_ab[np.ix_(axis.where, js)] += axis.A @ b.T
-                    g_b[js] += b @ r
-        _, std = priors(chosen[-1:], self.now.settings)
+        p = len(linear.start)
+        N_ab, g_b, g_a, total = np.zeros((len(self.N), p)), np.zeros(p), self.g.copy(), self.total
+        for k, js, b, added in linear.rows:
+            axis = self.axes[k]
+            r = axis.r
+            if added is not None:
+                r = r - added
+                total += float(r @ r - axis.r @ axis.r)
+                g_a[axis.where] += axis.A @ (r - axis.r)
+            if len(js):
+                N_ab[np.ix_(axis.where, js)] += axis.A @ b.T
+                g_b[js] += b @ r
+        _, std = priors(((effect, linear.start),), self.now.settings)
         solved = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
-        S, g = N_bb + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]
+        S, g = linear.N + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]
         step = np.linalg.solve(S, g)
         far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
         return float(self.left - total + g_a @ solved[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
@@ -143,8 +172,9 @@ class Candidates:
         self.logs = logs
         self.starts: dict[str, list[Theta]] = {}
         self.log_choices: dict[str, float] = {}
+        self.score: CandidateScore | None = None
         self.scores: dict[str, Scored] = {}
-        self.scored_fit: Fit | None = None
+        self.linear: dict[frozenset[str], dict[str, list[_Linear]]] = {}  # by the filters that acted
         pair = logs[0].pair
         for effect in effects:
             if effect.key not in self.starts:
@@ -162,19 +192,53 @@ class Candidates:
         """
         return log_p_value(gain, len(effect.parameters)) + self.log_choices[effect.key]
 
-    def ranked(self, now: Fit, candidates: Sequence[Effect]) -> list[Scored]:
-        """Candidates beside a fit by their score, each from its best start."""
-        if self.scored_fit is not now:
-            self.scored_fit, self.scores = now, {}
+    def ranked(self, now: Fit, candidates: Sequence[Effect], count: int | None = None) -> list[Scored]:
+        """Candidates beside a fit by their score, each from its best start: at least the `count` best of them.
+
+        Derivatives change little from fit to fit with the same filters (a mount that rings, a low pass), so those of an earlier
+        one tell which candidates need new ones: all whose score might be among the best if it were twice as good.
+        """
+        if self.score is None or self.score.now is not now:
+            self.score, self.scores = CandidateScore(self.logs, now), {}
+        derived = self._derived(now)
         allowed = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
-        score = None
-        for effect in allowed:
+        guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
+        best: list[Scored] = []
+        for guess, effect in sorted(guesses, key=lambda entry: entry[0]):
+            if (
+                count is not None
+                and len(best) >= max(count, 1)
+                and guess > min(UNSURE * best[max(count, 1) - 1].log_p, UNLIKELY)
+            ):
+                break
             if effect.key not in self.scores:
-                score = score or CandidateScore(self.logs, now)
-                gains = [(score.gain(effect, start), start) for start in self.starts[effect.key]]
-                gain, start = max(gains, key=lambda pair: pair[0])
-                self.scores[effect.key] = Scored(self.log_p(effect, gain), effect, start, gain)
-        return sorted((self.scores[effect.key] for effect in allowed), key=lambda entry: entry.log_p)
+                linear = [self.score.linear(effect, start) for start in self.starts[effect.key]]
+                derived[effect.key] = [each.short() for each in linear]
+                self.scores[effect.key] = self._best(self.score, effect, linear)
+            best = sorted([*best, self.scores[effect.key]], key=lambda entry: entry.log_p)
+        return best
+
+    def _derived(self, now: Fit) -> dict[str, list[_Linear]]:
+        """Candidates derived beside fits with the same filters; those of the last few such sets are kept."""
+        filters = frozenset(effect.key for effect, _ in now.chosen if effect.stage in FILTERS and not effect.linear)
+        derived = self.linear.pop(filters, {})
+        while len(self.linear) >= KEPT:
+            self.linear.pop(next(iter(self.linear)))
+        self.linear[filters] = derived
+        return derived
+
+    def _guess(self, score: CandidateScore, effect: Effect, derived: Mapping[str, Sequence[_Linear]]) -> Scored:
+        """Score with derivatives beside an earlier fit; the best of all without any."""
+        if effect.key in self.scores:
+            return self.scores[effect.key]
+        if effect.key not in derived:
+            return Scored(-np.inf, effect, self.starts[effect.key][0], np.inf)
+        return self._best(score, effect, derived[effect.key])
+
+    def _best(self, score: CandidateScore, effect: Effect, linear: Sequence[_Linear]) -> Scored:
+        gains = [(score.gain(effect, each), each.start) for each in linear]
+        gain, start = max(gains, key=lambda pair: pair[0])
+        return Scored(self.log_p(effect, gain), effect, start, gain)
 
 
 def unnamed_count(found: Fit) -> int:

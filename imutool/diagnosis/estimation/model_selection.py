@@ -126,11 +126,10 @@ class _Search:
         share = self.settings.rival_share
         if self.trials_of is not now:
             self.trials_of, self.trials = now, {}
-        ranked = self.candidates.ranked(
-            now, self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
-        )
+        allowed = self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
+        count = self.settings.fitted_each_round
         best: tuple[float, Fit] | None = None
-        for promised, effect, start, _ in ranked[: self.settings.fitted_each_round]:
+        for promised, effect, start, _ in self.candidates.ranked(now, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
                 continue  # the score of a linear effect is its gain
             if effect.key not in self.trials:
@@ -178,7 +177,7 @@ class _Search:
             without = fit(self.logs, others, iterations=2, near=now)
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0)  # refitted, a nonlinear effect may diverge for good
-            for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named)[:2]:
+            for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
                 if effect.key == mine.key:
                     if effect.linear:  # its score is its gain
                         break
@@ -248,11 +247,11 @@ class _Search:
 
     def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
         """Similar effects of the catalogue: they leave about as little (Akaike's criterion)."""
-        share = self.settings.rival_share
+        share, rivals = self.settings.rival_share, self.settings.rivals
         others = (*now.chosen[:k], *now.chosen[k + 1 :])
         without = fit(self.logs, others, iterations=2, near=now)
         gain, names = without.objective - now.objective, []
-        for _, effect, start, promised in self.candidates.ranked(without, self.named)[: self.settings.rivals]:
+        for _, effect, start, promised in self.candidates.ranked(without, self.named, rivals)[:rivals]:
             if effect.key != now.chosen[k][0].key and promised > share * gain:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - share * gain)
                 aic = now.objective + 2 * len(now.chosen[k][1])

@@ -31,13 +31,14 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     if pair.exact:
         return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, pair.settings.noise))
     assert pair.band_hz is not None
-    whiten, residual = _in_band(pair, candidates, pair.band_hz)
+    columns, misfit = _rich(pair, candidates), pair.real - expected(pair, ())
+    whiten, residual = _in_band(pair, columns, misfit, pair.band_hz)
     assert whiten.band is not None
     rate_hz = 1.0 / (pair.period_s * whiten.every)
     band_hz = known_band_hz(whiten.band(pair.real), residual, rate_hz, pair.band_hz, settings)
     if band_hz < pair.band_hz:
         pair = replace(pair, band_hz=band_hz)
-        whiten, _ = _in_band(pair, candidates, band_hz)
+        whiten, _ = _in_band(pair, columns, misfit, band_hz)
     return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
 
 
@@ -46,10 +47,12 @@ def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
     return WhitenedImu(pair, white if pair.known is None else white.counting(pair.known))
 
 
-def _in_band(pair: Pair, candidates: Sequence[Effect], band_hz: float) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
+def _in_band(
+    pair: Pair, wide: Sequence[Float64[np.ndarray, "_ _"]], wide_misfit: Float64[np.ndarray, "n 6"], band_hz: float
+) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
     """The noise of rows up to a frequency, and the residual of a rich model there."""
     band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
-    columns, misfit = _rich(pair, candidates, band), band(pair.real - expected(pair, ()))
+    columns, misfit = [band.rows(rows) for rows in wide], band(wide_misfit)
     usable = pair.usable[:: band.every]
     whiten = Whitener(np.ones((6, 1)), np.ones(6))
     for _ in range(pair.settings.noise.rounds):
@@ -112,8 +115,8 @@ def ridge_fit(
     return np.asarray(A @ np.linalg.solve(N, A[rows].T @ y[rows]))
 
 
-def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
-    """Design columns by axis in a band: a constant, and derivatives where fits begin."""
+def _rich(pair: Pair, candidates: Sequence[Effect]) -> list[Float64[np.ndarray, "_ n"]]:
+    """Design columns by axis: a constant, and derivatives where fits begin."""
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
     ideal = ForwardPass(pair, ())
     for effect in candidates:
@@ -124,7 +127,7 @@ def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[
             for axis, j, row in forward.derivatives(effect):
                 if not effect.parameters[j].begins:
                     columns[axis].append(row)
-    return [band.rows(np.stack(rows)) for rows in columns]
+    return [np.stack(rows) for rows in columns]
 
 
 def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tuple[Float64[np.ndarray, " q"], float]:
@@ -163,6 +166,8 @@ def known_band_hz(
         band = (f_hz >= low) & (f_hz < high)
         for part in (slice(0, 3), slice(3, 6)):
             e, r, x = (float(abs(density[band, part].sum())) for density in (power, recorded, cross))
+            if not e * r:  # a channel that never moves
+                continue
             gain, coherence = x / e, x * x / (e * r)
             std = np.sqrt((1.0 - coherence) / (2.0 * 3.0 * duration_s * (high - low))) * np.sqrt(r / e)
             diluted = min(1.0 - gain - settings.sigma * std, 1.0 - coherence) > settings.diluted_share

@@ -23,6 +23,7 @@ from imutool.mcap_io.log import Log
 
 MOST_READ, MOST_COMPARED, MOST_DRIVERS = 400, 24, 6
 SAME = 1e-12  # relative difference of two copies
+LEAST_COPIED = 0.9  # of the longer log, that two copies share
 LISTED = 12
 JOINTS, MAGNETIC = "sensor_msgs/msg/JointState", "sensor_msgs/msg/MagneticField"
 GNSS, PRESSURE = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/FluidPressure"
@@ -84,7 +85,7 @@ def paired(real: Location, sim: Location) -> Pairing:
     remarks, pairs, same = list[str](), list[SignalPair](), list[str]()
     topics = dict(_topics(own, other))
     for given in (pair for topic, theirs in topics.items() for pair in _of_topic(own, other, topic, theirs)):
-        if len(given.real) == len(given.sim) and np.allclose(given.real, given.sim, rtol=SAME, atol=0.0):
+        if _is_copy(given):
             same.extend(given.names)
         else:
             pair, remark = in_one_unit(given)
@@ -99,6 +100,13 @@ def paired(real: Location, sim: Location) -> Pairing:
     compared = {name for pair in pairs for name in pair.names}
     remarks += _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
     return Pairing(tuple(pairs), _drivers(own, compared, topics), tuple(remarks))
+
+
+def _is_copy(pair: SignalPair) -> bool:
+    """Whether one log's numbers are those of the other, which may have left out some at its ends."""
+    _, mine, theirs = np.intersect1d(pair.real_ns, pair.sim_ns, return_indices=True)
+    whole = len(mine) == min(len(pair.real), len(pair.sim)) > LEAST_COPIED * max(len(pair.real), len(pair.sim))
+    return whole and np.allclose(pair.real[mine], pair.sim[theirs], rtol=SAME, atol=0.0)
 
 
 def _listed(what: str, names: list[str]) -> list[str]:

@@ -15,7 +15,7 @@ from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import Topic
 
 NO_ENTRIES = np.zeros((0, 2), np.uint64)
-KEPT_BYTES = 6 << 20  # of messages: the first minute of a 200 Hz IMU, and all of a small log
+KEPT_BYTES = 10 << 20  # of messages: the two minutes of a 200 Hz IMU that the check of the fit reads, and all of a small log
 
 Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
 
@@ -47,7 +47,7 @@ def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> 
     raw = everything[: block.length]
     head = block.head(raw)
     indexes = parse_message_indexes(everything[block.length :], block, head.size)
-    data = records.unpack(raw, block.offset, max_chunk)
+    data = records.unpack(raw, block.offset, max_chunk, head)
     if indexes is None:
         return CheckedChunk(head, None, False, messages.parse(data, block.offset))
     found, right = indexes.messages(data, block.offset)

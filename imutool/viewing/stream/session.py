@@ -19,9 +19,10 @@ from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.stretches import measured
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
-from imutool.viewing.stream.sources import Malformed, Sample, Samples
+from imutool.viewing.stream.samples import Malformed, Sample
+from imutool.viewing.stream.sources import Samples
 from imutool.viewing.stream.statistics import Delay, StreamStatistics
 
 START_S = 2.0  # of the stream, from which the start bias is taken

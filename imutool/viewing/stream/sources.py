@@ -1,4 +1,4 @@
-"""Sources of a live stream: a log at its own speed, standard input, UDP, a rosbridge."""
+"""Sources of a live stream: a log at its own speed, standard input, UDP, Zenoh, a rosbridge."""
 
 from __future__ import annotations
 
@@ -9,117 +9,22 @@ import socket
 import sys
 import time
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
 from importlib.util import find_spec
-from typing import NamedTuple
+from queue import Empty, Full, Queue
 from urllib.parse import urlsplit
 
 import msgspec
 
 from imutool.errors import ConfigError, LogError
 from imutool.location import to_location
+from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
-EXPECTED = "a log, stdin, udp://HOST:PORT or rosbridge://HOST:PORT/TOPIC"
+EXPECTED = "a log, stdin, udp://HOST:PORT, zenoh://[HOST:PORT]/KEY or rosbridge://HOST:PORT/TOPIC"
 ROSBRIDGE_PORT = 9090
 WAIT_S = 0.5  # for data, between looks at the time
 CONNECT_TIMEOUT_S = 5.0
+MOST_WAITING = 10_000  # messages between two looks
 MAX_BYTES = 65_536  # of a message; a sample has some 200
-
-
-Vector = tuple[float, float, float]
-
-
-class Sample(NamedTuple):
-    """Sample of an IMU: stamp (ns), rad/s, m/s², time of arrival (s of `time.perf_counter`)."""
-
-    stamp_ns: int
-    gyro: Vector
-    accel: Vector
-    arrival_s: float
-
-
-class _Vector(msgspec.Struct):
-    x: float
-    y: float
-    z: float
-
-    def plain(self) -> Vector:
-        return self.x, self.y, self.z
-
-
-class _Stamp(msgspec.Struct):
-    """Time of ROS 2 or of ROS 1."""
-
-    sec: int | None = None
-    nanosec: int | None = None
-    secs: int | None = None
-    nsecs: int | None = None
-
-    def stamp_ns(self) -> int | None:
-        """Nanoseconds; None without a time."""
-        whole, rest = (self.sec, self.nanosec) if self.sec is not None else (self.secs, self.nsecs)
-        return None if whole is None else whole * 1_000_000_000 + (rest or 0)
-
-
-class _Header(msgspec.Struct):
-    stamp: _Stamp
-
-
-class _Message(msgspec.Struct):
-    """Sample in imutool's JSON, or a sensor_msgs/Imu, perhaps in the envelope of a rosbridge."""
-
-    t_ns: int | None = None
-    t_s: float | None = None
-    gyro: Vector | None = None
-    accel: Vector | None = None
-    header: _Header | None = None
-    angular_velocity: _Vector | None = None
-    linear_acceleration: _Vector | None = None
-    msg: _Message | None = None
-
-    def stamp_ns(self) -> int | None:
-        """Nanoseconds; None without a time."""
-        if self.t_ns is not None or self.t_s is not None:
-            return self.t_ns if self.t_ns is not None else round(1e9 * (self.t_s or 0.0))
-        return None if self.header is None else self.header.stamp.stamp_ns()
-
-    def values(self) -> tuple[Vector | None, Vector | None]:
-        """Angular rate and specific force; None where there is none."""
-        rate, force = (None if v is None else v.plain() for v in (self.angular_velocity, self.linear_acceleration))
-        return self.gyro or rate, self.accel or force
-
-
-DECODER = msgspec.json.Decoder(_Message)
-
-
-def sample(text: bytes | str, arrival_s: float) -> Sample:
-    """Sample from JSON with t_ns or t_s, gyro and accel, or from a sensor_msgs/Imu in JSON.
-
-    Raises:
-        ValueError: it is none.
-    """
-    message = DECODER.decode(text)
-    message = message.msg or message
-    stamp_ns, (gyro, accel) = message.stamp_ns(), message.values()
-    if gyro is None or accel is None:
-        raise ValueError("neither gyro and accel nor a sensor_msgs/Imu")
-    if stamp_ns is None:
-        raise ValueError("no time: t_ns, t_s or header.stamp")
-    return Sample(stamp_ns, gyro, accel, arrival_s)
-
-
-@dataclass
-class Malformed:
-    """Count of messages that hold no sample, with the first reason."""
-
-    count: int = 0
-    first: str = field(default="")
-
-    def add(self, text: bytes | str, error: Exception) -> None:
-        """Count a message."""
-        self.count += 1
-        if not self.first:
-            self.first = f"{error}: {text[:100]!r}"
 
 
 Samples = Iterator[Sample | None]  # None: nothing came for a while
@@ -140,7 +45,7 @@ def open_source(name: str, malformed: Malformed, *, imu: str | None = None, spee
     if parts.scheme in {"rosbridge", "ws", "wss"}:
         return _rosbridge(name, malformed)
     if parts.scheme == "zenoh":
-        raise ConfigError("zenoh is no source of this version", where="source", expected=EXPECTED)
+        return _zenoh(name, malformed)
     if "://" in name and parts.scheme not in {"file", "s3", "gs", "az"}:
         raise ConfigError(f"{name!r}", where="source", expected=EXPECTED)
     return _replay(name, imu, speed)
@@ -186,7 +91,7 @@ def _lines(malformed: Malformed) -> Samples:
             arrival_s = time.perf_counter()
             *lines, rest = (rest + block).split(b"\n") if block else [rest, b""]
             for line in lines:
-                yield from _decoded(line, arrival_s, malformed)
+                yield from decoded(line, arrival_s, malformed)
             if not block:
                 return
             if len(rest) > MAX_BYTES:
@@ -219,7 +124,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
                     continue
                 arrival_s = time.perf_counter()
                 for text in datagram.split(b"\n"):
-                    yield from _decoded(text, arrival_s, malformed)
+                    yield from decoded(text, arrival_s, malformed)
 
     return samples()
 
@@ -252,18 +157,49 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
                 except TimeoutError:
                     yield None
                     continue
-                yield from _decoded(text, time.perf_counter(), malformed)
+                yield from decoded(text, time.perf_counter(), malformed)
 
     return samples()
 
 
-def _decoded(text: bytes | str, arrival_s: float, malformed: Malformed) -> Iterator[Sample]:
-    """The sample of a message, if it holds one."""
+def _zenoh(name: str, malformed: Malformed) -> Samples:
+    """Samples that are published under a key: JSON, or the CDR of a sensor_msgs/Imu, as rmw_zenoh sends it."""
+    if find_spec("zenoh") is None:
+        raise ConfigError("needs eclipse-zenoh, which is not installed", where=name, fix="pip install 'imutool[live]'")
+    import zenoh
+
+    parts, config, arrived = urlsplit(name), zenoh.Config(), Queue[tuple[float, bytes]](MOST_WAITING)
+    if parts.netloc:  # else peers are found on the local network
+        config.insert_json5("connect/endpoints", f'["tcp/{parts.netloc}"]')
+        config.insert_json5("mode", '"client"')
+    session = contextlib.ExitStack()
+
+    def arrive(published: zenoh.Sample) -> None:
+        payload = published.payload.to_bytes()
+        try:
+            arrived.put_nowait((time.perf_counter(), payload))
+        except Full as error:
+            malformed.add(payload, ValueError(f"lost: {MOST_WAITING} messages wait already ({error!r})"))
+
     try:
-        if text.strip():
-            yield sample(text, arrival_s)
-    except (msgspec.DecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        malformed.add(text, error)
+        session.enter_context(zenoh.open(config)).declare_subscriber(parts.path.strip("/"), arrive)
+    except zenoh.ZError as error:
+        session.close()
+        raise ConfigError(
+            f"cannot be opened ({str(error).partition('!')[0]})", where=name, expected="a Zenoh router or peer"
+        ) from error
+
+    def samples() -> Generator[Sample | None]:
+        with session:
+            while True:
+                try:
+                    arrival_s, payload = arrived.get(timeout=WAIT_S)
+                except Empty:
+                    yield None
+                    continue
+                yield from decoded(payload, arrival_s, malformed)
+
+    return samples()
 
 
 def _address(name: str, default: int | None) -> tuple[str, int]:

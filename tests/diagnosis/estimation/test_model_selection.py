@@ -12,7 +12,8 @@ from support import planted
 
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.settings import SearchSettings
@@ -88,6 +89,25 @@ def test_more_parameters_need_a_larger_gain() -> None:
 
 def test_a_loss_is_no_evidence() -> None:
     assert log_p_value(-5.0, 3) == 0.0
+
+
+# ── the order of candidates ──
+
+
+def test_the_best_candidates_are_the_same_whether_all_are_derived_anew_or_only_the_likely_ones() -> None:
+    effects = {name: SINGLE[name] for name in ("gyro_scale", "lever_arm", "low_pass")}
+    logs = [planted.weighed(planted.pair(planted.rich(3, DURATION_S), effects, 3))]
+    screened, few = Candidates(logs, planted.catalogue()), 3
+    first = fit(logs, ())
+    screened.ranked(first, planted.catalogue())
+    for names_of in (["lever_arm"], ["lever_arm", "gyro_scale"], ["lever_arm", "gyro_scale", "low_pass"], ["gyro_scale"]):
+        now = fit(logs, planted.acting({name: SINGLE[name] for name in names_of}))
+        best = screened.ranked(now, planted.catalogue(), few)
+        every = Candidates(logs, planted.catalogue()).ranked(now, planted.catalogue())
+        assert [scored.effect.key for scored in best[:few]] == [scored.effect.key for scored in every[:few]]
+        assert [scored.gain for scored in best[:few]] == [scored.gain for scored in every[:few]]
+        if "low_pass" not in names_of:
+            assert len(best) < len(every)
 
 
 # ── nothing ──

@@ -88,9 +88,11 @@ def test_fields_are_paired_by_topic_message_and_joint_and_the_rest_is_left_out(t
     joints = np.stack([a, np.mod(turning, 2 * np.pi), *np.zeros((2, len(t))), *np.zeros((2, len(t)))], axis=1)
     swapped = np.stack([1.01 * turning, 1.1 * a, *np.zeros((2, len(t))), *np.zeros((2, len(t)))], axis=1)
     degrees = (numbers, t, np.degrees(b)[:, None])
-    write(tmp_path / "real.mcap", {**both, "/arm/joint_states": (JOINTS, t, joints), "/angle": degrees}, ("hip", "knee"))
-    radians = (numbers, t, 1.001 * b[:, None])
-    write(tmp_path / "sim.mcap", {**both, "/joint_states": (JOINTS, t, swapped), "/angle": radians}, ("knee", "hip"))
+    real = {**both, "/arm/joint_states": (JOINTS, t, joints), "/angle": degrees, "/copy": (numbers, t, a[:, None])}
+    write(tmp_path / "real.mcap", real, ("hip", "knee"))
+    radians, copy = (numbers, t, 1.001 * b[:, None]), (numbers, t[50:], a[50:, None])
+    sim = {**both, "/joint_states": (JOINTS, t, swapped), "/angle": radians, "/copy": copy}
+    write(tmp_path / "sim.mcap", sim, ("knee", "hip"))
     pairing = paired(tmp_path / "real.mcap", tmp_path / "sim.mcap")
     pairs = {pair.name: pair for pair in pairing.pairs}
     assert set(pairs) == {"/arm/joint_states.position[0]", "/arm/joint_states.position[1]", "/angle.data"}
@@ -98,3 +100,4 @@ def test_fields_are_paired_by_topic_message_and_joint_and_the_rest_is_left_out(t
     assert np.allclose(pairs["/arm/joint_states.position[1]"].real[:, 0], turning)
     assert np.allclose(pairs["/angle.data"].real[:, 0], b)
     assert any("degrees" in remark for remark in pairing.remarks)
+    assert any("The same in both logs" in remark and "/copy.data" in remark for remark in pairing.remarks)

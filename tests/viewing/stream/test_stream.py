@@ -21,10 +21,12 @@ from support.report_schema import assert_valid
 import imutool as api
 from imutool.bias_start.bias_at_rest import auto
 from imutool.errors import ConfigError, DataError
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.recording import Imu
 from imutool.viewing.stream import sources
+from imutool.viewing.stream.samples import Malformed, Sample, sample
 from imutool.viewing.stream.session import run
-from imutool.viewing.stream.sources import Malformed, Sample, open_source, sample
+from imutool.viewing.stream.sources import open_source
 
 Imutool = Callable[..., subprocess.CompletedProcess[str]]
 PLAIN = '{"t_ns": 5, "gyro": [0.1, 0.2, 0.3], "accel": [1, 2, 9.8]}'
@@ -127,7 +129,7 @@ def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) 
 
 @pytest.mark.parametrize(
     "name",
-    ["udp://127.0.0.1", "udp://h:99999", "zenoh://x", "ftp://x/y", "rosbridge://127.0.0.1:9", "rosbridge://127.0.0.1:9/imu"],
+    ["udp://127.0.0.1", "udp://h:99999", "zenoh://x:1/", "ftp://x/y", "rosbridge://127.0.0.1:9", "rosbridge://127.0.0.1:9/imu"],
 )
 def test_a_wrong_source_is_refused_at_once(name: str) -> None:
     with pytest.raises(ConfigError):
@@ -175,8 +177,34 @@ def test_a_rosbridge_is_subscribed_to(imu: Imu) -> None:
     assert [one.stamp_ns for one in found if one is not None] == imu.t_ns[:3].tolist()
 
 
+def test_zenoh_carries_json_and_cdr(imu: Imu) -> None:
+    import zenoh
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    malformed = Malformed()
+    with zenoh.open(config) as session:
+        source = open_source(f"zenoh://127.0.0.1:{port}/robot/imu", malformed)
+        publisher = session.declare_publisher("robot/imu")
+        while not publisher.matching_status.matching:
+            time.sleep(0.01)
+        publisher.put(lines(imu)[0])
+        publisher.put(b"nonsense")
+        for row in encode_imu(imu.t_ns[1:3], imu.gyro[1:3], imu.accel[1:3], "imu"):  # as rmw_zenoh publishes
+            publisher.put(row.tobytes())
+        found = [next(source) for _ in range(3)]
+        source.close()  # type: ignore[attr-defined]
+    assert [one.stamp_ns for one in found if one is not None] == imu.t_ns[:3].tolist()
+    np.testing.assert_array_equal([one.gyro for one in found if one is not None], imu.gyro[:3])
+    assert malformed.count == 1
+
+
 def test_the_command_replays_a_log_and_reports_the_delay(logs: Path, tmp_path: Path, imutool: Imutool) -> None:
-    words = ("live", "--from", logs / "flight_1.mcap", "--speed", "6", "--save", "live.rrd", "--json", "r.json")
+    words = ("live", logs / "flight_1.mcap", "--speed", "6", "--save", "live.rrd", "--json", "r.json")
     done = imutool(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "99 % within" in done.stdout
