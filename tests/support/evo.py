@@ -23,7 +23,7 @@ for command, *words in json.loads(sys.argv[1]):
 
 
 def statistics(folder: Path, lines: Sequence[Sequence[str]]) -> list[dict[str, float]]:
-    """Statistics of each run: `ape` or `rpe`, the true file, the estimated one, further words. evo's settings go to the folder."""
+    """Statistics of each run: `ape` or `rpe`, true file, estimated file, further words. evo's settings go to the folder."""
     if importlib.util.find_spec("evo") is None:
         pytest.skip(f"evo is not installed for {sys.executable}")
     results = [folder / f"{number}.zip" for number in range(len(lines))]
