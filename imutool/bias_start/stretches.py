@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning.cleaner import rows
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.topics import CLEAN_FIX, ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.topics import CLEAN_FIX
 from imutool.recording import Imu, Recording, nanoseconds
 
 MOST_GAP_S = 3600.0  # of a gap on the filters' clock: beyond, the time says nothing about the bias
