@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -66,8 +67,13 @@ def _load_csv(path: Path, columns: Columns) -> None:
 def _load_parquet(path: Path, columns: Columns) -> None:
     parquet = _module("pyarrow.parquet", path)
     file = parquet.ParquetFile(path)
-    _check_size(path, file.metadata.num_rows * file.metadata.num_columns * 8)
-    table = file.read()
+    numbers = [
+        field.name
+        for field in file.schema_arrow
+        if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(field.type))
+    ]
+    _check_size(path, file.metadata.num_rows * len(numbers) * 8)
+    table = file.read(columns=numbers)  # a text of a few bytes may unpack to gigabytes
     for name in table.column_names:
         column = table.column(name)
         if str(column.type).startswith("timestamp"):
@@ -78,10 +84,21 @@ def _load_parquet(path: Path, columns: Columns) -> None:
 
 def _load_npz(path: Path, columns: Columns) -> None:
     with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            with archive.open(info) as member:  # the size that the array states, whatever the archive says
+                shape = _npy_shape(member) if info.filename.endswith(".npy") else ()
+            _check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
         _check_size(path, sum(info.file_size for info in archive.infolist()))
     with np.load(path, allow_pickle=False) as arrays:
         for name in arrays.files:
             columns.add(name, arrays[name])
+
+
+def _npy_shape(member: Any) -> tuple[int, ...]:
+    version = np.lib.format.read_magic(member)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape: tuple[int, ...] = read(member)[0]
+    return shape
 
 
 def _load_mat(path: Path, columns: Columns) -> None:
@@ -108,17 +125,37 @@ def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
 def _load_hdf5(path: Path, columns: Columns) -> None:
     h5py = _module("h5py", path)
 
-    def visit(name: str, node: Any) -> None:  # external links are never followed
-        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb":
+    elsewhere: list[str] = []
+
+    def look(name: str, link: Any) -> None:  # external links are never followed
+        if isinstance(link, h5py.ExternalLink):
+            elsewhere.append(name)
+
+    def visit(name: str, node: Any) -> None:
+        if "MATLAB_object_decode" in node.attrs:
+            what = f"{name} is a MATLAB object ({_plain(node.attrs.get('MATLAB_class', 'unknown'))}), not an array"
+            raise DataError(what, where=path, fix="Save it from MATLAB as arrays, or with writetable as CSV")
+        if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "iufb" or name.startswith("#"):
             return
         if node.external or node.is_virtual:
             raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
         _check_size(path, node.size * 8)
         unit = node.attrs.get("units", node.attrs.get("unit", ""))
-        columns.add(name, node[()], unit if isinstance(unit, str) else "")
+        columns.add(name, node[()], _plain(unit))
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)
+        file.visititems_links(look)
+    if elsewhere:
+        what = f"{', '.join(elsewhere)}: links to other files, which are not followed"
+        if not columns.values:
+            raise DataError(what, where=path, fix="Copy the arrays into this file")
+        columns.remarks.losses.append(what)
+
+
+def _plain(attribute: Any) -> str:
+    """Text of an attribute, which MATLAB writes as bytes."""
+    return attribute.decode(errors="replace") if isinstance(attribute, bytes) else str(attribute)
 
 
 def _refuse_sheet(path: Path, columns: Columns) -> None:

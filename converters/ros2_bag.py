@@ -83,14 +83,14 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _has_messages(path: Path) -> bool:
-    """Whether a database has the tables of a bag."""
+    """Whether a database has the tables of a bag; a damaged one counts by its name, and says why when it is read."""
     if head(path, len(SQLITE)) != SQLITE:
         return False
     try:
         with sqlite3.connect(f"file:{path}?immutable=1", uri=True) as database:
             names = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except sqlite3.Error:
-        return False
+        return path.suffix == ".db3"
     return {"topics", "messages"} <= names
 
 

@@ -30,6 +30,7 @@ from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
 from imutool.location import Location
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
@@ -38,7 +39,6 @@ from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import repaired
 from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
-from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
 

@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError
 from imutool.location import LogPath, local, location
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.storage import outputs
 from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
-from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
 from imutool.viewing import Output, notebook
 from imutool.viewing.model.run_data import RunData

@@ -31,7 +31,7 @@ from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.units import SENSORS, Sensor
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+Positive = Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)]
 Channels = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=512)], ...], msgspec.Meta(min_length=1, max_length=8)]
 Dilations = Annotated[tuple[Annotated[int, msgspec.Meta(ge=1, le=1024)], ...], msgspec.Meta(min_length=1, max_length=8)]
 

@@ -25,6 +25,7 @@ FORMAT = "imutool.model/1"
 MAX_BYTES = 64 << 20  # the shipped models are under 2 MB
 MAX_RATE_HZ = 1e6
 MAX_WEIGHT = 1e6  # the largest of the shipped models is 10
+MIN_SCALE = 1e-9  # of an input that a network divides by
 MAX_TOML = 1 << 20  # bytes of a physics.toml; usual files have a few thousand
 MAX_SETTINGS = 16 << 10  # characters; usual settings have a few hundred
 WITH_RATE = ("conv", "hybrid", "neural_ode")  # their networks count in samples
@@ -132,6 +133,9 @@ def load(path: Path) -> BiasModel:
         raise ModelError("holds numbers that are not finite", where=path)
     if any((np.abs(value) > MAX_WEIGHT).any() for value in tensors.values()):
         raise ModelError("holds numbers that no training gives", where=path, expected=f"at most {MAX_WEIGHT:g}")
+    least = {".scale": MIN_SCALE, ".units": MIN_SCALE, ".var": 0.0}  # divisors
+    if any((value < least.get(Path(name).suffix, -MAX_WEIGHT)).any() for name, value in tensors.items()):
+        raise ModelError("holds scales that no training gives", where=path, expected=f"at least {MIN_SCALE:g}")
     model = kind(settings, header.rate_hz, tensors)
     model.card = {**header.card, "name": path.stem, "sha256": digest(path)}
     return model

@@ -38,7 +38,7 @@ HIDDEN = {"gyro": ((128, 128), (512,)), "accel": ((256, 512), (256, 256))}  # bo
 INPUTS = 9
 NORMAL_PEAK = (2.0 * np.pi) ** -0.5
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+Positive = Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)]
 Width = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 

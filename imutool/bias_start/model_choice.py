@@ -35,9 +35,10 @@ from imutool.cleaning.first_pass import raw_batches
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.location import Location
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recording
-from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 
 HEAD_S = 60.0  # start of a log that the search for the initial bias reads
@@ -96,7 +97,7 @@ def choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) 
         LogError: none is named, and the log has not exactly one.
     """
     own = [topic for topic in given if topic]
-    topics = list(dict.fromkeys(imus or own or [log.only_imu()]))
+    topics = list(dict.fromkeys(log.topic(name, (schemas.IMU,)).name for name in imus or own or [log.only_imu()]))
     for topic in own:
         if topic not in topics:
             raise ConfigError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +17,9 @@ from jaxtyping import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning.cleaner import rows
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.topics import CLEAN_FIX, ImuBatch
-from imutool.recording import Imu, nanoseconds
+from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.topics import CLEAN_FIX
+from imutool.recording import Imu, Recording, nanoseconds
 
 MOST_GAP_S = 3600.0  # of a gap on the filters' clock: beyond, the time says nothing about the bias
 MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
@@ -58,22 +59,29 @@ def measured(gyro: Rows3, accel: Rows3) -> Bool[np.ndarray, " n"]:
     return good
 
 
-def measured_imu(imu: Imu, where: str) -> Imu:
+def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
     """Samples of an IMU that are a measurement; a warning counts the others.
+
+    Without specific force they are one in `free_fall` alone: a simulated sensor has no noise.
 
     Raises:
         ConfigError: fewer than two are left.
     """
-    reasons = unmeasured(imu.gyro, imu.accel)
+    reasons = {why: mask for why, mask in unmeasured(imu.gyro, imu.accel).items() if not (free_fall and why == ZERO_FORCE)}
     left_out = {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
     if not left_out:
         return imu
-    good = measured(imu.gyro, imu.accel)
+    good = ~np.logical_or.reduce(list(reasons.values()))
     if good.sum() < 2:
         raise _nothing_measured(left_out, where)
     logger.warning("%s: samples that are no measurement are left out: %s", where, described(left_out))
     rows_left: Imu = imu.rows(good)
     return rows_left
+
+
+def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
+    """A recording without the IMU samples that are no measurement, as `measured_imu`."""
+    return replace(recording, imu=measured_imu(recording.imu, recording.name, free_fall=free_fall))
 
 
 class StretchClock:

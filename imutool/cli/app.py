@@ -190,7 +190,11 @@ Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]
-Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several.")]
+Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several; gyro=TOPIC,accel=TOPIC joins two.")]
+Imus = Annotated[
+    list[str] | None,
+    typer.Option("--imu", help="IMU topic, where a log has several; gyro=TOPIC,accel=TOPIC joins two. Repeatable."),
+]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
 JSON, HTML, PNG, TOML = (Written(suffixes) for suffixes in (outputs.JSON, outputs.HTML, outputs.PNG, outputs.TOML))
 RRD, MODEL, LOG = (Written(suffixes) for suffixes in (outputs.RRD, outputs.MODEL, outputs.LOG))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import HTML, LOG, LOST, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.app import HTML, LOG, LOST, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError, LogError
 from imutool.location import to_location
@@ -27,10 +27,11 @@ def clean(
     source: Annotated[str, typer.Argument(metavar="LOG", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
     target: Annotated[str | None, typer.Argument(metavar="OUT", help="New log with a clean, debiased IMU topic."), LOG] = None,
     model: Annotated[str | None, typer.Option(help="For OUT: model file, physics.toml or a name that ships.")] = None,
-    imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
+    imu: Imus = None,
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="Run only this rule. Repeatable.")] = None,
     no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Skip this rule. Repeatable.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write OUT even if the log cannot be trusted.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="In OUT, correct axes that the motion shows to be wrong.")] = False,
     report_to: Annotated[
         Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as an HTML page."), HTML
     ] = None,
@@ -48,13 +49,9 @@ def clean(
     """
     from imutool.cleaning.rule import chosen
 
-    rules = chosen(rule or (), no_rule or (), force)
-    given = {
-        "--model": model,
-        "--smooth": smooth,
-        "--force": force,
-        "--overwrite": overwrite and report_to is None and json_to is None,
-    }
+    rules = chosen(rule or (), no_rule or (), force, fix)
+    given = {"--model": model, "--smooth": smooth, "--force": force, "--fix": fix}
+    given["--overwrite"] = overwrite and report_to is None and json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     added: dict[str, int] = {}

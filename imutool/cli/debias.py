@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from imutool.bias_start.verdict import Fitness
-from imutool.cli.app import HTML, LOG, LOST, RRD, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
+from imutool.cli.app import HTML, LOG, LOST, RRD, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import Location, to_location
@@ -42,7 +42,7 @@ def debias(
         LOG,
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
-    imu: Annotated[list[str] | None, typer.Option(help="IMU topic, where a log has several. Repeatable.")] = None,
+    imu: Imus = None,
     init: Init = "auto",
     smooth: Smooth = False,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",

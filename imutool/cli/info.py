@@ -14,7 +14,7 @@ from imutool.cli.app import LOST, PNG, TOML, Json, MaxChunk, Overwrite, Quiet, V
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
-from imutool.report import json_values
+from imutool.report import UnsetType, json_values
 
 if TYPE_CHECKING:
     from imutool.log_info.report import LogInfo
@@ -164,6 +164,7 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
         rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
+        rows += [(imu["topic"], entry["subject"], entry["evidence"]) for entry in imu.get("conventions", [])]
         for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
             noise = imu["noise"]
             if noise is not None:
@@ -172,6 +173,9 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
     for truth in report.truth:
         value = f"{100 * truth.coverage:.1f} % of the IMU, {truth.gaps} gaps, longest {truth.longest_gap_s:.2f} s"
         rows += [(truth.topic, "kind of poses", truth.kind), (truth.topic, "covers", value)]
+        if not isinstance(truth.gyro_rms_rad_s, UnsetType) and not isinstance(truth.gyro_explained, UnsetType):
+            value = f"{100 * truth.gyro_explained:.1f} % of the motion, {truth.gyro_rms_rad_s:.4f} rad/s rms left"
+            rows.append((truth.topic, "explains gyro", value))
     return rows
 
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from posixpath import commonpath
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
 from imutool.mcap_io.read import RECORD
 from imutool.mcap_io.topics import MESSAGE_POSES
 from imutool.recording import Recording
 from imutool.recording.message_log import KINDS, MessageLog
 
-POSES = (*MESSAGE_POSES, schemas.TF, "geometry_msgs/msg/PoseWithCovarianceStamped")
+POSES = (*MESSAGE_POSES, schemas.TF)
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Labels:
         if isinstance(content, Recording) or not set(parts) <= set(topics):
             named, expected = " and ".join(parts), ", ".join(topics) or "a bag or a log with IMU topics"
             raise ConfigError(f"no IMU messages to join on {named}", where="imu", expected=expected)
-        return replace(content, pairs={f"{commonpath(parts).rstrip('/')}/imu": parts})
+        return replace(content, pairs={whole_of(parts): parts})
 
     def _check(self, topics: Collection[str], name: str) -> None:
         for topic, _ in self.kinds:
@@ -76,15 +75,12 @@ def parse_kinds(texts: Sequence[str]) -> tuple[tuple[str, str], ...]:
     return tuple(kinds)
 
 
-def parse_parts(text: str) -> tuple[str, str] | None:
+def parse_pair(text: str) -> tuple[str, str] | None:
     """Topics of `gyro=/a,accel=/b`; None of an empty text.
 
     Raises:
-        ConfigError: no such text.
+        ConfigError: any other text.
     """
-    if not text:
-        return None
-    match = re.fullmatch(r"gyro=([^,\s]+),accel=([^,\s]+)", text.strip())
-    if match is None:
+    if (parts := parse_parts(text)) is None and text:
         raise ConfigError(f"{text!r}", where="imu", expected="gyro=TOPIC,accel=TOPIC")
-    return match[1], match[2]
+    return parts

@@ -22,10 +22,10 @@ from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected, reflect
 from imutool.mcap_io.read import RECORD
-from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY, named_kind
+from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks, scalar_series, velocity_series
 from imutool.mcap_io.writer import Chunk, LogWriter
-from imutool.recording.message_log import MessageLog, MessageTopic, Table
+from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind
 
 BULKY = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 SENSORS = (schemas.IMU, schemas.VECTOR3, schemas.TF, schemas.FLOAT, *MESSAGE_POSES)

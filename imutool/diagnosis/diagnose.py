@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from imutool.bias_start.stretches import measured_recording
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
@@ -45,7 +46,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
 from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.read import read
 from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
@@ -114,6 +115,11 @@ def diagnose(
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
     report(4, 4, "")
     return diagnosis
+
+
+def read_log(log: Location, *, imu: str | None = None, truth: str | None = None) -> Recording:
+    """A recording or a simulation, which may fall freely, without samples that no sensor gives."""
+    return measured_recording(read(log, imu=imu, truth=truth), free_fall=True)
 
 
 def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:

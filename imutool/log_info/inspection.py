@@ -9,16 +9,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from imutool.cleaning import raw_batches
+from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.rules.units import unit_findings
+from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
+from imutool.log_info.conventions import convention_summary, convention_warnings, conventions
+from imutool.log_info.pose_agreement import agreement
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
@@ -62,6 +66,9 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     own = [imu for imu in imus if imu.derived_from is UNSET]
     imu_ns = clocks[own[0].topic] if own else np.empty(0, np.int64)
     truths = [_coverage(log.topics[name], clocks[name], imu_ns) for name in log.pose_topics]
+    if check and own and truths and log.topics[own[0].topic].is_read:
+        samples = _sound(*_columns(log, own[0].topic))
+        truths = [_against_gyro(log, truth, samples) for truth in truths]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
     warnings += [*_truth_warnings(own, truths), *refused]
     stamps = [clock for clock in clocks.values() if len(clock)]
@@ -115,24 +122,23 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     if not topic.is_read:
         warnings = [f"encoding {topic.message_encoding!r} is not read"]
         return ImuInfo(topic=topic.name, warnings=warnings, derived_from=derived_from)
-    batches = list(raw_batches(log, topic.name))
-    t_ns = _joined(batch.stamp_ns for batch in batches)
-    gyro, accel = (np.concatenate([np.empty((0, 3)), *(getattr(batch, name) for batch in batches)]) for name in SENSORS)
+    t_ns, gyro, accel = _columns(log, topic.name)
     finite = not_finite.measured(gyro) & not_finite.measured(accel)
-    ordered, first = np.unique(t_ns[finite], return_index=True)
-    imu = Imu(ordered, gyro[finite][first], accel[finite][first])
+    imu = _sound(t_ns, gyro, accel)
     later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
+    stamps = read_stamps(t_ns)
     counts = {
         "out_of_order": int((t_ns < later).sum()),
         "duplicated": len(t_ns) - len(np.unique(t_ns)),
-        "missing": _missing(np.unique(t_ns)),
+        "missing": _missing(np.unique(restamped(t_ns) if stamps.batch > 1.0 else t_ns)),
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
-    rest = _rest(imu)
+    rest, whole = _rest(imu), convention_summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, truth),
+        warnings=_imu_warnings(counts, imu, whole, stamps),
+        conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
         samples=len(t_ns),
         **_clock(t_ns)._asdict(),
@@ -143,6 +149,20 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
         accel_at_rest_m_s2=rest.accel_m_s2,
         noise=rest.noise,
     )
+
+
+def _columns(log: Log, topic: str) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Stamps, rates and accelerations of an IMU as recorded."""
+    batches = list(raw_batches(log, topic))
+    gyro, accel = (np.concatenate([np.empty((0, 3)), *(getattr(batch, name) for batch in batches)]) for name in SENSORS)
+    return _joined(batch.stamp_ns for batch in batches), gyro, accel
+
+
+def _sound(t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]) -> Imu:
+    """Finite samples in time order, each stamp once."""
+    finite = not_finite.measured(gyro) & not_finite.measured(accel)
+    ordered, first = np.unique(t_ns[finite], return_index=True)
+    return Imu(ordered, gyro[finite][first], accel[finite][first])
 
 
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
@@ -204,7 +224,7 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> list[str]:
+def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stamps: Stamps) -> list[str]:
     words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
@@ -213,12 +233,8 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> l
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    return [*warnings, *_unit_warnings(imu, truth)] if len(imu) else [*warnings, "no samples"]
-
-
-def _unit_warnings(imu: Imu, truth: Truth | None) -> list[str]:
-    """Warnings about units, by the same rule as `clean`; its notes are no warnings."""
-    return [finding.what for finding in unit_findings(imu, truth) if finding.severity != "note"]
+    warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
+    return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 
 def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
@@ -244,6 +260,19 @@ def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.
         longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
         starts_after_s=float(knots[0] - start) * 1e-9,
         ends_before_s=float(end - knots[-1]) * 1e-9,
+    )
+
+
+def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
+    """Report on poses with their agreement with the gyro, where both show motion; /tf holds poses of several frames."""
+    if log.topics[truth.topic].schema_name == schemas.TF:
+        return truth
+    poses = read_truth(log, topics=[truth.topic])
+    found = None if poses is None else agreement(poses, imu)
+    return (
+        truth
+        if found is None
+        else msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
     )
 
 

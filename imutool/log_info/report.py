@@ -55,6 +55,14 @@ class ImuNoise(Section, frozen=True):
     accel_density_unit: str = "m/s^2/sqrt(Hz)"
 
 
+class Convention(Section, frozen=True):
+    """Convention of an IMU or of its poses: what the motion shows, or why it shows nothing."""
+
+    subject: str
+    judged: bool
+    evidence: str
+
+
 class ImuInfo(Section, frozen=True, kw_only=True):
     """IMU topic: clock from the header stamps, defects, rest and noise.
 
@@ -80,6 +88,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
     stationary: list[Interval] | UnsetType = UNSET
     accel_at_rest_m_s2: float | UnsetType | None = UNSET
     noise: ImuNoise | UnsetType | None = UNSET
+    conventions: list[Convention] | UnsetType = UNSET
 
 
 class TruthInfo(Section, frozen=True):
@@ -96,6 +105,8 @@ class TruthInfo(Section, frozen=True):
     longest_gap_s: float = 0.0
     starts_after_s: float | UnsetType = UNSET
     ends_before_s: float | UnsetType = UNSET
+    gyro_rms_rad_s: float | UnsetType = UNSET  # what the poses do not explain of the log's first gyro
+    gyro_explained: float | UnsetType = UNSET  # share of its motion that they do
 
 
 class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):

@@ -134,9 +134,7 @@ class LogIndex:
         """As `unpack`, from the block's bytes."""
         if block.compression is None:
             return messages.parse(raw, block.offset)
-        if HEAD.unpack_from(raw) != (Opcode.CHUNK, block.length - HEAD.size):
-            raise LogError(f"the summary lists a chunk at byte {block.offset}, and none begins there")
-        data = records.unpack(raw, block.offset, self.max_chunk)
+        data = records.unpack(raw, block.offset, self.max_chunk, block.head(raw))
         offsets = message_offsets(self.source, block, len(data)) if len(data) > SMALL else None
         return (None if offsets is None else messages.parse_at(data, offsets)) or messages.parse(data, block.offset)
 

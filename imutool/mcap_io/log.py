@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType, TracebackType
@@ -15,7 +16,8 @@ from imutool.errors import DataError, LogError
 from imutool.location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import decode_image
+from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch, decode_image
+from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.passthrough.chunk_check import KeptChunks
@@ -25,14 +27,14 @@ from imutool.mcap_io.topics import (
     MESSAGE_POSES,
     PART_KEY,
     SCALARS,
-    ImuBatch,
-    PoseBatch,
-    ScalarBatch,
     StampCheck,
     Topic,
+    joined_topic,
     reflected_topics,
     topics_of,
 )
+
+logger = logging.getLogger(__name__)
 
 
 class Log:
@@ -87,11 +89,7 @@ class Log:
             self._source.file.close()
 
     def check(self) -> None:
-        """Reads every chunk and attachment and compares its CRC.
-
-        Raises:
-            LogError: the first damage.
-        """
+        """Reads every chunk and attachment and compares its CRC; LogError at the first damage."""
         with self.named():
             self.index.check()
 
@@ -152,9 +150,13 @@ class Log:
     def topic(self, name: str, schema_names: Collection[str]) -> Topic:
         """A topic by name, which must carry one of these messages in an encoding that imutool reads.
 
+        `gyro=TOPIC,accel=TOPIC` joins two topics to one IMU, and says the delay between them.
+
         Raises:
             LogError: no such topic, other messages, or another encoding.
         """
+        if (parts := parse_parts(name)) is not None:
+            return self._join(*(self.topic(part, (schemas.IMU, schemas.VECTOR3)) for part in parts))
         if name not in self.topics:
             raise LogError(f"there is no topic {name}", where=self.path, expected=self.listing())
         found = self.topics[name]
@@ -164,6 +166,15 @@ class Log:
         if not found.is_read:
             raise LogError(f"{name} is encoded as {found.message_encoding!r}", where=self.path, expected=" or ".join(ENCODINGS))
         return found
+
+    def _join(self, gyro: Topic, accel: Topic) -> Topic:
+        if (known := self.topics.get(name := whole_of((gyro.name, accel.name)))) is None:
+            with self.named(name):
+                known, notes = joined_topic(gyro, accel, lambda topic: (rows for _, rows in self.rows([topic])))
+            self.topics = MappingProxyType({**self.topics, name: known})
+            for note in notes:
+                logger.warning("%s: %s", self.path, note)
+        return known
 
     def listing(self) -> str:
         """The log's topics and their schemas, for a message."""
@@ -223,48 +234,37 @@ class Log:
             LogError: no such IMU topic, another encoding, NaN or infinite values, stamps that do not increase, damage.
         """
         described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck()
-        for _, rows in self.rows([topic], start_ns, end_ns):
-            with self.named(topic):
+        for _, rows in self.rows([described.name], start_ns, end_ns):
+            with self.named(described.name):
                 for batch in described.decode_imu(rows):
                     stamps.check_imu(batch)
                     yield batch
 
     def pose_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[PoseBatch]:
-        """The poses of a topic in file order; of a TFMessage one batch per transform in it.
-
-        Raises:
-            LogError: no such pose topic, another encoding, NaN or infinite values, damage.
-        """
+        """The poses of a topic in file order; of a TFMessage one batch per transform in it; LogError as `imu_batches`."""
         described = self.topic(topic, (*MESSAGE_POSES, schemas.TF))
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
     def scalar_batches(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ScalarBatch]:
-        """The messages of a Float64 or Vector3Stamped topic in file order.
-
-        Raises:
-            LogError: no such topic, another encoding, NaN or infinite values, damage.
-        """
+        """The messages of a Float64 or Vector3Stamped topic in file order; LogError as `imu_batches`."""
         described = self.topic(topic, SCALARS)
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 yield from described.decode_scalars(rows)
 
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
-        """Stamp and encoded bytes of every image of a CompressedImage topic, in file order.
-
-        Raises:
-            LogError: no such topic, another encoding, damage.
-        """
+        """Stamp and encoded bytes of every image of a CompressedImage topic, in file order; LogError as `imu_batches`."""
         encoding = self.topic(topic, (schemas.IMAGE,)).message_encoding
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):
                 yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)
 
     def channel_ids(self, topic: str) -> set[int]:
-        """The channels of a topic."""
-        return {i for i, channel in self.index.channels.items() if channel.topic == topic}
+        """The channels of a topic; of a joined IMU those of its gyroscope."""
+        name = (found.gyro_topic if (found := self.topics.get(topic)) else "") or topic
+        return {i for i, channel in self.index.channels.items() if channel.topic == name}
 
     def keep(self, topics: Collection[str]) -> None:
         """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""

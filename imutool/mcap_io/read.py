@@ -20,6 +20,7 @@ from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Rec
 
 logger = logging.getLogger(__name__)
 
+DOUBTFUL = ("estimate", "odometry")  # kinds of poses
 VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
 UNIT_KEY = "unit"  # channel metadata of a scalar
 RECORD = "imutool"  # name of our metadata record
@@ -94,7 +95,7 @@ def read_recording(
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
-        other_poses={name: log.topics[name].pose_kind for name in log.pose_topics if name not in truths},
+        other_poses={t: k for t in log.pose_topics if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths},
     )
 
 

@@ -171,12 +171,12 @@ class _Saver:
     def _copy_block(self, block: MessageBlock) -> None:
         raw = self.index.read(block)
         found = self.index.unpack_bytes(block, raw)
-        head = None if block.compression is None else ChunkHead.of(raw[:128], len(raw), block.offset)
+        head = None if block.compression is None else ChunkHead.of(raw, len(raw), block.offset)
         if head is None or block.edited or not _frame_ends(raw[head.data_at :], head.compression):
             if len(found.heads):
                 self._new_chunk(block, found)
             return
-        self._write_chunk(raw[: head.data_at], raw[head.data_at :], head, found)
+        self._write_chunk([raw], head, found)
 
     def _new_chunk(self, block: MessageBlock, found: messages.Messages) -> None:
         """Packs messages that cannot stay in their chunk, or lie outside chunks."""
@@ -188,18 +188,15 @@ class _Saver:
         start = records.chunk_head(data, packed, compression, int(times.min()), int(times.max()))
         if block.offset in self.index.losses.unchecked_in:
             start = start[:CRC_AT] + bytes(4) + start[CRC_AT + 4 :]
-        self._write_chunk(start, packed, ChunkHead.of(start, len(start) + len(packed), block.offset), found)
+        self._write_chunk([start, packed], ChunkHead.of(start, len(start) + len(packed), block.offset), found)
 
-    def _write_chunk(self, start: bytes, packed: bytes, head: ChunkHead, found: messages.Messages) -> None:
-        times = found.times()
-        start_ns, end_ns = (head.start_ns, head.end_ns) if not len(times) else (int(times[0]), int(times[-1]))
-        if len(times) > 1:
-            start_ns, end_ns = int(times.min()), int(times.max())
-        entry = head.index_at(self.out.target.position, len(start) + len(packed))
-        self.out.target.write(start + packed if len(packed) < len(start) * 100 else start)
-        if len(packed) >= len(start) * 100:
-            self.out.target.write(packed)
-        entry.message_start_time, entry.message_end_time = start_ns, end_ns
+    def _write_chunk(self, parts: list[bytes], head: ChunkHead, found: messages.Messages) -> None:
+        times, at = found.times(), self.out.target.position
+        for part in parts:
+            self.out.target.write(part)
+        entry = head.index_at(at, self.out.target.position - at)
+        if len(times):
+            entry.message_start_time, entry.message_end_time = messages.span(times)
         self.out.write_indexes(entry, found.heads["channel"], times, found.offsets)
 
     def _copy_record(self, span: RecordSpan) -> None:

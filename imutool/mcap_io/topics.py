@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, Shaped, UInt8, UInt32
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
-from imutool.mcap_io.codec.decode import TwistColumns, decode_imu, decode_poses, decode_scalars, decode_twist
+from imutool.mcap_io.codec.decode import (
+    ImuBatch,
+    PoseBatch,
+    ScalarBatch,
+    TwistColumns,
+    decode_imu,
+    decode_poses,
+    decode_scalars,
+    decode_twist,
+)
+from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 from imutool.mcap_io.index import LogIndex
+from imutool.recording.message_log import named_kind
+from imutool.recording.two_sensors import joined
 
 ENCODINGS = ("cdr", "ros1")
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
@@ -24,53 +35,9 @@ DERIVED_KEY = "imutool_source_topic"  # channel metadata: computed by imutool fr
 PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that topic
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
-KIND_WORDS = {  # in the names of topics
-    "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
-    "estimate": "filtered|fused|estimate|estimated|ekf|ukf|kalman|slam|vio|vins|msckf|okvis|orb|lio|amcl|local_position|vision",
-    "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
-}
-MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM)
+MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
-
-
-class ImuBatch(NamedTuple):
-    """Consecutive messages of one IMU; times in ns, rad/s, m/s²."""
-
-    log_time: Int64[np.ndarray, " n"]
-    publish_time: Int64[np.ndarray, " n"]
-    sequence: UInt32[np.ndarray, " n"]
-    stamp_ns: Int64[np.ndarray, " n"]
-    gyro: Float64[np.ndarray, "n 3"]
-    accel: Float64[np.ndarray, "n 3"]
-    frame_id: str
-
-
-class PoseBatch(NamedTuple):
-    """Consecutive poses of one frame in another; metres, quaternions as they stand in the log."""
-
-    log_time: Int64[np.ndarray, " n"]
-    publish_time: Int64[np.ndarray, " n"]
-    sequence: UInt32[np.ndarray, " n"]
-    stamp_ns: Int64[np.ndarray, " n"]
-    p_wb: Float64[np.ndarray, "n 3"]
-    q_wb_wxyz: Float64[np.ndarray, "n 4"]
-    frame_id: str
-    child_frame_id: str
-
-
-class ScalarBatch(NamedTuple):
-    """Consecutive messages of a numeric topic.
-
-    `stamp_ns` is the log time where the message has no header.
-    """
-
-    log_time: Int64[np.ndarray, " n"]
-    publish_time: Int64[np.ndarray, " n"]
-    sequence: UInt32[np.ndarray, " n"]
-    stamp_ns: Int64[np.ndarray, " n"]
-    values: Float64[np.ndarray, "n k"]
-    frame_id: str
 
 
 @dataclass(frozen=True)
@@ -86,8 +53,9 @@ class Topic:
     message_encoding: str
     count: int
     metadata: Mapping[str, str]
-    reflected: Reflected | None = None
+    reflected: Reflected | JoinedImu | None = None
     own_schema: str = ""  # name in the log of the type of a reflected IMU or pose
+    gyro_topic: str = ""  # of an IMU joined of two topics, whose messages stand for its own
 
     @property
     def is_derived(self) -> bool:
@@ -129,6 +97,17 @@ class Topic:
             columns = decode_imu(cut.payload, self._encoding, layout)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
+    def vectors(self, rows: Rows, sensor: str) -> Iterator[Vectors]:
+        """Samples of one sensor, `gyro` or `accel`, from messages of an IMU or from plain vectors.
+
+        Raises:
+            LogError: a payload that is no such message.
+        """
+        if self.schema_name == schemas.VECTOR3:
+            yield from (Vectors(part.stamp_ns, part.values, part.frame_id) for part in self.decode_scalars(rows))
+        else:
+            yield from (Vectors(part.stamp_ns, getattr(part, sensor), part.frame_id) for part in self.decode_imu(rows))
+
     def decode_poses(self, rows: Rows) -> Iterator[PoseBatch]:
         """Poses from their bytes, one batch per stretch with one frame and per transform.
 
@@ -162,15 +141,6 @@ class Topic:
         """
         for part, layout in schemas.runs(rows.payload, schemas.TWIST, self.message_encoding):
             yield decode_twist(rows.where(part).payload, self.message_encoding, layout)
-
-
-def named_kind(topic: str, schema_name: str) -> str:
-    """What poses are worth by the words of their topic's name, then by their type."""
-    words = "_".join(filter(None, re.split(r"[^a-z0-9]+", topic.lower())))
-    for kind, pattern in KIND_WORDS.items():
-        if re.search(rf"(^|_)({pattern})(_|$)", words):
-            return kind
-    return "odometry" if re.search(r"[/.]Odometry$", f"/{schema_name}") else "unknown"
 
 
 def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
@@ -285,3 +255,24 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
 
 def _as_ros(topic: Topic, message: Reflected) -> Topic:
     return replace(topic, schema_name=message.schema_name, reflected=message, own_schema=topic.schema_name)
+
+
+def joined_topic(gyro: Topic, accel: Topic, rows: Callable[[str], Iterator[Rows]]) -> tuple[Topic, list[str]]:
+    """IMU on the gyro's stamps of two topics, and notes on rates, delay and samples left out.
+
+    Raises:
+        DataError: the two share no time.
+    """
+    gyro_ns, rates = _column(gyro.vectors(found, "gyro") for found in rows(gyro.name))
+    accel_ns, forces = _column(accel.vectors(found, "accel") for found in rows(accel.name))
+    name = whole_of((gyro.name, accel.name))
+    imu, notes = joined(gyro_ns, rates, accel_ns, forces, name)
+    message = JoinedImu(gyro.cut, partial(gyro.vectors, sensor="gyro"), imu.t_ns, imu.accel)
+    encoding = gyro.message_encoding if gyro.message_encoding in ENCODINGS else "cdr"
+    return Topic(name, schemas.IMU, "ros2msg", encoding, len(imu), {}, message, gyro_topic=gyro.name), notes
+
+
+def _column(parts: Iterable[Iterator[Vectors]]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    every = [vectors for part in parts for vectors in part]
+    stamps, values = [vectors.stamp_ns for vectors in every], [vectors.values for vectors in every]
+    return np.concatenate([np.zeros(0, np.int64), *stamps]), np.concatenate([np.zeros((0, 3)), *values])

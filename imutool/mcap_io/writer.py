@@ -234,8 +234,7 @@ class LogWriter:
         start_ns, end_ns = chunk.start_ns, int(chunk.times.max())
         head = records.chunk_head(chunk.data, packed, name, start_ns, end_ns)
         offset = self.target.position
-        self.target.write(head)
-        self.target.write(packed)
+        self.target.write(head + packed)
         entry = records.ChunkHead.of(head, len(head) + len(packed), offset).index_at(offset, len(head) + len(packed))
         self.write_indexes(entry, chunk.channels, chunk.times, chunk.offsets)
 
@@ -248,15 +247,16 @@ class LogWriter:
     ) -> None:
         """Writes the message indexes of the chunk just written, and enters it in the summary."""
         first, counts = self.target.position, dict[int, int]()
-        for channel in (ids := np.unique(channels).tolist() if len(channels) != 1 else [int(channels[0])]):
-            mask = slice(None) if len(ids) == 1 else channels == channel
-            counts[channel] = len(times[mask])
+        for channel in (ids := np.unique(channels).tolist() if len(channels) > 1 else channels.tolist()):
+            mine = channels == channel if len(ids) > 1 else slice(None)
+            index = messages.message_index(channel, times[mine], offsets[mine])
+            counts[channel] = (len(index) - messages.SINGLE_INDEX.size) // 16 + 1
             entry.message_index_offsets[channel] = self.target.position
-            self.target.write(messages.message_index(channel, times[mask], offsets[mask]))
+            self.target.write(index)
         entry.message_index_length = self.target.position - first
         self.contents.chunks.append(entry)
         if counts:
-            self.contents.add(counts, *((int(times[0]),) * 2 if len(times) == 1 else (int(times.min()), int(times.max()))))
+            self.contents.add(counts, *messages.span(times))
 
     def finish(self) -> None:
         """Ends the data section and writes the summary under the temporary name."""

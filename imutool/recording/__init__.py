@@ -139,7 +139,8 @@ def _dict(value: Any) -> Any:
 class Recording:
     """Recording of one IMU with its true poses, scalar channels, camera frames and metadata.
 
-    `truths`, `scalars` and `frames` are keyed by topic (`/ground_truth/pose`), `metadata` by record name. Equality ignores
+    `truths`, `scalars` and `frames` are keyed by topic (`/ground_truth/pose`), `metadata` by record name. `truths` holds an
+    estimate or odometry only where it was asked for by name; `other_poses` then states its kind. Equality ignores
     frames: the writer copies them byte for byte, which its tests check.
     """
 
@@ -151,7 +152,7 @@ class Recording:
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     imu_topic: str = "/imu0"
     source: str = ""
-    other_poses: Mapping[str, str] = field(default_factory=dict)  # kinds of pose topics that are no truth: not read
+    other_poses: Mapping[str, str] = field(default_factory=dict)  # kinds of pose topics that are no truth
 
     def __post_init__(self) -> None:
         for name in ("other_poses", "truths", "scalars", "frames", "metadata"):
@@ -161,7 +162,7 @@ class Recording:
         """A line for each topic."""
         topics: list[tuple[str, object]] = [(self.imu_topic, self.imu), *self.truths.items(), *self.scalars.items()]
         topics += [(topic, f"{frames.count} frames, {frames.format}") for topic, frames in self.frames.items()]
-        topics += [(topic, f"poses ({kind}), not read") for topic, kind in self.other_poses.items()]
+        topics += [(topic, f"poses ({kind}), not read") for topic, kind in self.other_poses.items() if topic not in self.truths]
         return "\n".join([f"Recording {self.name!r}", *(f"  {topic}: {content}" for topic, content in topics)])
 
     def __eq__(self, other: object) -> bool:
@@ -186,6 +187,12 @@ class Recording:
         if not self.truths:
             raise self.no_truth("no true poses")
         return next(iter(self.truths.values()))
+
+    @property
+    def truth_caveat(self) -> str:
+        """Caveat on poses that were asked for and are no truth; else empty."""
+        chosen = [f"{topic} ({self.other_poses[topic]})" for topic in self.truths if topic in self.other_poses]
+        return f"{', '.join(chosen)} is no truth: poses made with this IMU hide errors of it" if chosen else ""
 
     def no_truth(self, what: str, expected: str = "a pose topic in the log") -> DataError:
         """Error of a recording without truth; it names the poses that are an estimate or odometry."""

@@ -6,6 +6,7 @@ in bounded memory. What a converter knows as numbers (`imus`, `poses`, `scalars`
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,6 +17,12 @@ from jaxtyping import Shaped
 from imutool.recording import Imu, Poses, Scalars, Times
 
 KINDS = ("truth", "estimate", "odometry", "unknown")  # what poses are worth
+
+KIND_WORDS = {  # in the names of topics
+    "truth": "ground_truth|groundtruth|gt|truth|mocap|vicon|vrpn|optitrack|qualisys|natnet",
+    "estimate": "filtered|fused|estimate|estimated|ekf|ukf|kalman|slam|vio|vins|msckf|okvis|orb|lio|amcl|local_position|vision",
+    "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
+}
 
 
 @dataclass(frozen=True)
@@ -61,6 +68,17 @@ class Remarks:
 
     notes: list[str] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)
+
+
+def named_kind(topic: str, schema_name: str) -> str:
+    """What poses are worth by the words of their topic's name, then by their type."""
+    words = "_".join(filter(None, re.split(r"[^a-z0-9]+", topic.lower())))
+    for kind, pattern in KIND_WORDS.items():
+        if re.search(rf"(^|_)({pattern})(_|$)", words):
+            return kind
+    if re.search(r"[/.]Odometry$", f"/{schema_name}"):
+        return "odometry"
+    return "estimate" if schema_name.endswith("PoseWithCovarianceStamped") else "unknown"  # a filter states its covariance
 
 
 def no_messages() -> Iterator[Message]:

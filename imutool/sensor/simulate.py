@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
+from imutool.mcap_io.codec.decode import PoseBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
-from imutool.mcap_io.topics import PoseBatch
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
@@ -126,7 +126,11 @@ def simulate(
     recording = replace(simulation.recording, name=out.stem, metadata={**source.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
     report(4, 4, "")
-    return replace(simulation, recording=recording, settings=settings | {"output": str(out)})
+    others = (
+        f"{entry.name} of {entry.column} is no effect of an IMU, and not simulated" for entry in file.effect if entry.column
+    )
+    remarks = (*simulation.remarks, *others)
+    return replace(simulation, recording=recording, settings=settings | {"output": str(out)}, remarks=remarks)
 
 
 def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int) -> Simulation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from imutool import __version__, registry
 from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias_start.stretches import measured_recording
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
@@ -30,7 +32,7 @@ from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
-
+logger = logging.getLogger(__name__)
 
 LEAST_S = 10.0  # of truth without gaps, in all logs together
 LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
@@ -60,7 +62,7 @@ def train(
 
     Raises:
         ConfigError: the target exists, unknown method or settings, or a checkpoint of another training.
-        LogError, DataError: a log without IMU or truth, different rates, too little to train on.
+        ConfigError, LogError, DataError: a log without IMU, measurements or truth, different rates, too little to train on.
         NumericsError: the loss diverged.
     """
     if out.exists() and not overwrite:
@@ -81,7 +83,10 @@ def train(
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
-    recordings = [read(log, imu=imu, truth=truth) for log in logs]
+    recordings = [measured_recording(read(log, imu=imu, truth=truth)) for log in logs]
+    for recording in recordings:
+        if recording.truth_caveat:
+            logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
     say = progress or (lambda epoch: None)
     descent = _Descent(kept, resume, device, say)
@@ -199,8 +204,16 @@ def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording],
         "torch": torch.__version__,
         "method": method,
         "training": plain(settings),
-        "logs": [{"name": r.name, "file": p.name, "sha256": sha256(p)} for r, p in zip(recordings, logs, strict=True)],
+        "logs": [
+            {"name": r.name, "file": p.name, "sha256": sha256(p), "poses": _kind(r)}
+            for r, p in zip(recordings, logs, strict=True)
+        ],
     }
+
+
+def _kind(recording: Recording) -> str:
+    """What the poses that a model was trained on are worth."""
+    return recording.other_poses.get(next(iter(recording.truths), ""), "truth")
 
 
 def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:

@@ -19,8 +19,8 @@ from imu_defects import late, messages, repeated, with_values, without
 from imutool.cleaning import survey
 from imutool.cleaning.first_pass import examine
 from imutool.cleaning.truth import read_truth
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import ImuBatch
 
 HOUR_NS, HALF_A_SECOND_NS, DELAY_NS, JITTER_NS = 3_600_000_000_000, 500_000_000, 3_000_000, 200_000
 

@@ -1,10 +1,13 @@
 """Whether debiasing knows how sure it is: NEES of the gyro's rest bias along sequences, against what their truth says.
 
     python tests/bench/consistency.py --model M.safetensors LOG... [--start truth] [--start auto] [--start smooth]
+    python tests/bench/consistency.py --left-out TRAINING_LOG...
 
 Every `TRUTH_S` of a log the bias is measured from the truth around (the slope, in time, of what integration misses), and the
 difference to the bias in use is weighed by its covariance plus that of the measurement. Three degrees of freedom: honest
-covariances give a mean of 3; the bounds are chi-square's. V1_01 is compared with its recomputed truth.
+covariances give a mean of 3; the bounds are chi-square's. The coverage is the share of windows within the ellipsoids that
+should hold 68, 95 and 99.7 % of them. With `--left-out` each log is judged by the closed form of all others. V1_01 is compared
+with its recomputed truth.
 
 The calibration's share of a window's covariance is that of the slope: its unknowns are the same at every sample, and what goes
 with the motion mostly cancels over 15 s, which the samples' covariances one by one do not show. What a measurement is worth is
@@ -24,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float64
+from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
@@ -42,6 +46,7 @@ from imutool.mcap_io.read import read
 from imutool.recording import Recording, seconds
 
 LEAST_TRUSTED = 0.5
+SHARES = (0.68, 0.95, 0.997)
 RECOMPUTED = "/ground_truth_recomputed/pose"
 
 
@@ -91,21 +96,32 @@ def main() -> None:
     """One line a log and start, and one for all logs together."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", type=Path, nargs="+")
-    parser.add_argument("--model", type=Path, required=True)
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("--model", type=Path)
+    which.add_argument("--left-out", action="store_true")
     parser.add_argument("--start", action="append", choices=("truth", "auto", "smooth"))
     options = parser.parse_args()
-    model = load(options.model)
+    recordings = []
+    for path in options.logs:
+        recording = read(path)
+        recordings.append(recording.with_truth(RECOMPUTED if RECOMPUTED in recording.truths else next(iter(recording.truths))))
+    models = {r.name: load(options.model) if options.model else of_others(recordings, r) for r in recordings}
     for start in options.start or ("truth", "auto", "smooth"):
         logs = []
-        for path in options.logs:
-            recording = read(path)
-            truths = list(recording.truths)
-            recording = recording.with_truth(RECOMPUTED if RECOMPUTED in truths else truths[0])
+        for recording in recordings:
+            model = models[recording.name]
             one = windows(model, recording, start)
             if len(one[0]):
                 print(f"{start:7}{recording.name:18}", told([one]), flush=True)
                 logs.append(one)
         print(f"{start:7}{'all':18}", told(logs), flush=True)
+
+
+def of_others(recordings: list[Recording], left_out: Recording) -> BiasModel:
+    """Closed form of all logs but one."""
+    from left_out import learned
+
+    return learned([recording for recording in recordings if recording is not left_out], [])
 
 
 def windows(
@@ -147,7 +163,9 @@ def told(logs: list[tuple[np.ndarray, np.ndarray]]) -> str:
     e, P = (np.concatenate(parts) for parts in zip(*logs, strict=True))
     found = consistency(e, P)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
-    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  consistent: {found['consistent']}"
+    squares = np.einsum("mi,mij,mj->m", e, np.linalg.inv(P), e)
+    covered = " / ".join(f"{100 * (squares <= chi2.ppf(share, 3)).mean():.0f}" for share in SHARES)
+    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered} %"
 
 
 if __name__ == "__main__":

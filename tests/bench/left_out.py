@@ -1,31 +1,36 @@
 """How the training logs of a data set predict one another: where settings are chosen, away from every test sequence.
 
     python tests/bench/left_out.py LOG.mcap... [--set model.gyro_effects=[...]] [--start truth:5 --start auto ...]
+    python tests/bench/left_out.py LOG.mcap... --minute
 
 For each log the effects of `hybrid` (without the neural ODE, which would take a minute each) are found on all the others, and
 the log is integrated from every start; AOE in degrees. How long a start from the truth takes, which starts are worth their
-name, and whether an effect earns its place was asked here.
+name, and whether an effect earns its place was asked here. With `--minute` it is the other way round: `train`'s closed form
+on the middle minute of each log alone, scored on all others beside raw samples and `static` (mean AOE of these logs).
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from imutool.bias.model import BiasModel
 from imutool.bias_start.correction import apply
-from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.config import load
+from imutool.errors import ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
-from imutool.recording import Recording
+from imutool.recording import Recording, nanoseconds
 from imutool.training.calibration import PhysicsFirst
 from imutool.training.fit import Training
 from imutool.training.settings import settings_of
 
+MINUTE_S, SCORED = 60.0, ("truth", "auto", "smooth")
 STARTS = ("prior", "truth:2", "truth:5", "truth:10", "truth:15", "auto", "smooth")
 
 
@@ -35,10 +40,14 @@ def main() -> None:
     parser.add_argument("logs", type=Path, nargs="+")
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--start", action="append")
+    parser.add_argument("--minute", action="store_true")
     options = parser.parse_args()
     starts = options.start or list(STARTS)
     recordings = [read(log) for log in options.logs]
     recordings = [r.with_truth(next(iter(r.truths))) for r in recordings]
+    if options.minute:
+        minutes(recordings, options.start or list(SCORED), options.set)
+        return
     print(f"| left out | {' | '.join(starts)} | effects |\n|{'---|' * (len(starts) + 2)}")
     table = []
     for left_out in recordings:
@@ -47,6 +56,37 @@ def main() -> None:
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
         print(f"| {left_out.name} | {' | '.join(f'{a:.2f}' for a in table[-1])} | {found} |", flush=True)
     print(f"| mean | {' | '.join(f'{a:.2f}' for a in np.mean(table, axis=0))} | |")
+
+
+def minutes(recordings: list[Recording], starts: list[str], words: list[str]) -> None:
+    """A row for each log that gave its middle minute."""
+    raw = [float(metrics.evaluate(*along_truth(r.imu, r.truth, r.name))["aoe_deg"]) for r in recordings]
+    static = [at_rest(r) for r in recordings]
+    print(f"| minute of | raw | static | {' | '.join(starts)} | effects |\n|{'---|' * (len(starts) + 4)}")
+    for place, minute_of in enumerate(recordings):
+        both = minute_of.overlap().imu
+        spare_ns = max(0, int(both.t_ns[-1] - both.t_ns[0]) - nanoseconds(MINUTE_S))
+        begin_ns = int(both.t_ns[0]) + spare_ns // 2
+        model = learned([replace(minute_of, imu=both.between(begin_ns, begin_ns + nanoseconds(MINUTE_S)))], words)
+        others = [k for k in range(len(recordings)) if k != place]
+        scores = [np.mean([values[k] for k in others]) for values in (raw, static)]
+        scores += [np.mean([aoe(model, recordings[k], start) for k in others]) for start in starts]
+        found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
+        print(
+            f"| {minute_of.name} | {' | '.join('–' if np.isnan(score) else f'{score:.2f}' for score in scores)} | {found} |",
+            flush=True,
+        )
+
+
+def at_rest(recording: Recording) -> float:
+    """AOE with the log's own bias at rest; NaN where it never rests."""
+    try:
+        model, begun = estimate_at_rest(recording.imu, recording.name)
+    except ModelError:
+        return float("nan")
+    return float(
+        metrics.evaluate(*along_truth(apply(model, begun, recording.imu).imu, recording.truth, recording.name))["aoe_deg"]
+    )
 
 
 def learned(recordings: list[Recording], words: list[str]) -> BiasModel:

@@ -32,12 +32,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.codec.messages import message_record, message_rows
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
-from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.writer import Chunk, LogWriter
 
 IMU, CAMERA, MONO = "/imu0", "/cam0/image_raw/compressed", "/cam1/image_raw"

@@ -92,6 +92,7 @@ def test_tensors_that_lie_on_one_another_are_refused(saved: Path) -> None:
     [
         ("neural_ode", {"curve_width": 4096}),
         ("neural_ode", {"curve_width": 10**15}),
+        ("neural_ode", {"drift_step_s": 1e308}),
         ("conv", {"channels": [512] * 8, "dilations": [1024] * 8, "kernel": 16}),
         ("conv", {"channels": [512] * 100_000}),
         ("linear", {"nonsense": "x" * (MAX_SETTINGS + 1)}),
@@ -133,6 +134,18 @@ def test_weights_that_no_training_gives_are_refused(saved: Path, weight: float) 
     header, data = parts(saved)
     with pytest.raises(ModelError, match="holds numbers that no training gives"):
         load(written(saved, header, np.full(len(data) // 4, weight, np.float32).tobytes()))
+
+
+@pytest.mark.parametrize(
+    ("method", "tensor", "value"),
+    [("conv", "net.gyro.scale", 0.0), ("neural_ode", "drift.gyro.units", 1e-45), ("conv", "net.gyro.layers.0.var", -1.0)],
+)
+def test_inputs_are_divided_by_no_zero(tmp_path: Path, method: str, tensor: str, value: float) -> None:
+    header, data = parts(library() / f"euroc-adis16448-{method}.safetensors")
+    start, end = header[tensor]["data_offsets"]
+    weights = np.full((end - start) // 4, value, np.float32).tobytes()
+    with pytest.raises(ModelError, match="holds scales that no training gives"):
+        load(written(tmp_path / "m.safetensors", header, data[:start] + weights + data[end:]))
 
 
 @pytest.mark.parametrize("name", ["conv", "hybrid", "neural_ode"])

@@ -19,7 +19,7 @@ from imutool.bias_start.initial_bias import tracked_from_prior
 from imutool.bias_start.stretches import MOST_GAP_S, Sieve, StretchClock, measured
 from imutool.debiasing import DebiasedBlock, DebiasReport, debias
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
 from imutool.sensor.made_up_flight import flight
 

@@ -13,7 +13,8 @@ from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.rule import CleaningSettings, every
 from imutool.cleaning.samples import BLOCK, blocks, padded
 from imutool.errors import LogError
-from imutool.mcap_io.topics import ImuBatch, StampCheck
+from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.topics import StampCheck
 from imutool.report import json_values
 from imutool.sensor.made_up_flight import flight
 

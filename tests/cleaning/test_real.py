@@ -12,7 +12,7 @@ from support.imu_defects import batch_of, late, repeated, with_values, without
 from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.truth import Truth
 from imutool.converters import euroc, fetch, tum_vi
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Recording
 
 SOURCES = {

@@ -13,7 +13,7 @@ from imutool.cleaning.finding import Finding
 from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.truth import Truth
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import GRAVITY_M_S2, Poses
 from imutool.sensor.made_up_flight import flight
 

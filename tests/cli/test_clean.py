@@ -16,8 +16,9 @@ from support.imu_defects import messages, repeated, with_values, without, write_
 from imutool.cleaning import CleaningSettings, survey
 from imutool.debiasing import debias
 from imutool.errors import LogError
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import ImuBatch, StampCheck
+from imutool.mcap_io.topics import StampCheck
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.html import cleaning_page

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import os
 import resource
 import shutil
@@ -26,6 +27,7 @@ from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.local import MARK_PART, PARTIAL, remove_abandoned, temporary_path
+from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 from imutool.sensor.made_up_flight import flight
 
@@ -35,10 +37,12 @@ CONFIG, LOST, INTERRUPTED, TERMINATED, KILLED = 3, 3, 130, 143, -signal.SIGKILL
 WAIT_S, POLL_S, TRIES = 60.0, 0.002, 10
 SOON_S, SLACK_S = 2.0, 3.0  # after SIGTERM, for a process and all its children; for a machine busy with other tests
 DISK_BYTES = 1500  # less than any output here
+CHANGED_AT = 6  # read of the log: behind its summary, before its messages
 
 # words of each command that writes a file, and the file; in.mcap is a log of 20 s, seq a raw sequence
 WRITERS: dict[str, tuple[Sequence[str], str]] = {
     "convert": (["convert", "seq", "out.mcap"], "out.mcap"),
+    "convert a log": (["convert", "in.mcap", "out.mcap"], "out.mcap"),
     "debias": (["debias", "in.mcap", "out.mcap"], "out.mcap"),
     "clean": (["clean", "in.mcap", "out.mcap"], "out.mcap"),
     "repair": (["repair", "in.mcap", "out.mcap"], "out.mcap"),
@@ -49,7 +53,11 @@ WRITERS: dict[str, tuple[Sequence[str], str]] = {
     "train": (["train", "in.mcap", "--method", "linear", "-o", "out.safetensors"], "out.safetensors"),
     "trajectories": (["evaluate", "in.mcap", "--trajectories", "out"], "out"),
     "pictures": (["view", "in.mcap", "--png", "out"], "out"),
+    "diagnose": (["diagnose", "in.mcap", "-o", "out"], "out"),
+    "conceal": (["conceal", "in.mcap", "out"], "out"),
+    "live": (["live", "--from", "in.mcap", "--speed", "100", "--save", "out.rrd"], "out.rrd"),
 }
+RERUN = ("save", "live")  # their files are Rerun's: tests/test_bad_input.py
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +203,7 @@ def full_disk() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "save"])  # Rerun's files: tests/test_bad_input.py
+@pytest.mark.parametrize("name", [name for name in WRITERS if name not in RERUN])
 def test_a_full_disk_leaves_nothing(here: Path, imutool: Run, name: str) -> None:
     before = digests(here)
     words, _ = WRITERS[name]
@@ -207,7 +215,7 @@ def test_a_full_disk_leaves_nothing(here: Path, imutool: Run, name: str) -> None
     assert digests(here) == before
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "diagnose"])  # it searches first
 def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None:
     """Not even root makes a file in /proc."""
     words, target = WRITERS[name]
@@ -223,7 +231,7 @@ def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None
 
 
 @pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
-@pytest.mark.parametrize("name", ["debias", "repair", "export"])
+@pytest.mark.parametrize("name", ["convert a log", "debias", "repair", "export"])
 def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: str, change: str) -> None:
     """The output is whole and of the bytes that were there, or there is none and a message says why."""
     words, target = WRITERS[name]
@@ -258,7 +266,43 @@ def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: 
         assert not (here / target).exists()
 
 
-@pytest.mark.parametrize("name", ["convert", "debias", "view", "train"])
+READERS: dict[str, tuple[Sequence[str], str]] = {
+    **{name: case for name, case in WRITERS.items() if name not in ("convert", "convert a log", "pictures")},
+    "info": (["info", "in.mcap", "--json", "out.json"], "out.json"),
+    "audit": (["audit", "in.mcap", "--json", "out.json"], "out.json"),
+}
+
+
+@pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
+@pytest.mark.parametrize("name", READERS)
+def test_an_input_that_changes_at_a_read(
+    here: Path, imutool: Run, monkeypatch: pytest.MonkeyPatch, name: str, change: str
+) -> None:
+    """As above for every command, in this process, at one of its first reads."""
+    words, target = READERS[name]
+    source, read, reads = here / "in.mcap", Source._read, itertools.count(1)
+
+    def changing(self: Source, offset: int, length: int) -> bytes:
+        if self.path.name == source.name and next(reads) == CHANGED_AT:
+            if change == "grows":
+                with source.open("ab") as file:
+                    file.write(b"\0" * 100_000)
+            elif change == "vanishes":
+                source.unlink()
+            else:
+                os.truncate(source, source.stat().st_size // 2)
+        return read(self, offset, length)
+
+    monkeypatch.setattr(Source, "_read", changing)
+    done = imutool(*words, cwd=here)
+    assert next(reads) > CHANGED_AT
+    assert "Traceback" not in done.stderr
+    assert done.returncode in {0, 3, 4, 5}, done.stderr
+    assert partials(here) == []
+    assert (here / target).exists() or (done.returncode and "error: " in done.stderr)
+
+
+@pytest.mark.parametrize("name", ["convert", "debias", "view", "train", "diagnose", "live"])
 def test_of_two_runs_at_once_to_one_target_one_wins(here: Path, command: str, name: str) -> None:
     words, target = WRITERS[name]
     runs = [started(command, words, here) for _ in range(2)]
@@ -266,7 +310,7 @@ def test_of_two_runs_at_once_to_one_target_one_wins(here: Path, command: str, na
     assert sorted(run.returncode for run in runs) == [0, CONFIG], said
     (loser,) = (text for run, text in zip(runs, said, strict=True) if run.returncode)
     assert "exists. " in loser
-    assert (here / target).stat().st_size > DISK_BYTES or name == "train"
+    assert (here / target).stat().st_size > DISK_BYTES or name == "train" or (here / target / "findings.json").exists()
     assert partials(here) == []
 
 

@@ -247,6 +247,27 @@ def test_an_hdf5_file_that_leads_to_another_file_is_refused(convert, tmp_path):
     assert "gyro lies in another file" in done.stderr
 
 
+def test_what_a_table_file_cannot_give_is_said_with_what_to_do(convert, tmp_path):
+    import h5py
+
+    with h5py.File(tmp_path / "object.mat", "w") as file:
+        file["T"] = np.arange(3)
+        file["T"].attrs.update(MATLAB_class=np.bytes_("timetable"), MATLAB_object_decode=3)
+    with h5py.File(tmp_path / "links.h5", "w") as file:
+        file["gyro"] = h5py.ExternalLink("other.h5", "gyro")
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive, archive.open("gyro.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (10**9, 3)})
+    expected = {
+        "object.mat": ("T is a MATLAB object (timetable)", "with writetable as CSV"),
+        "links.h5": ("gyro: links to other files", "Copy the arrays into this file"),
+        "bomb.npz": ("unpacks to 24000000000 bytes", "at most"),
+    }
+    for name, sentences in expected.items():
+        done = convert(tmp_path / name, tmp_path / "out.mcap")
+        assert done.returncode == 4, done.stderr
+        assert all(sentence in done.stderr for sentence in sentences), done.stderr
+
+
 @pytest.mark.parametrize("start", [b"PAR1", b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file, made up"])
 def test_damaged_files_are_refused_in_one_sentence(convert, tmp_path, start):
     (tmp_path / "a").write_bytes(start + bytes(600))

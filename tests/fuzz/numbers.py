@@ -52,10 +52,13 @@ def problems(rng: random.Random, folder: Path) -> Iterator[str]:
     words = ["debias", "in.mcap", "out.mcap", "-q", "--init", rng.choice(STARTS)]
     words += ["--model", model] if model else []
     words += rng.choice(([], [], ["--smooth"], ["--clean"]))
-    with only_below(folder, "out.mcap", "out") as wrong:
+    with only_below(folder, "out.mcap", "out", "out.html", "out.safetensors") as wrong:
         commands = [words, ["info", "in.mcap", "--json", "-"], ["clean", "in.mcap", "--json", "-"]]
         commands += [["evaluate", "in.mcap", *(["--model", model] if model else []), "--json", "-"]]
-        commands += [["export", "in.mcap", "out", "--format", "euroc", "-q"]]
+        commands += [["export", "in.mcap", "out", "--format", "euroc", "-q"], ["audit", "in.mcap", "--json", "-"]]
+        commands += [["live", "--from", "in.mcap", "--speed", "1e9", "--seconds", "5", "--no-view", "--print"]]
+        commands += [["view", "in.mcap", "--html", "out.html", "-q"]]
+        commands += [["train", "in.mcap", "-o", "out.safetensors", "--method", "linear", "--json", "-"]]
         answers = [command(folder, *line) for line in rng.sample(commands, 2)]
     yield from wrong
     for done in answers:

@@ -35,6 +35,7 @@ FOUND = {
     "another log behind a gap, whose first channel the log does not have": ("logs", "2026-11-25", 65),
     "a schema that was cut off by a chunk": ("logs", "2026-11-25", 412),
     "another log behind a gap, of which a channel is not defined": ("logs", "2026-11-26", 99),
+    "bytes of a damaged chunk that look like a schema": ("logs", "harm-29", 20),
 }
 
 

@@ -124,6 +124,9 @@ def make() -> Callable[..., bytes]:
         elif kind == "geometry_msgs/msg/PoseStamped":
             pose = types["geometry_msgs/msg/Pose"](vector(store, values[0], "Point"), quaternion(store, values[1]))
             message = types[kind](head, pose)
+        elif kind == "geometry_msgs/msg/PoseWithCovarianceStamped":
+            pose = types["geometry_msgs/msg/Pose"](vector(store, values[0], "Point"), quaternion(store, values[1]))
+            message = types[kind](head, types["geometry_msgs/msg/PoseWithCovariance"](pose, np.arange(36.0)))
         elif kind == "nav_msgs/msg/Odometry":
             pose = types["geometry_msgs/msg/Pose"](vector(store, values[0], "Point"), quaternion(store, values[1]))
             twist = types["geometry_msgs/msg/Twist"](vector(store, np.ones(3)), vector(store, np.ones(3)))

@@ -22,6 +22,8 @@ from imutool.mcap_io.topics import KIND_KEY, Topic
         ("/mavros/local_position/pose", schemas.POSE, "estimate"),
         ("/wheel/pose", schemas.POSE, "odometry"),
         ("/pose", schemas.POSE, "unknown"),
+        ("/robot/pose", schemas.POSE_COVARIANCE, "estimate"),
+        ("/vicon/pose", schemas.POSE_COVARIANCE, "truth"),
         ("/weight/pose", schemas.POSE, "unknown"),
         ("/tf", schemas.TF, "unknown"),
     ],

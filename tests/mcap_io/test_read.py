@@ -78,12 +78,13 @@ def test_time_of_a_recording_is_the_stamp_and_selection_is_by_log_time(foreign: 
     assert recording.imu.t_ns.tolist() == [START_NS + 5_000_000 * i for i in range(100, 200)]
 
 
-@pytest.mark.parametrize("kind", [schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM])
+@pytest.mark.parametrize("kind", [schemas.POSE, schemas.POSE_COVARIANCE, schemas.ODOMETRY, schemas.TRANSFORM])
 def test_truth_comes_from_any_pose_message(foreign: Foreign, make: Make, kind: str) -> None:
     log = foreign(imu_messages(make) + poses(make, "/odom", kind))
     assert read(log).truths == {}
     assert read(log).other_poses == {"/odom": "odometry"}
     recording = read(log, truth="/odom")
+    assert recording.truth_caveat == "/odom (odometry) is no truth: poses made with this IMU hide errors of it"
     truth = recording.truths["/odom"]
     assert truth.p_wb[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert truth.q_wb_wxyz[0].tolist() == [0.5, -0.5, 0.5, 0.5]

@@ -21,14 +21,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas as schema
-from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.decode import ImuBatch, decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
-from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch, StampCheck
+from imutool.mcap_io.topics import DERIVED_KEY, StampCheck
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording

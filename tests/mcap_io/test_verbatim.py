@@ -26,6 +26,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import message_rows
 from imutool.mcap_io.log import Log
@@ -33,7 +34,6 @@ from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage import local
 from imutool.mcap_io.storage.source import Digest, Source, sha256
-from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.verify import Verified, verify
 from imutool.mcap_io.write import write
 from imutool.mcap_io.writer import Chunk, LogWriter, free_id

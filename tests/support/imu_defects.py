@@ -10,9 +10,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import ImuBatch
 from imutool.recording import Imu
 
 JITTER_NS = 200_000  # of the recorder's clock

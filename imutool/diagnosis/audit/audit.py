@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imutool.bias_start.stretches import measured_recording
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import Expected, noise_faults
@@ -17,7 +18,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
 from imutool.location import Location
-from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.read import read
 from imutool.noise import datasheet
 from imutool.recording import Recording
 from imutool.report import Report
@@ -50,7 +51,8 @@ def audit(sim: Location, real: Location | None = None, *, noise: str | Path = "n
         ConfigError, LogError: a log or the data sheet cannot be read.
         DataError: the simulation has no poses that can be differentiated.
     """
-    simulated, recording = read_log(sim, imu=imu), None if real is None else read_log(real, imu=imu)
+    simulated = measured_recording(read(sim, imu=imu), free_fall=True)
+    recording = None if real is None else measured_recording(read(real, imu=imu))
     sheet = datasheet.read(noise)
     faults = simulator_faults(simulated, recording, sheet)
     not_tested = dict(_not_tested(recording, sheet))

@@ -166,6 +166,8 @@ def known_band_hz(
         band = (f_hz >= low) & (f_hz < high)
         for part in (slice(0, 3), slice(3, 6)):
             e, r, x = (float(abs(density[band, part].sum())) for density in (power, recorded, cross))
+            if not e * r:  # a channel that never moves
+                continue
             gain, coherence = x / e, x * x / (e * r)
             std = np.sqrt((1.0 - coherence) / (2.0 * 3.0 * duration_s * (high - low))) * np.sqrt(r / e)
             diluted = min(1.0 - gain - settings.sigma * std, 1.0 - coherence) > settings.diluted_share

@@ -109,7 +109,7 @@ def reference_caveat(recordings: Sequence[Recording]) -> str:
     texts = (str(text) for recording in recordings for record in recording.metadata.values() for text in record.values())
     if any("and IMU measurements" in text for text in texts):
         return "its poses were estimated with this IMU, and hide errors of the gyro"
-    return ""
+    return next((recording.truth_caveat for recording in recordings if recording.truth_caveat), "")
 
 
 # ── an attitude that is turned throughout ──

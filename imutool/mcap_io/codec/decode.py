@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float64, Int64, UInt8, UInt32
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec.schemas import (
@@ -67,6 +67,45 @@ class TwistColumns(NamedTuple):
     angular: Float64[np.ndarray, "n 3"]
     linear: Float64[np.ndarray, "n 3"]
     variance: Float64[np.ndarray, "n 6"]
+    frame_id: str
+
+
+class ImuBatch(NamedTuple):
+    """Consecutive messages of one IMU; times in ns, rad/s, m/s²."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    gyro: Float64[np.ndarray, "n 3"]
+    accel: Float64[np.ndarray, "n 3"]
+    frame_id: str
+
+
+class PoseBatch(NamedTuple):
+    """Consecutive poses of one frame in another; metres, quaternions as they stand in the log."""
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    p_wb: Float64[np.ndarray, "n 3"]
+    q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    frame_id: str
+    child_frame_id: str
+
+
+class ScalarBatch(NamedTuple):
+    """Consecutive messages of a numeric topic.
+
+    `stamp_ns` is the log time where the message has no header.
+    """
+
+    log_time: Int64[np.ndarray, " n"]
+    publish_time: Int64[np.ndarray, " n"]
+    sequence: UInt32[np.ndarray, " n"]
+    stamp_ns: Int64[np.ndarray, " n"]
+    values: Float64[np.ndarray, "n k"]
     frame_id: str
 
 

@@ -20,6 +20,7 @@ from imutool.errors import LogError
 
 IMU = "sensor_msgs/msg/Imu"
 POSE = "geometry_msgs/msg/PoseStamped"
+POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 VECTOR3 = "geometry_msgs/msg/Vector3Stamped"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 TF = "tf2_msgs/msg/TFMessage"
@@ -100,6 +101,7 @@ def canonical(schema_name: str) -> str:
 SHAPES: dict[str, tuple[str | int, ...]] = {
     IMU: ("header", 37),
     POSE: ("header", 7),
+    POSE_COVARIANCE: ("header", 7 + 36),
     VECTOR3: ("header", 3),
     TWIST: ("header", 6 + 36),
     TF: ("count", "header", "text", 7),

@@ -12,10 +12,12 @@ from jaxtyping import Int64, UInt8, UInt16
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import as_ros1
+from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import Part
-from imutool.mcap_io.topics import DERIVED_KEY, REFLECTED, ImuBatch, Topic
+from imutool.mcap_io.topics import DERIVED_KEY, REFLECTED, Topic
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageTopic
 
@@ -91,7 +93,7 @@ def define(out: LogWriter, new: NewTopic, log: Log, source: Topic, *, own: bool)
         schema = log.index.schemas.get(channel.schema_id)
         data = schema.data if schema else b""
         described = source.own_schema, source.schema_encoding, data, source.message_encoding, tuple(metadata.items())
-        assert source.reflected is not None, "an IMU in such an encoding was found by reflection"
+        assert isinstance(source.reflected, Reflected), "an IMU in such an encoding was found by reflection"
         return out.define(MessageTopic(new.name, *described)), source.reflected.from_cdr
     return out.channel(new.name, new.schema_name, metadata), None
 

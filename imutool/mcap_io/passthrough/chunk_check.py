@@ -47,7 +47,7 @@ def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> 
     raw = everything[: block.length]
     head = block.head(raw)
     indexes = parse_message_indexes(everything[block.length :], block, head.size)
-    data = records.unpack(raw, block.offset, max_chunk)
+    data = records.unpack(raw, block.offset, max_chunk, head)
     if indexes is None:
         return CheckedChunk(head, None, False, messages.parse(data, block.offset))
     found, right = indexes.messages(data, block.offset)

@@ -20,6 +20,7 @@ from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
 from imutool.mcap_io.writer import free_id
 
+SCHEMA = int(Opcode.SCHEMA)
 ChunkKey = tuple[int, int, int]  # start and end in ns, unpacked bytes: what a summary says of a chunk wherever it lies
 
 
@@ -34,6 +35,7 @@ class Recording:
     lists: set[ChunkKey] | None = None  # the chunks in its summary, which are all it has
     ended: bool = False  # its footer was met
     anonymous: bool = False  # no record in the file defines its ids
+    headless: bool = False  # its begin is lost, and may lie ahead of `start`
     ids: dict[int, int] = field(default_factory=dict)  # channel ids of the whole file by its own
     moved: bool = False  # its definitions cannot stay as they are in its chunks
     sizes: dict[int, tuple[int, int]] = field(default_factory=dict)  # the shortest and the longest message of a channel
@@ -56,17 +58,22 @@ class Recording:
         schema = self.schemas.get(known.schema_id)
         return known.topic, known.message_encoding, (schema.name, schema.encoding, schema.data) if schema else None
 
-    def agrees(self, definitions: Iterable[Any]) -> bool:
-        """Whether none of these definitions contradicts its own."""
+    def agrees(self, definitions: Iterable[Any], *, proven: bool = False) -> bool:
+        """Whether none of these definitions contradicts its own; a schema out of nowhere gives way to proven ones."""
         for record in definitions:
             known = (self.schemas if isinstance(record, Schema) else self.channels).get(record.id)
-            if known is not None and not same_definition(known, record):
+            if known is not None and not same_definition(known, record) and not (proven and self._gives_way(known)):
                 return False
         return True
 
+    def _gives_way(self, known: Any) -> bool:
+        """Whether it is a schema that no CRC covers and no channel uses: bytes of a damaged chunk may look like one."""
+        used = {channel.schema_id for channel in self.channels.values()} | {i for opcode, i in self.proven if opcode == SCHEMA}
+        return isinstance(known, Schema) and known.id not in used
+
     def define(self, record: Any, *, proven: bool) -> None:
         """Adds a definition; a proven one replaces one that is not."""
-        opcode = int(Opcode.SCHEMA if isinstance(record, Schema) else Opcode.CHANNEL)
+        opcode = SCHEMA if isinstance(record, Schema) else int(Opcode.CHANNEL)
         if proven or (opcode, record.id) not in self.proven:
             self.known(opcode).setdefault(record.id, record)
             if proven:

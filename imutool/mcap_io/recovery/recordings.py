@@ -60,7 +60,8 @@ class Recordings:
 
     def assign(self, events: Sequence[Event]) -> None:
         """Finds the recording of every block, in file order."""
-        self._complete([event for event in events if isinstance(event, ScannedBlock)])
+        blocks = [event for event in events if isinstance(event, ScannedBlock)]
+        self._complete(blocks)
         runs = definition_runs(events)
         for event in events:
             if isinstance(event, LogStart):
@@ -77,11 +78,13 @@ class Recordings:
             else:
                 self._assign(event)
         self._behind_gap = None
+        for found in blocks:
+            self._doubt(found)
         for recording in self.each:
             self._give_up_misfits(recording, [found for found in self._early if self.of(found.block) is recording])
         for found in self._early:
             self._verify(found, self.of(found.block))
-        self._name_logs([event.block for event in events if isinstance(event, ScannedBlock)])
+        self._name_logs([found.block for found in blocks])
 
     def _complete(self, blocks: Sequence[ScannedBlock]) -> None:
         """Completes what a summary says by what the chunks are that it lists."""
@@ -110,15 +113,13 @@ class Recordings:
         if self._behind_gap is not None:
             self._behind_gap.append(found)
         recording = self._choose(found)
-        listed = found.key in (recording.lists or ())
-        own = parsed(found.definitions, 0, self.losses)
+        listed, own = found.key in (recording.lists or ()), parsed(found.definitions, 0, self.losses)
         kinds = {0} | {record.id for record in own if isinstance(record, Schema)}
         known = {record.id for record in own if isinstance(record, Channel) and record.schema_id in kinds}
         found.evidence = 3 if known >= set(found.block.counts or {}) else 2 if listed else int(self._certain)
         found.block.recording = self.each.index(recording)
         foreign = recording is not self._now and not listed  # of another log, although no record says that one begins
-        self._current = recording
-        self._named = self._named if recording.anonymous else recording
+        self._current, self._named = recording, self._named if recording.anonymous else recording
         if not (found.block.counts or {}).keys() <= recording.readable():
             self._early.append(found)
         self._certain = not foreign and (self._certain or found.evidence > 1 or bool(known))
@@ -168,9 +169,8 @@ class Recordings:
 
     def _begin(self, start: int) -> None:
         """Begins the log whose Header stands at a byte."""
-        self._current = self._named = Recording(start)
+        self._current = self._named = self._new(start)
         self._certain, self._behind_gap = True, None
-        self.each.append(self._current)
 
     def _take_definitions(self, run: Sequence[Definition]) -> None:
         """Takes in definitions outside chunks that follow one another, unless they contradict earlier ones.
@@ -198,7 +198,7 @@ class Recordings:
         """The recording of a block, which may be a new one."""
         own = parsed(found.definitions, found.block.offset, self.losses) if found.definitions else []
         rest = set(found.block.counts or {}) - {record.id for record in own if isinstance(record, Channel)}
-        agreeing = [r for r in (self._now, *self.each) if r.agrees(own)]
+        agreeing = [r for r in (self._now, *self.each) if r.agrees(own, proven=bool(found.crc))]
         listed = [r for r in agreeing if r.lists and found.key in r.lists]
         if not agreeing:
             chosen = self._new_behind_gap(found)
@@ -230,29 +230,28 @@ class Recordings:
             if found.block.compression is None or not found.block.counts:
                 continue
             before = kept.setdefault((found.key, found.crc), found)
-            if before is not found and self._same_contents(before, found):
+            if before is not found and self._contents(before) == self._contents(found):
                 better, worse = sorted((before, found), key=self._evidence, reverse=True)
                 kept[found.key, found.crc], worse.block.lost = better, True
                 self.losses.add_harmless(
                     f"the chunk at byte {worse.block.offset} repeats the one at byte {better.block.offset}"
                 )
 
-    def _same_contents(self, a: ScannedBlock, b: ScannedBlock) -> bool:
-        return self.found_in(a.block).data.tobytes() == self.found_in(b.block).data.tobytes()
+    def _contents(self, found: ScannedBlock) -> bytes:
+        return self.found_in(found.block).data.tobytes()
 
     def _evidence(self, found: ScannedBlock) -> tuple[bool, int]:
         """How well it is known what the messages of a block are."""
-        readable = self.of(found.block).readable()
-        unproven = self.unproven.get(found.block.offset, {})
-        return (found.block.counts or {}).keys() <= readable - unproven.keys(), found.evidence
+        readable = self.of(found.block).readable() - self.unproven.get(found.block.offset, {}).keys()
+        return (found.block.counts or {}).keys() <= readable, found.evidence
 
-    def _new(self, start: int) -> Recording:
-        self.each.append(Recording(start))
+    def _new(self, start: int, *, headless: bool = False) -> Recording:
+        self.each.append(Recording(start, headless=headless))
         return self.each[-1]
 
     def _new_behind_gap(self, found: ScannedBlock) -> Recording:
         """A recording of which a block is, with what others since the last gap define that do not contradict the block."""
-        new = self._new(found.block.offset)
+        new = self._new(found.block.offset, headless=True)
         for block in (found, *(self._behind_gap or ())):
             own = parsed(block.definitions, block.block.offset, self.losses)
             for record in own if new.agrees(own) else ():
@@ -272,12 +271,21 @@ class Recordings:
             [r for r in pool if r.start <= found.block.offset],
         ):
             pool = [r for r in pool if r in narrower] or pool
+        alone = used <= self._now.readable() and not any(used <= r.readable() for r in pool)
+        if self._certain and (alone or self._now in pool):
+            return self._now
+        return self._by_content(found, used, pool)
+
+    def _doubt(self, found: ScannedBlock) -> None:
+        """Weighs a block behind a gap against the logs behind it whose begin is lost: it may lie in one of them."""
+        used, own = set(found.block.counts or {}), self.of(found.block)
+        later = [r for r in self.each if r.headless and r.start > found.block.offset and used <= r.readable()]
+        if later and not found.evidence and used <= own.readable():
+            found.block.recording = self.each.index(self._by_content(found, used, [own, *later]))
+
+    def _by_content(self, found: ScannedBlock, used: set[int], pool: Sequence[Recording]) -> Recording:
+        """The first recording whose definitions fit a block's messages; notes channels of which several topics are possible."""
         open_ids = {i for i in used if len(_topics(i, pool)) > 1}
-        chained = self._certain and used <= self._now.readable()
-        if chained and not any(used <= r.readable() for r in pool):
-            return self._now
-        if self._certain and self._now in pool:
-            return self._now
         if not open_ids:  # of two definitions of one topic the proven holds
             return max(pool, key=lambda r: sum((int(Opcode.CHANNEL), i) in r.proven for i in used))
         fitting = [r for r in pool if all(self._fits(found.block, i, r) for i in open_ids)]

@@ -88,14 +88,13 @@ class RecoveredIndex(LogIndex):
         seen = set[int]()
         for block in self.blocks:
             if block.compression is not None:
-                raw = self.source.at(block.offset, min(block.length, HEAD_BYTES))
-                entry, fields = self._listed.get(block.offset), raw[HEAD.size : HEAD.size + CHUNK_HEAD.size]
-                *times, size, crc, _ = CHUNK_HEAD.unpack(fields)
-                stated = [block.start_ns, block.end_ns, entry.uncompressed_size if entry else size]
-                if [*times, size] != stated or block.head(raw).compression != block.compression:
+                entry = self._listed.get(block.offset)
+                head = block.head(self.source.at(block.offset, min(block.length, HEAD_BYTES)))
+                size = entry.uncompressed_size if entry else head.size
+                if head[:3] != (block.start_ns, block.end_ns, size) or head.compression != block.compression:
                     raise LogError(f"the summary lists the chunk at byte {block.offset} otherwise than it is")
-                key = hash(fields)
-                if crc and key in seen:
+                key = hash(head)
+                if head.crc and key in seen:
                     raise LogError(f"the chunk at byte {block.offset} may repeat another")
                 seen.add(key)
 

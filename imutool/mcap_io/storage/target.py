@@ -43,7 +43,7 @@ class Target:
     def __init__(self, path: Location, *, overwrite: bool = False, summing: bool = True) -> None:
         self.path, self.overwrite = path, overwrite
         self.position, self.crc, self.summing = 0, 0, summing
-        self._medium = _medium(path)
+        self._medium, self._errors = _medium(path), io_errors(path)
         self.temporary = self._medium.temporary
         # Ctrl-C may come between two lines, before `abandon` can be called: then the file goes with this object
         self._remove = weakref.finalize(self, self._medium.discard)
@@ -59,10 +59,12 @@ class Target:
             raise
         except FileExistsError as error:
             raise ConfigError("the target exists", where=self.path, fix="Another program wrote it meanwhile") from error
-        except io_errors(self.path) as error:
-            raise ConfigError(
-                f"cannot be written ({reason(error)})", where=self.path, fix="Choose a place that can be written and has room"
-            ) from error
+        except self._errors as error:
+            raise self._refusal(error) from error
+
+    def _refusal(self, error: Exception) -> ConfigError:
+        what = f"cannot be written ({reason(error)})"
+        return ConfigError(what, where=self.path, fix="Choose a place that can be written and has room")
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Appends bytes.
@@ -70,8 +72,10 @@ class Target:
         Raises:
             ConfigError: the system refuses; the message gives its reason.
         """
-        with self._system_errors():
+        try:  # a context manager would take as long as the rest
             self._medium.write(data)
+        except self._errors as error:
+            raise self._refusal(error) from error
         self.position += len(data)
         if self.summing:
             self.crc = crc32(data, self.crc)

@@ -14,12 +14,12 @@ from imutool.cleaning.truth import Truth, of_poses
 from imutool.errors import DataError, LogError
 from imutool.location import Location
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.decode import TwistColumns
+from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recording
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
-from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Imu, Recording
 from imutool.viewing.model.run_data import LogTimes, Run
 

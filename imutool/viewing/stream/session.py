@@ -19,7 +19,7 @@ from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.stretches import measured
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
 from imutool.viewing.stream.samples import Malformed, Sample
 from imutool.viewing.stream.sources import Samples

@@ -130,11 +130,11 @@ def test_other_writers_messages_decode_exactly(make: Callable[..., bytes], frame
     )
     assert (imu.gyro.tobytes(), imu.accel.tobytes(), imu.frame_id) == (a.tobytes(), b.tobytes(), frame_id)
     assert np.array_equal(imu.stamp_ns, STAMPS)
-    for kind in (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM):
+    for kind in (schemas.POSE, schemas.POSE_COVARIANCE, schemas.ODOMETRY, schemas.TRANSFORM):
         rows = matrix([make(kind, int(s), a[i], q[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
         (pose,) = decode_poses(rows, kind, encoding)
         assert (pose.p_wb.tobytes(), pose.q_wb_wxyz.tobytes()) == (a.tobytes(), q.tobytes())
-        assert pose.child_frame_id == ("" if kind == schemas.POSE else "bodies")
+        assert pose.child_frame_id == ("" if kind in (schemas.POSE, schemas.POSE_COVARIANCE) else "bodies")
         assert np.array_equal(pose.stamp_ns, STAMPS)
     rows = matrix([make(schemas.VECTOR3, int(s), a[i], ros1=ros1, frames=frames) for i, s in enumerate(STAMPS)])
     assert decode_scalars(rows, schemas.VECTOR3, encoding).values.tobytes() == a.tobytes()

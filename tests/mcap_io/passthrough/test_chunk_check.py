@@ -39,9 +39,9 @@ def test_kept_chunks_make_the_same_copy_and_are_unpacked_once(
     source, unpacked = foreign(flight, layout, chunk_size=10_000), list[int]()
     unpack = chunk_check.records.unpack
 
-    def counted(record: memoryview, offset: int, max_chunk: int) -> bytes | memoryview:
+    def counted(record: memoryview, offset: int, *others: Any) -> bytes | memoryview:
         unpacked.append(offset)
-        return unpack(record, offset, max_chunk)
+        return unpack(record, offset, *others)
 
     monkeypatch.setattr(chunk_check.records, "unpack", counted)
     with Log(source) as log:

@@ -69,3 +69,15 @@ def test_chunks_that_no_summary_lists_keep_the_definitions_of_their_own_log(fore
     first.write_bytes(raw[: a[4][1]] + inside + raw[a[4][1] :])
     repair(first, tmp_path / "out.mcap")
     assert by_mcap(tmp_path / "out.mcap") == [m for _, _, each in a + b for m in each]
+
+
+def test_chunks_between_two_gaps_may_be_of_the_log_that_follows_without_its_begin(foreign: Foreign, tmp_path: Path) -> None:
+    first = foreign([text("/mine", 100 + i) for i in range(3)], chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/other", 1000 + i) for i in range(5)], chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, other = stretches(first), stretches(second), first.read_bytes(), second.read_bytes()
+    tail, begin = other[b[2][0] : b[3][1]], other[b[0][0] : b[0][1]]  # chunks that define nothing, and the one that does
+    first.write_bytes(raw[: a[0][1]] + b"\0" * 5 + tail + b"\0" * 5 + begin)
+    report = repair(first, tmp_path / "out.mcap")
+    assert by_mcap(tmp_path / "out.mcap") == [*a[0][2], *b[0][2]]
+    assert report.losses.unproven == 2
+    assert report.losses.topics == {"(/mine or /other)": 2}

@@ -15,11 +15,11 @@ import pytest
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.target import Target
-from imutool.mcap_io.topics import ImuBatch
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
 

@@ -13,7 +13,7 @@ from support.imu_defects import batch_of, late, repeated, with_values, without
 from imutool.cleaning.first_pass import examine
 from imutool.diagnosis_output import FINDINGS as WRITTEN
 from imutool.errors import ConfigError, DataError
-from imutool.mcap_io.topics import ImuBatch
+from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model import events

@@ -17,11 +17,11 @@ from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import started
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.decode import TwistColumns, decode_twist
+from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns, decode_twist
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
-from imutool.mcap_io.topics import DERIVED_KEY, ImuBatch
+from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight

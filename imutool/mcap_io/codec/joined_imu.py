@@ -1,0 +1,67 @@
+"""Gyroscope and accelerometer on topics of their own, joined to one IMU as they are read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from posixpath import commonpath
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, Shaped, UInt8
+
+from imutool.errors import ConfigError
+from imutool.mcap_io.codec.encode import encode_imu
+from imutool.mcap_io.codec.messages import Messages, Rows, columns
+
+Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
+
+
+class Vectors(NamedTuple):
+    """Samples of one sensor: stamps in ns, three numbers each, and their frame."""
+
+    stamp_ns: Int64[np.ndarray, " n"]
+    values: Float64[np.ndarray, "n 3"]
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class JoinedImu:
+    """Messages of a gyroscope as those of an IMU, with the accelerations at their stamps."""
+
+    cut_gyro: Callable[[Messages, Bool[np.ndarray, " n"]], Cut]
+    rates: Callable[[Rows], Iterator[Vectors]]
+    t_ns: Int64[np.ndarray, " n"]  # of the gyro's samples that have an acceleration
+    accel: Float64[np.ndarray, "n 3"]
+
+    def cut(self, found: Messages, mask: Bool[np.ndarray, " n"]) -> Cut:
+        """Heads of the chosen messages that have an acceleration, and their samples as CDR."""
+        for heads, payload in self.cut_gyro(found, mask):
+            start = 0
+            for stamp_ns, gyro, frame in self.rates(columns(heads, payload)):
+                place = np.minimum(np.searchsorted(self.t_ns, stamp_ns), len(self.t_ns) - 1)
+                known = self.t_ns[place] == stamp_ns
+                if known.any():
+                    rows = encode_imu(stamp_ns[known], gyro[known], self.accel[place][known], frame)
+                    yield heads[start : start + len(known)][known], rows
+                start += len(known)
+
+
+def parse_parts(text: str) -> tuple[str, str] | None:
+    """Topics of `gyro=/a,accel=/b`; None of any other name.
+
+    Raises:
+        ConfigError: it begins like that, and one of the two is missing.
+    """
+    if not re.match(r"\s*(gyro|accel)=", text):
+        return None
+    parts = dict(part.strip().partition("=")[::2] for part in text.split(","))
+    if parts.keys() != {"gyro", "accel"} or not all(parts.values()):
+        raise ConfigError(f"{text!r}", where="imu", expected="gyro=TOPIC,accel=TOPIC")
+    return parts["gyro"], parts["accel"]
+
+
+def whole_of(parts: tuple[str, str]) -> str:
+    """Topic of the IMU that two topics make up: `imu` in the folder that they share."""
+    return f"{commonpath(parts).rstrip('/')}/imu"

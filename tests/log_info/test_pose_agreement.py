@@ -1,0 +1,57 @@
+"""Poses are held against the gyro: a planted mount and bias count for nothing, another motion does."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from imutool.cleaning.truth import Truth
+from imutool.log_info.pose_agreement import agreement
+from imutool.recording import Imu
+
+RNG = np.random.default_rng(6)
+START_NS = 1_600_000_000_000_000_123
+T = np.arange(0.0, 30.0, 0.005)
+MOUNT = Rotation.from_rotvec([0.3, -1.2, 0.7])
+NOISE_RAD_S = 0.002
+
+
+def attitude(t: np.ndarray, tempo: float = 1.0) -> Rotation:
+    angles = [0.5 * np.sin(tempo * 2 * np.pi * f * t + k) for k, f in enumerate((0.2, 0.31, 0.13))]
+    return Rotation.from_euler("ZYX", np.stack(angles, axis=1))
+
+
+def poses(tempo: float = 1.0) -> Truth:
+    t = np.arange(0.0, 30.0, 0.1)
+    return Truth(
+        "/pose",
+        START_NS + np.rint(t * 1e9).astype(np.int64),
+        np.zeros((len(t), 3)),
+        attitude(t, tempo).as_quat(scalar_first=True),
+    )
+
+
+def imu(share: float = 1.0) -> Imu:
+    step = 1e-4
+    rate = (attitude(T - step).inv() * attitude(T + step)).as_rotvec() / (2 * step)
+    gyro = share * MOUNT.apply(rate) + [0.02, -0.01, 0.03] + RNG.normal(0.0, NOISE_RAD_S, rate.shape)
+    return Imu(START_NS + np.rint(T * 1e9).astype(np.int64), gyro, np.tile([0.0, 0.0, 9.81], (len(T), 1)))
+
+
+def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias():
+    found = agreement(poses(), imu())
+    assert found is not None
+    assert found.explained > 0.999
+    assert found.rms_rad_s < 2 * NOISE_RAD_S
+
+
+def test_poses_of_another_motion_do_not():
+    found = agreement(poses(tempo=1.7), imu())
+    assert found is not None
+    assert found.explained < 0.3
+
+
+def test_a_gyro_at_rest_or_poses_of_another_time_show_nothing():
+    late = poses()._replace(t_ns=poses().t_ns + 10**12)
+    assert agreement(poses(), imu(share=0.0)) is None
+    assert agreement(late, imu()) is None

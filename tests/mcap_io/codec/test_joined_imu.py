@@ -1,0 +1,87 @@
+"""`gyro=TOPIC,accel=TOPIC` names one IMU of two topics, wherever a topic of an IMU is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool import info
+from imutool.debiasing import debias
+from imutool.errors import ConfigError, LogError
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
+from imutool.mcap_io.codec.joined_imu import parse_parts
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import Series, chunks
+from imutool.mcap_io.writer import LogWriter
+
+START_NS = 1_600_000_000_000_000_123
+RNG = np.random.default_rng(8)
+GYRO_NS = START_NS + np.arange(4000) * 2_500_000  # 400 Hz, 10 s
+ACCEL_NS = START_NS + 1_300_000 + np.arange(2500) * 4_000_000  # 250 Hz, begins later and ends earlier
+GYRO = RNG.normal(0.01, 0.003, (4000, 3))
+ACCEL = np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.02, (2500, 3))
+PARTS = "gyro=/cam/motion_g,accel=/cam/motion_a"
+
+
+def as_imu(sensor: str):
+    """Encoder of an Imu whose other sensor reads nothing, as drivers publish single sensors."""
+
+    def encode(t_ns, values):
+        nothing = np.zeros_like(values)
+        return encode_imu(t_ns, *((values, nothing) if sensor == "gyro" else (nothing, values)), "optical")
+
+    return encode
+
+
+def as_vector(t_ns, values):
+    return encode_vector3(t_ns, values, "optical")
+
+
+def write_log(path: Path, schema: str) -> Path:
+    with LogWriter(path) as log:
+        series = [
+            Series(log.channel(topic, schema, {}), t, (t, v), as_imu(sensor) if schema == schemas.IMU else as_vector)
+            for topic, sensor, t, v in (("/cam/motion_g", "gyro", GYRO_NS, GYRO), ("/cam/motion_a", "accel", ACCEL_NS, ACCEL))
+        ]
+        for chunk in chunks(series):
+            log.chunk(chunk)
+    return path
+
+
+@pytest.mark.parametrize("schema", [schemas.IMU, schemas.VECTOR3])
+def test_two_topics_are_read_as_one_imu_on_the_gyros_stamps(tmp_path, schema, caplog):
+    source = write_log(tmp_path / "two.mcap", schema)
+    imu = read(source, imu=PARTS).imu
+    inside = (ACCEL_NS[0] <= GYRO_NS) & (ACCEL_NS[-1] >= GYRO_NS)
+    assert np.array_equal(imu.t_ns, GYRO_NS[inside])
+    assert np.array_equal(imu.gyro, GYRO[inside])
+    wanted = [np.interp(imu.t_ns - START_NS, ACCEL_NS - START_NS, column) for column in ACCEL.T]
+    np.testing.assert_allclose(imu.accel, np.stack(wanted, axis=1), rtol=1e-12)
+    assert "gyro at 400.0 Hz and accelerometer at 250.0 Hz became one IMU" in caplog.text
+    assert "delay" in caplog.text
+    assert "2 gyro samples have no accelerometer sample near them" in caplog.text
+
+
+def test_debias_writes_one_message_a_gyro_message(tmp_path):
+    source = write_log(tmp_path / "two.mcap", schemas.IMU)
+    done = debias(source, tmp_path / "out.mcap", imus=[PARTS])
+    assert done.rewrite.added["/cam/imu/debiased"] == len(GYRO_NS) - 2
+    debiased = read(tmp_path / "out.mcap", imu="/cam/imu/debiased").imu
+    raw = read(tmp_path / "out.mcap", imu=PARTS).imu
+    assert np.array_equal(debiased.t_ns, raw.t_ns)
+    assert np.abs((raw.gyro - debiased.gyro).mean(axis=0) - 0.01).max() < 3e-4
+    assert {topic.topic for topic in info(tmp_path / "out.mcap").imu} >= {"/cam/motion_g", "/cam/motion_a"}
+
+
+def test_what_is_no_such_pair_is_refused(tmp_path):
+    source = write_log(tmp_path / "two.mcap", schemas.IMU)
+    assert parse_parts("/imu0") is None
+    assert parse_parts("accel=/b, gyro=/a") == ("/a", "/b")
+    with pytest.raises(ConfigError, match="gyro=TOPIC,accel=TOPIC"):
+        parse_parts("gyro=/a")
+    with Log(source) as log, pytest.raises(LogError, match="there is no topic /nowhere"):
+        log.topic("gyro=/nowhere,accel=/cam/motion_a", (schemas.IMU,))
