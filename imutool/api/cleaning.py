@@ -44,6 +44,7 @@ def clean(
     rules: Sequence[str] = (),
     skip_rules: Sequence[str] = (),
     force: bool = False,
+    fix: bool = False,
     init: str = "auto",
     smooth: bool = False,
     overwrite: bool = False,
@@ -59,6 +60,7 @@ def clean(
         rules: Rules to apply; by default all (`imutool clean --help` lists them).
         skip_rules: Rules to leave out.
         force: Write `target` even from a log with the verdict `quarantine`.
+        fix: Correct also the axes that the motion shows to be wrong, in `target`.
         init: Initial bias for `target`, as in `debias`.
         smooth: Smoothing for `target`, as in `debias`.
         overwrite: Replace an existing `target`.
@@ -74,7 +76,7 @@ def clean(
         >>> report.surveys[0].verdict
         'good'
     """
-    wanted = chosen(rules, skip_rules, force)
+    wanted = chosen(rules, skip_rules, force, fix)
     check_outputs([OutputFile("target", target, outputs.LOG)], [source, model], overwrite=overwrite)
     if target is None:
         return _survey(source, imus, wanted)

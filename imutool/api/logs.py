@@ -99,12 +99,11 @@ def convert(
     kinds: Sequence[str] = (),
     mapping: str | Path | None = None,
     imu: str = "",
+    correct: Sequence[str] = (),
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
     """Convert recordings of any format to MCAP logs, one log per sequence.
-
-    The report has `written`, `failures`, `notes`, and `losses`: what a log lacks of its source.
 
     Args:
         source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
@@ -118,12 +117,12 @@ def convert(
         kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
         mapping: TOML file that states what the columns of a table mean.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
+        correct: `conventions`: units, axes and frames that the motion shows to be wrong; `stamps`: put them on a line.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
     Raises:
-        ConfigError: Unknown format or sequence, an existing log without `overwrite`.
-        ImutoolError: No known sequence, or the only one failed. With several, failures are in the report.
+        ImutoolError: Unknown format, no sequence, an existing log; of several sequences the report has failures.
 
     Examples:
         >>> import imutool
@@ -143,6 +142,7 @@ def convert(
         kinds=kinds,
         mapping=None if mapping is None else local(mapping, "mapping"),
         imu=imu,
+        correct=correct,
         workers=workers,
         progress=progress,
     )

@@ -1,4 +1,4 @@
-"""Clean IMU messages of a surveyed log, batch by batch: defects dropped, units converted."""
+"""Clean IMU messages batch by batch: defects dropped, units and axes converted."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ class Cleaner:
 
     def __init__(self, survey: Survey) -> None:
         self._survey, self._count = survey, 0
-        self._scales = bool((survey.scale != 1.0).any())
+        self._matrices = survey.matrices
+        self._converts = bool((self._matrices != np.eye(3)).any())
 
     def __call__(self, batch: ImuBatch) -> ImuBatch:
-        """Remaining messages, in SI units where the survey settled the unit.
+        """Remaining messages, in the units and axes that the survey settled.
 
         Raises:
             LogError: more messages than were surveyed.
@@ -42,9 +43,9 @@ class Cleaner:
         self._count = end
         if not keep.all():
             batch = rows(batch, keep)
-        if self._scales:
-            scale = self._survey.scale
-            batch = batch._replace(gyro=np.multiply(batch.gyro, scale[:3]), accel=np.multiply(batch.accel, scale[3:]))
+        if self._converts:
+            gyro, accel = self._matrices
+            batch = batch._replace(gyro=batch.gyro @ gyro.T, accel=batch.accel @ accel.T)
         return batch
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool import registry
+from imutool.cleaning.conventions import axis_names
 from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, verdict
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
@@ -23,6 +24,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
+from imutool.units import SENSORS
 
 SCHEMA = "imutool.clean/1"
 RECORDED = 20  # intervals of a finding that go into a log's metadata
@@ -40,6 +42,9 @@ class Survey:
     Attributes:
         dropped: whether each message, in file order, is left out.
         scale: factors from the log's units to rad/s and m/s², gyro then accel.
+        axes: signed permutations from the log's axes to right ones, gyro then accel; other than the identity only with `fix`.
+        world: rotation of the poses' world after which z is up.
+        pose_topic: topic of the poses, and `pose_delay_ns` by which they are late.
         surplus: bit-for-bit copies of other messages; to drop them costs nothing.
         reasons: why the log is not to be trusted; empty where it is.
     """
@@ -54,6 +59,10 @@ class Survey:
     surplus: int
     dropped: Bool[np.ndarray, " n"]
     scale: Float64[np.ndarray, "6"]
+    axes: Float64[np.ndarray, "2 3 3"]
+    world: Float64[np.ndarray, "3 3"]
+    pose_topic: str
+    pose_delay_ns: int
     findings: tuple[Finding, ...]
     reasons: tuple[str, ...]
 
@@ -61,6 +70,12 @@ class Survey:
     def valid(self) -> int:
         """Number of messages that the rules keep."""
         return self.messages - int(self.dropped.sum())
+
+    @property
+    def matrices(self) -> Float64[np.ndarray, "2 3 3"]:
+        """Matrices that lead from the log's gyro and accel to rad/s and m/s² in right axes."""
+        product: Float64[np.ndarray, "2 3 3"] = self.axes * self.scale.reshape(2, 1, 3)
+        return product
 
     @property
     def score(self) -> float:
@@ -101,6 +116,7 @@ class Survey:
             last_ns=self.end_ns,
             duration_s=(self.end_ns - self.start_ns) * 1e-9,
             scale={"gyro": float(self.scale[0]), "accel": float(self.scale[3])},
+            axes={sensor: axis_names(P) for sensor, P in zip(SENSORS, self.axes, strict=True)},
             rules=self.settings.names(),
             findings=[finding.report(self.start_ns) for finding in self.findings],
         )
@@ -133,6 +149,7 @@ class SurveyReport(Section, frozen=True, kw_only=True):
     last_ns: int
     duration_s: float
     scale: dict[str, float]
+    axes: dict[str, str]
     rules: list[str]
     findings: list[FindingReport]
 
@@ -199,7 +216,9 @@ def examine(
     reasons = tuple(_reasons(settings, whole, int(dropped.sum()) - surplus, findings))
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
     counts = whole.messages, start_ns, end_ns, missing, surplus
-    return Survey(where, topic, settings, *counts, dropped, whole.scale, findings, reasons)
+    pose_topic = "" if truth is None else truth.topic
+    frames = whole.axes, whole.world, pose_topic, whole.pose_delay_ns
+    return Survey(where, topic, settings, *counts, dropped, whole.scale, *frames, findings, reasons)
 
 
 def _through(

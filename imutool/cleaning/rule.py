@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -13,9 +13,11 @@ from jaxtyping import Float64, Int64
 from msgspec import Meta
 
 from imutool import registry
+from imutool.cleaning.conventions import Conventions, judge
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.samples import Motion, Numbers, Samples
 from imutool.cleaning.truth import Truth
+from imutool.cleaning.unit_evidence import FORCES, accel_reading
 from imutool.config import Settings
 from imutool.errors import ConfigError
 
@@ -30,6 +32,7 @@ class CleaningSettings(Settings, frozen=True, kw_only=True):
     only: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     convert_units: bool = True  # where the unit is settled beyond doubt; else it is only said
+    fix: bool = False  # also axes, where the motion shows them
     max_invalid_share: Share = 0.1  # of the messages dropped, from which on the log is not trusted
     max_missing_share: Share = 0.3  # of the samples its own rate would have brought
     force: bool = False  # clean what cannot be trusted all the same
@@ -53,13 +56,13 @@ def every() -> tuple[str, ...]:
     return tuple(registry.names(GROUP))
 
 
-def chosen(only: Iterable[str], without: Iterable[str], force: bool = False) -> CleaningSettings:
+def chosen(only: Iterable[str], without: Iterable[str], force: bool = False, fix: bool = False) -> CleaningSettings:
     """Settings for the rules of a command line.
 
     Raises:
         ConfigError: a name that is no rule, or one both asked for and left out.
     """
-    rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force)
+    rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force, fix=fix)
     rules.names()
     if both := set(rules.only) & set(rules.without):
         raise ConfigError(f"{min(both)} is asked for and left out", where="rule", fix="Give `rule` or `no_rule`")
@@ -72,6 +75,9 @@ class TopicSummary:
 
     Attributes:
         scale: factors from the log's units to rad/s and m/s², gyro then accel.
+        axes: signed permutations that lead from the log's axes to right ones, gyro then accel.
+        world: rotation of the poses' world after which z is up.
+        pose_delay_ns: by which the stamps of the poses are late.
         late_ns: sorted stamps of late samples (from `time_back`): they are not missing.
         jumps: numbers of the samples before which the clock of the stamps stepped (from `clock_jumps`).
         other_rate_ns: stretches at another rate (from `changed_rate`).
@@ -82,9 +88,18 @@ class TopicSummary:
     motion: Motion
     truth: Truth | None
     scale: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
+    axes: Float64[np.ndarray, "2 3 3"] = field(default_factory=lambda: np.stack([np.eye(3)] * 2))
+    world: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    pose_delay_ns: int = 0
     late_ns: Int64[np.ndarray, " n"] = field(default_factory=lambda: np.zeros(0, np.int64))
     jumps: frozenset[int] = frozenset()
     other_rate_ns: Sequence[tuple[int, int]] = ()
+
+    @cached_property
+    def conventions(self) -> Conventions:
+        """Units, axes and frames that the motion shows."""
+        unit = accel_reading(self.motion).unit
+        return judge(self.motion, self.truth, FORCES.get(unit, 1.0))
 
 
 class Rule(ABC):

@@ -85,6 +85,12 @@ class Motion:
         self._open: tuple[int, Float64[np.ndarray, "7"]] | None = None
         self._mean: tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]] | None = None
 
+    @property
+    def middle_ns(self) -> int:
+        """Start of the steps for what lies in their middle: the mean of a step's samples is half a period before that."""
+        period_ns = (self.end_ns - (self.start_ns or 0)) // max(self.samples - 1, 1)
+        return (self.start_ns or 0) - min(period_ns, STEP_NS) // 2
+
     def see(self, samples: Samples) -> None:
         """Add samples, with increasing stamps."""
         if not len(samples.number):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -11,7 +11,10 @@ from jaxtyping import Float64, Int64
 from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
 from imutool.mcap_io.log import Log
-from imutool.recording import GRAVITY_M_S2, Poses, seconds
+from imutool.recording import Poses, seconds
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 
 class Truth(NamedTuple):
@@ -21,6 +24,7 @@ class Truth(NamedTuple):
     t_ns: Int64[np.ndarray, " n"]
     p_wb: Float64[np.ndarray, "n 3"]
     q_wb_wxyz: Float64[np.ndarray, "n 4"]
+    kind: str = "truth"
 
 
 def read_truth(
@@ -49,7 +53,8 @@ def read_truth(
             q_wxyz = np.concatenate(turns)
             norm = np.linalg.norm(q_wxyz, axis=1)
             good = norm > 0.5
-            return Truth(topic, np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None])
+            columns = np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None]
+            return Truth(topic, *columns, log.topics[topic].pose_kind)
     return None
 
 
@@ -77,12 +82,11 @@ def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " 
     return truth.t_ns[:-1], truth.t_ns[1:], (R[:-1].inv() * R[1:]).as_rotvec() / dt[:, None]
 
 
-def feeling(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Specific force (m/s², body frame) at each inner pose, from second differences."""
+def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Rotation, Float64[np.ndarray, "m 3"]]:
+    """Time, orientation and acceleration (m/s², world) at inner poses, by second differences."""
     from scipy.spatial.transform import Rotation
 
     t_s = seconds(truth.t_ns, int(truth.t_ns[0]))
     v_w = np.diff(truth.p_wb, axis=0) / np.diff(t_s)[:, None]
     a_w = 2.0 * np.diff(v_w, axis=0) / (t_s[2:] - t_s[:-2])[:, None]
-    R = Rotation.from_quat(truth.q_wb_wxyz[1:-1], scalar_first=True)
-    return truth.t_ns[1:-1], R.inv().apply(a_w + np.array([0.0, 0.0, GRAVITY_M_S2]))
+    return truth.t_ns[1:-1], Rotation.from_quat(truth.q_wb_wxyz[1:-1], scalar_first=True), a_w

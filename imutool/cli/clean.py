@@ -31,6 +31,7 @@ def clean(
     rule: Annotated[list[str] | None, typer.Option("--rule", metavar="NAME", help="Run only this rule. Repeatable.")] = None,
     no_rule: Annotated[list[str] | None, typer.Option("--no-rule", metavar="NAME", help="Skip this rule. Repeatable.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Write OUT even if the log cannot be trusted.")] = False,
+    fix: Annotated[bool, typer.Option("--fix", help="In OUT, correct axes that the motion shows to be wrong.")] = False,
     report_to: Annotated[
         Path | None, typer.Option("--report", metavar="F.html", help="Write the findings as an HTML page."), HTML
     ] = None,
@@ -48,13 +49,9 @@ def clean(
     """
     from imutool.cleaning.rule import chosen
 
-    rules = chosen(rule or (), no_rule or (), force)
-    given = {
-        "--model": model,
-        "--smooth": smooth,
-        "--force": force,
-        "--overwrite": overwrite and report_to is None and json_to is None,
-    }
+    rules = chosen(rule or (), no_rule or (), force, fix)
+    given = {"--model": model, "--smooth": smooth, "--force": force, "--fix": fix}
+    given["--overwrite"] = overwrite and report_to is None and json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     added: dict[str, int] = {}

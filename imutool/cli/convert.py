@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,9 @@ from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import progress, say, tell_error, tell_warning, write_json
 from imutool.errors import DataError
 from imutool.report import Report, Section
+
+if TYPE_CHECKING:
+    from imutool.conversion.run import ConvertReport
 
 LOGS = Written(files=("*.mcap",), keeps=True)  # a file, or a folder of files
 FOLDER = Written(files=("*",), keeps=True)
@@ -71,6 +74,8 @@ def convert(
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
     ] = None,
+    fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames shown wrong by the motion.")] = False,
+    restamp: Annotated[bool, typer.Option("--restamp", help="Put the IMU's stamps on the line of its own clock.")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
@@ -93,9 +98,15 @@ def convert(
             kinds=kind or (),
             mapping=map_,
             imu=imu,
+            correct=[name for name, asked in (("conventions", fix), ("stamps", restamp)) if asked],
             workers=workers,
             progress=tell,
         )
+    _tell(report, json_to, overwrite=overwrite, quiet=quiet)
+
+
+def _tell(report: ConvertReport, json_to: str | None, *, overwrite: bool, quiet: bool) -> None:
+    """Report written logs, notes, losses and failures; the exit code says which there are."""
     failures = [Failure(failure.name, failure.message) for failure in report.failures]
     summary = Conversion([str(path) for path in report.written], failures, report.notes, report.losses)
     if not write_json(summary, json_to, overwrite=overwrite):

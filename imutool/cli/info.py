@@ -164,6 +164,7 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
         rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
+        rows += [(imu["topic"], entry["subject"], entry["evidence"]) for entry in imu.get("conventions", [])]
         for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
             noise = imu["noise"]
             if noise is not None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from imutool import registry
+from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError
@@ -73,6 +74,7 @@ def convert(
     kinds: Sequence[str] = (),
     mapping: Path | None = None,
     imu: str = "",
+    correct: Sequence[str] = (),
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
@@ -81,34 +83,34 @@ def convert(
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
     are worth. `mapping` is a file that states what the columns of a table mean.
     `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
+    `correct` names what is corrected: `conventions` that the log's motion shows to be wrong, and `stamps`.
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.
 
     Raises:
         DataError: no converter recognises anything in the source.
-        ConfigError: unknown format or sequence, two sequences of one name, a target that exists, is a source, or cannot
-            be made.
+        ConfigError: unknown format, sequence or correction, two of one name, a target that exists or cannot be made.
         ImutoolError: the only sequence there is (or was asked for) failed; of several, failures go to the report.
     """
-    labels = Labels(sensor, parse_kinds(kinds), parse_pair(imu))
+    labels, corrected = Labels(sensor, parse_kinds(kinds), parse_pair(imu)), parse_corrections(correct)
+    ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
-        return _from_stream(module, source, out, sequences, labels, compression, images, overwrite, progress)
+        return _from_stream(module, source, out, sequences, ways, progress)
     source_sequences = _find(source, format)
     if sequences:
         source_sequences = _only(source_sequences, sequences)
     names = source_sequences.names()
     targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
     jobs = [
-        replace(job, target=target, compression=compression, images=images, overwrite=overwrite, labels=labels, mapping=mapping)
+        replace(ways, converter=job.converter, sequence=job.sequence, target=target)
         for job, target in zip(source_sequences.jobs, targets, strict=True)
     ]
     if len(names) == 1 and source_sequences.errors:
         raise source_sequences.errors[0][1]
     _check_targets(jobs)
     outcomes: dict[int, Outcome] = {}
-    done = len(source_sequences.errors)
     for number, outcome in run_jobs(jobs, _worker_count(workers, len(jobs))):
         outcomes[number] = outcome
-        done += 1
+        done = len(source_sequences.errors) + len(outcomes)
         if progress is not None:
             progress(done, len(names), jobs[number].sequence.name)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
@@ -250,10 +252,7 @@ def _from_stream(
     source: Path,
     out: Path,
     wanted: Sequence[str],
-    labels: Labels,
-    compression: str,
-    images: bool,
-    overwrite: bool,
+    ways: Job,
     progress: Progress | None,
 ) -> ConvertReport:
     """Convert one after the other, with a converter that only has `read`.
@@ -268,8 +267,8 @@ def _from_stream(
     report = ConvertReport()
     for recording in chain(first, recordings):
         (target,) = _targets([recording.name], out, many=len(first) > 1)
-        kept = replace(recording, frames={}) if isinstance(recording, Recording) and not images else recording
-        report.add(target, write_content(kept, target, labels, compression=compression, overwrite=overwrite))
+        kept = replace(recording, frames={}) if isinstance(recording, Recording) and not ways.images else recording
+        report.add(target, write_content(kept, replace(ways, target=target)))
         if progress is not None:
             progress(len(report.written), len(report.written), recording.name)
     missing = set(wanted) - {path.stem for path in report.written} if len(first) > 1 else set(wanted) - {first[0].name}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
+from imutool.conversion.corrections import write_corrected
 from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
@@ -32,6 +34,7 @@ class Job:
     overwrite: bool = False
     labels: Labels = field(default_factory=Labels)
     mapping: Path | None = None  # what the columns of a table mean
+    correct: tuple[str, ...] = ()  # `conventions`, `stamps`
 
 
 @dataclass(frozen=True)
@@ -59,24 +62,29 @@ def _convert_one(job: Job) -> Outcome:
         if given and "mapping" not in inspect.signature(module.read_sequence).parameters:
             raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
         content = module.read_sequence(job.sequence, images=job.images, **given)
-        return write_content(content, job.target, job.labels, compression=job.compression, overwrite=job.overwrite)
+        return write_content(content, job)
     except ImutoolError as error:
         return Outcome(error)
 
 
-def write_content(
-    content: Recording | MessageLog, target: Path, labels: Labels, *, compression: str, overwrite: bool
-) -> Outcome:
-    """Write what a converter has read, with the user's labels.
+def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
+    """Write what a converter has read, with the user's labels, corrected as the job says.
 
     Raises:
         ImutoolError: it cannot be written.
     """
-    labelled = labels.put_on(content)
+    if job.correct:
+        with TemporaryDirectory(prefix=".imutool-", dir=job.target.parent) as folder:
+            recorded = Path(folder) / job.target.name
+            outcome = write_content(content, replace(job, target=recorded, correct=()))
+            ways = {"compression": job.compression}
+            notes = write_corrected(recorded, job.target, job.correct, overwrite=job.overwrite, **ways)
+            return replace(outcome, notes=(*outcome.notes, *notes))
+    labelled = job.labels.put_on(content)
     if isinstance(labelled, Recording):
-        write(labelled, target, compression=compression, overwrite=overwrite)
+        write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
         return Outcome()
-    write_log(labelled, target, compression=compression, overwrite=overwrite)
+    write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
     return Outcome(None, tuple(labelled.remarks.notes), tuple(labelled.remarks.losses))
 
 

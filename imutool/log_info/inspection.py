@@ -14,12 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from imutool.cleaning import raw_batches
+from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.rules.units import unit_findings
+from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
+from imutool.log_info.conventions import convention_summary, convention_warnings, conventions
 from imutool.log_info.pose_agreement import agreement
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
@@ -124,17 +126,19 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     finite = not_finite.measured(gyro) & not_finite.measured(accel)
     imu = _sound(t_ns, gyro, accel)
     later = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
+    stamps = read_stamps(t_ns)
     counts = {
         "out_of_order": int((t_ns < later).sum()),
         "duplicated": len(t_ns) - len(np.unique(t_ns)),
-        "missing": _missing(np.unique(t_ns)),
+        "missing": _missing(np.unique(restamped(t_ns) if stamps.batch > 1.0 else t_ns)),
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
-    rest = _rest(imu)
+    rest, whole = _rest(imu), convention_summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, truth),
+        warnings=_imu_warnings(counts, imu, whole, stamps),
+        conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
         samples=len(t_ns),
         **_clock(t_ns)._asdict(),
@@ -220,7 +224,7 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> list[str]:
+def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stamps: Stamps) -> list[str]:
     words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
@@ -229,12 +233,8 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, truth: Truth | None) -> l
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    return [*warnings, *_unit_warnings(imu, truth)] if len(imu) else [*warnings, "no samples"]
-
-
-def _unit_warnings(imu: Imu, truth: Truth | None) -> list[str]:
-    """Warnings about units, by the same rule as `clean`; its notes are no warnings."""
-    return [finding.what for finding in unit_findings(imu, truth) if finding.severity != "note"]
+    warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
+    return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 
 def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:

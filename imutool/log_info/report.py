@@ -55,6 +55,14 @@ class ImuNoise(Section, frozen=True):
     accel_density_unit: str = "m/s^2/sqrt(Hz)"
 
 
+class Convention(Section, frozen=True):
+    """Convention of an IMU or of its poses: what the motion shows, or why it shows nothing."""
+
+    subject: str
+    judged: bool
+    evidence: str
+
+
 class ImuInfo(Section, frozen=True, kw_only=True):
     """IMU topic: clock from the header stamps, defects, rest and noise.
 
@@ -80,6 +88,7 @@ class ImuInfo(Section, frozen=True, kw_only=True):
     stationary: list[Interval] | UnsetType = UNSET
     accel_at_rest_m_s2: float | UnsetType | None = UNSET
     noise: ImuNoise | UnsetType | None = UNSET
+    conventions: list[Convention] | UnsetType = UNSET
 
 
 class TruthInfo(Section, frozen=True):

@@ -42,6 +42,7 @@ CHANGED_AT = 6  # read of the log: behind its summary, before its messages
 # words of each command that writes a file, and the file; in.mcap is a log of 20 s, seq a raw sequence
 WRITERS: dict[str, tuple[Sequence[str], str]] = {
     "convert": (["convert", "seq", "out.mcap"], "out.mcap"),
+    "convert a log": (["convert", "in.mcap", "out.mcap"], "out.mcap"),
     "debias": (["debias", "in.mcap", "out.mcap"], "out.mcap"),
     "clean": (["clean", "in.mcap", "out.mcap"], "out.mcap"),
     "repair": (["repair", "in.mcap", "out.mcap"], "out.mcap"),
@@ -214,7 +215,7 @@ def test_a_full_disk_leaves_nothing(here: Path, imutool: Run, name: str) -> None
     assert digests(here) == before
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "diagnose"])  # it searches first
 def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None:
     """Not even root makes a file in /proc."""
     words, target = WRITERS[name]
@@ -230,7 +231,7 @@ def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None
 
 
 @pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
-@pytest.mark.parametrize("name", ["debias", "repair", "export"])
+@pytest.mark.parametrize("name", ["convert a log", "debias", "repair", "export"])
 def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: str, change: str) -> None:
     """The output is whole and of the bytes that were there, or there is none and a message says why."""
     words, target = WRITERS[name]
@@ -266,8 +267,7 @@ def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: 
 
 
 READERS: dict[str, tuple[Sequence[str], str]] = {
-    **{name: case for name, case in WRITERS.items() if name not in ("convert", "pictures")},
-    "convert a log": (["convert", "in.mcap", "out.mcap"], "out.mcap"),
+    **{name: case for name, case in WRITERS.items() if name not in ("convert", "convert a log", "pictures")},
     "info": (["info", "in.mcap", "--json", "out.json"], "out.json"),
     "audit": (["audit", "in.mcap", "--json", "out.json"], "out.json"),
 }

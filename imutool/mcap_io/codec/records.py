@@ -124,7 +124,9 @@ def _contradicting(offset: int) -> LogError:
 def unpack(
     record: bytes | memoryview, offset: int, max_chunk: int = MAX_CHUNK, head: ChunkHead | None = None
 ) -> bytes | memoryview:
-    """Unpacked, CRC-checked contents of a Chunk record, whose `head` may be known; a view if it is not compressed.
+    """Unpack a Chunk record and check its CRC; a view where it is not compressed.
+
+    `head` is that of the record, if it is known.
 
     Raises:
         LogError: unknown compression, data that do not unpack to the stated size, or a wrong CRC.

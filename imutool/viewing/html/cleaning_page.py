@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from imutool.cleaning import Finding, Survey
-from imutool.cleaning.rules.units import DEGREES
+from imutool.cleaning.unit_evidence import DEGREES
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html.page import document, text
 

@@ -1,0 +1,300 @@
+"""Conventions of a log: units, axes and signs of the IMU, frames and clock of its poses.
+
+Each answer is the best of a finite set of readings: 48 signed permutations of the axes, times the usual units, times the six
+directions that may be up. A reading is taken where it beats every other by a likelihood ratio of `SURE` standard errors, where
+it explains most of what is there to be explained, and where the motion turns about two axes at least. Else the answer is None:
+rest, planar motion and level flight are no evidence.
+
+The likelihood is Student's, so that a jolt does not decide; its ratio is tested over blocks of time, as neighbours are not
+independent (Vuong, Likelihood ratio tests for model selection, Econometrica 57, 1989, eq. 5.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
+from imutool.cleaning.samples import STEP_S, Motion
+from imutool.cleaning.truth import Truth, force_in_world, turning
+from imutool.cleaning.unit_evidence import RATES
+from imutool.recording import GRAVITY_M_S2
+
+SURE = 3.0  # standard errors of the log likelihood ratio
+CLEARLY = 0.5  # of the misfit of a zero reading, or of the log as it is, that of the best reading at most
+STUDENT = 3.0  # degrees of freedom of the errors
+SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at least: more than a tilted mount leaks
+BLOCKS_S, FEWEST_BLOCKS = 1.0, 8
+
+WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
+MOST_WINDOWS = 600  # evenly taken from a longer log
+TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
+
+FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
+
+
+class Reading(NamedTuple):
+    """Signed permutation and unit of a sensor: true = factor * axes @ measured."""
+
+    axes: Float64[np.ndarray, "3 3"]
+    unit: str
+    certain: float  # standard errors of the likelihood ratio against the second best
+    misfit: float
+    misfit_as_is: float
+    sole: bool = True  # else the nearest to the log's axes of several that fit alike
+
+    @property
+    def names(self) -> str:
+        """Axis names, as `+x +z -y`."""
+        return axis_names(self.axes)
+
+    @property
+    def wrong(self) -> bool:
+        """Whether other axes than the log's fit, and clearly better."""
+        return not self.as_is and self.misfit < CLEARLY * self.misfit_as_is
+
+    @property
+    def as_is(self) -> bool:
+        """Whether the axes are those of the log."""
+        return bool((self.axes == np.eye(3)).all())
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """Conventions that a log's motion shows; None where it does not.
+
+    Attributes:
+        gyro, accel: against the poses, in the frame of their body.
+        relative: the gyro against gravity as the accelerometer reads it.
+        up: axis of the poses' world that points up, as `+z`.
+        delay: of the poses.
+    """
+
+    topic: str = ""
+    gyro: Reading | None = None
+    accel: Reading | None = None
+    relative: Reading | None = None
+    up: str | None = None
+    delay: Delay | None = None
+
+
+def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventions:
+    """Conventions of an IMU, from its motion and its poses; `accel_factor` leads to m/s²."""
+    step, mean = motion.table()
+    if len(step) < WINDOW:
+        return Conventions()
+    relative = _against_gravity(step, mean)
+    if truth is None or motion.start_ns is None:
+        return Conventions(relative=relative)
+    delay = pose_delay(motion, truth)
+    late_ns = 0 if delay is None else round(delay.seconds * 1e9)
+    shifted = truth._replace(t_ns=truth.t_ns - late_ns)
+    gyro = _gyro_against_poses(step, mean, motion.middle_ns, shifted)
+    accel, up = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
+    return Conventions(truth.topic, gyro, accel, relative, up, delay)
+
+
+def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
+    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first."""
+    signed = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            P = np.zeros((3, 3))
+            P[range(3), order] = signs
+            signed.append(P)
+    return np.stack(signed)
+
+
+def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:
+    """Axis names of a signed permutation, as `+x +z -y`."""
+    return " ".join(f"{'+' if row[np.argmax(np.abs(row))] > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P)
+
+
+class _Choice(NamedTuple):
+    best: int
+    certain: float
+    misfit: Float64[np.ndarray, " c"]
+    alike: Bool[np.ndarray, " c"]  # not told from the best
+
+
+def _choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"]) -> _Choice | None:
+    """Best row of errors, by Student's likelihood; None of too little time.
+
+    `certain` is the smallest ratio of the mean of the blocks' likelihood ratios to its standard error.
+    """
+    number, inverse = np.unique(blocks, return_inverse=True)
+    if len(number) < FEWEST_BLOCKS:
+        return None
+    misfit = np.sqrt(np.median(errors**2, axis=1))
+    sigma = max(float(misfit.min()), 1e-9)
+    likelihood = -0.5 * (STUDENT + 3.0) * np.log1p((errors / sigma) ** 2 / STUDENT)
+    sums = np.stack([np.bincount(inverse, row) for row in likelihood])
+    best = int(np.argmax(sums.sum(axis=1)))
+    ahead = sums[best] - sums
+    error = ahead.std(axis=1, ddof=1) * np.sqrt(len(number))
+    z = np.where(error > 0, ahead.sum(axis=1) / np.maximum(error, 1e-300), 0.0)
+    others = np.delete(z, best)
+    return _Choice(best, float(others.min()), misfit, z < SURE)
+
+
+def _excited(rate: Float64[np.ndarray, "n 3"]) -> bool:
+    """Whether the motion turns about two axes at least."""
+    _, second, main = np.linalg.eigvalsh(rate.T @ rate)
+    return bool(second > SECOND_AXIS**2 * main)
+
+
+def _rate_readings(fast: float) -> list[tuple[str, Float64[np.ndarray, "3 3"]]]:
+    """Units under which a fast rate of the log is one of a sensor, each with every permutation."""
+    units = [unit for unit, factor in RATES.items() if 0.02 < fast * factor < FASTEST_RAD_S]
+    return [(unit, RATES[unit] * P) for unit in units for P in signed_permutations()]
+
+
+def _reading(choice: _Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
+    unit, matrix = readings[choice.best]
+    as_is = next(row for row, (name, M) in enumerate(readings) if name == unit and (RATES[unit] * np.eye(3) == M).all())
+    return Reading(
+        np.round(matrix / RATES[unit]), unit, choice.certain, float(choice.misfit[choice.best]), float(choice.misfit[as_is])
+    )
+
+
+def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"]) -> Reading | None:
+    """Reading of the gyro that carries gravity along: f(t) = R f(t + 0.5 s), up to the motion's own acceleration.
+
+    Where a vehicle's thrust is what the accelerometer reads, it does not turn in the body, and a zero rate explains it best.
+    """
+    rate, first, last, number = _windows(step, mean)
+    if not len(rate):
+        return None
+    readings = _rate_readings(float(np.quantile(np.linalg.norm(rate, axis=2), 0.9)))
+    if not readings:
+        return None
+    choice = _choose(_carried(rate, first, last, readings), number)
+    if choice is None or choice.certain < SURE or not _excited(rate.reshape(-1, 3)):
+        return None
+    nothing = float(np.sqrt(np.median(((last - first) ** 2).sum(axis=1))))
+    return _reading(choice, readings) if choice.misfit[choice.best] < CLEARLY * nothing else None
+
+
+def _windows(
+    step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"]
+) -> tuple[Float64[np.ndarray, "w n 3"], Float64[np.ndarray, "w 3"], Float64[np.ndarray, "w 3"], Int64[np.ndarray, " w"]]:
+    """Windows that turn: their angular rates, the specific force at both ends, and the number of their block."""
+    starts = np.arange(1, len(step) - WINDOW - 1)
+    starts = starts[step[starts + WINDOW + 1] - step[starts - 1] == WINDOW + 2]
+    rate = mean[:, :3] - np.median(mean[:, :3], axis=0)
+    rows = starts[:, None] + np.arange(WINDOW + 1)
+    turned = np.linalg.norm(rate[rows].sum(axis=1), axis=1)
+    if not len(starts) or not turned.max() > 0:
+        return np.zeros((0, WINDOW, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
+    use = np.flatnonzero(turned > TURNING * np.quantile(turned, 0.9))
+    starts = starts[use[:: max(1, -(-len(use) // MOST_WINDOWS))]]
+    rows = starts[:, None] + np.arange(WINDOW + 1)
+    smooth = (mean[:-2, 3:] + mean[1:-1, 3:] + mean[2:, 3:]) / 3.0
+    between = 0.5 * (rate[rows[:, :-1]] + rate[rows[:, 1:]])
+    return between, smooth[starts - 1], smooth[starts + WINDOW - 1], step[starts] // (4 * WINDOW)
+
+
+def _carried(
+    rate: Float64[np.ndarray, "w n 3"],
+    first: Float64[np.ndarray, "w 3"],
+    last: Float64[np.ndarray, "w 3"],
+    readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]],
+) -> Float64[np.ndarray, "c w"]:
+    """Length of the error of the specific force that each reading of the rates carries from a window's end to its start.
+
+    A signed permutation P of a rate turns the rotation: exp(P w) = P exp(det(P) w) P^T.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turns: dict[tuple[str, bool], Rotation] = {}
+    for unit in {unit for unit, _ in readings}:
+        for sign in (1.0, -1.0):
+            R = Rotation.identity(len(rate))
+            for k in range(WINDOW):
+                R = R * Rotation.from_rotvec(sign * RATES[unit] * STEP_S * rate[:, k])
+            turns[unit, sign > 0] = R
+    errors = []
+    for unit, matrix in readings:
+        P = matrix / RATES[unit]
+        R = turns[unit, bool(np.linalg.det(P) > 0)]
+        errors.append(np.linalg.norm(R.apply(last @ P) @ P.T - first, axis=1))
+    return np.stack(errors)
+
+
+def _gyro_against_poses(
+    step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], start_ns: int, truth: Truth
+) -> Reading | None:
+    """Reading of the gyro under which it is the rate of the poses."""
+    first, last, rate = turning(truth)
+    use, first_s, last_s = usable(first, last, start_ns, step)
+    if not len(use):
+        return None
+    true = rate[use] - np.median(rate[use], axis=0)
+    measured = between(step, mean[:, :3], first_s, last_s)
+    measured -= np.median(measured, axis=0)
+    readings = _rate_readings(float(np.quantile(np.linalg.norm(measured, axis=1), 0.9)))
+    if not readings:
+        return None
+    errors = np.stack([np.linalg.norm(true - measured @ M.T, axis=1) for _, M in readings])
+    choice = _choose(errors, (first_s / BLOCKS_S).astype(np.int64))
+    lively = np.linalg.norm(true, axis=1) >= np.median(np.linalg.norm(true, axis=1))
+    if choice is None or np.median(errors[choice.best][lively]) > CLEARLY * np.median(np.linalg.norm(true[lively], axis=1)):
+        return None
+    if choice.certain >= SURE and _excited(measured):
+        return _reading(choice, readings)
+    return _nearest(choice, readings) if truth.kind == "truth" else None
+
+
+def _nearest(choice: _Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
+    """Of the readings that fit about as well as the best, the one nearest to the log's axes; it is no proposal."""
+    close = choice.misfit < choice.misfit.min() / CLEARLY
+    good = [row for row in np.flatnonzero(close).tolist() if readings[row][0] == readings[choice.best][0]]
+    nearest = max(good, key=lambda row: float(np.trace(readings[row][1])), default=choice.best)
+    return _reading(choice._replace(best=nearest), readings)._replace(sole=False)
+
+
+def _accel_against_poses(
+    step: Int64[np.ndarray, " m"],
+    accel: Float64[np.ndarray, "m 3"],
+    start_ns: int,
+    truth: Truth,
+    gyro: Reading | None,
+    relative: Reading | None,
+) -> tuple[Reading | None, str | None]:
+    """Axes of the accelerometer against the poses, and the axis of their world that is up.
+
+    a_w + g up = R_wb axes f. Without acceleration (axes, up) and (-axes, -up) fit alike; then neither is told.
+    """
+    at_ns, R, a_w = force_in_world(truth)
+    use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
+    if len(use) < FEWEST_BLOCKS:
+        return None, None
+    f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
+    ups = np.concatenate([np.eye(3)[2:], -np.eye(3)[2:], np.eye(3)[:2], -np.eye(3)[:2]])
+    every = signed_permutations()
+    if gyro is not None and gyro.sole and relative is not None:  # axes that agree with the gyro's, up to the sign of gravity
+        agreed = np.linalg.det(gyro.axes) * gyro.axes @ relative.axes.T * np.linalg.det(relative.axes)
+        every = np.stack([agreed, -agreed])
+    readings = [(P, up) for P in every for up in ups]
+    turned = {k: R[use].apply(f @ P.T) for k, P in enumerate(every)}
+    errors = np.stack(
+        [np.linalg.norm(a_w[use] + GRAVITY_M_S2 * up - turned[k], axis=1) for k in range(len(every)) for up in ups]
+    )
+    choice = _choose(errors, (first_s / BLOCKS_S).astype(np.int64))
+    if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
+        return None, None
+    P, up = readings[choice.best]
+    as_is = float(np.sqrt(np.median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - R[use].apply(f)) ** 2, axis=1))))
+    alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
+    one_up = all((up == other).all() for _, other in alike)
+    one_axes = all((other == P).all() for other, _ in alike)
+    found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
+    named = ("+" if up.sum() > 0 else "-") + "xyz"[int(np.argmax(np.abs(up)))] if one_up else None
+    if gyro is None or not gyro.sole:  # without turns about two axes a proposal has no evidence
+        return found if found is not None and found.as_is else None, named if named == "+z" else None
+    return found, named

@@ -1,0 +1,103 @@
+"""Delay of the poses' stamps, by the cross-correlation of angular rates."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.cleaning.samples import STEP_S, Motion
+from imutool.cleaning.truth import Truth, turning
+from imutool.cleaning.unit_evidence import POSES_APART_NS
+from imutool.recording import seconds
+
+MOST_POSES = 2000  # evenly taken from a longer log
+LONGEST_DELAY_S, FINE_S = 2.0, 0.01
+LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
+DELAY_PARTS, FEWEST = 8, 40  # parts whose own lags show how sure the delay is, and poses in each
+
+
+class Delay(NamedTuple):
+    """Lateness of the poses' stamps against the gyro's, with its standard deviation."""
+
+    seconds: float
+    std_s: float
+
+
+def pose_delay(motion: Motion, truth: Truth) -> Delay | None:
+    """Delay of the poses' stamps by the lengths of the rates; None where it is not shown."""
+    first, last, rate = turning(truth)
+    step, mean = motion.table()
+    start = motion.middle_ns
+    use, first_s, last_s = usable(first, last, start, step)
+    inside = (first_s > LONGEST_DELAY_S + STEP_S * step[0]) & (last_s + LONGEST_DELAY_S < STEP_S * (step[-1] + 1))
+    use, first_s, last_s = use[inside], first_s[inside], last_s[inside]
+    if len(use) < DELAY_PARTS * FEWEST:
+        return None
+    true = np.linalg.norm(rate[use], axis=1)
+    gyro = mean[:, :3] - np.median(mean[:, :3], axis=0)
+
+    def correlations(lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:
+        rows = []
+        for lag in lags:
+            measured = np.linalg.norm(between(step, gyro, first_s - lag, last_s - lag), axis=1)
+            parts = zip(np.array_split(true, DELAY_PARTS), np.array_split(measured, DELAY_PARTS), strict=True)
+            rows.append([_correlation(true, measured), *(_correlation(*part) for part in parts)])
+        return np.array(rows)
+
+    coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
+    whole = correlations(coarse)[:, 0]
+    at = int(np.argmax(whole))
+    if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
+        return None
+    lags = coarse[at] + np.arange(-12, 13) * FINE_S
+    fine = correlations(lags)
+    peaks = np.array([_peak(lags, column) for column in fine.T])
+    parts = peaks[1:][np.isfinite(peaks[1:])]
+    if not np.isfinite(peaks[0]) or len(parts) < DELAY_PARTS // 2:
+        return None
+    return Delay(float(peaks[0]), float(np.std(parts, ddof=1)) / len(parts) ** 0.5)
+
+
+def _correlation(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float((a * b).sum() / np.sqrt(max((a * a).sum() * (b * b).sum(), 1e-300)))
+
+
+def _peak(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) -> float:
+    """Place of the largest value between steps; NaN at the end or of a weak one."""
+    best = int(np.argmax(values))
+    if values[best] < WEAK or best in (0, len(lags) - 1):
+        return float("nan")
+    before, at, after = values[best - 1 : best + 2]
+    curve = before - 2.0 * at + after
+    return float(lags[best] + (0.5 * (before - after) / curve * FINE_S if curve < 0 else 0.0))
+
+
+def between(
+    step: Int64[np.ndarray, " m"],
+    values: Float64[np.ndarray, "m 3"],
+    first_s: Float64[np.ndarray, " n"],
+    last_s: Float64[np.ndarray, " n"],
+) -> Float64[np.ndarray, "n 3"]:
+    """Mean of the values between two times, from the integral of the steps' means."""
+    full = np.arange(int(step[0]), int(step[-1]) + 1)
+    even = np.stack([np.interp(full, step, column) for column in values.T], axis=1)
+    whole = np.concatenate([np.zeros((1, 3)), np.cumsum(even * STEP_S, axis=0)])
+    edges = STEP_S * np.append(full, full[-1] + 1)
+    a, b = (np.stack([np.interp(t, edges, column) for column in whole.T], axis=1) for t in (first_s, last_s))
+    mean: Float64[np.ndarray, "n 3"] = (b - a) / (last_s - first_s)[:, None]
+    return mean
+
+
+def usable(
+    first_ns: Int64[np.ndarray, " n"], last_ns: Int64[np.ndarray, " n"], start_ns: int, step: Int64[np.ndarray, " m"]
+) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
+    """Pairs of neighbouring poses inside the IMU's time: rows, and their ends in seconds."""
+    first_s, last_s = seconds(first_ns, start_ns), seconds(last_ns, start_ns)
+    use = np.flatnonzero(
+        (first_s > STEP_S * step[0]) & (last_s < STEP_S * (step[-1] + 1)) & (last_ns - first_ns < POSES_APART_NS)
+    )
+    use = use[:: max(1, -(-len(use) // MOST_POSES))]
+    return use, first_s[use], last_s[use]

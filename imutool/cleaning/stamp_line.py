@@ -1,0 +1,122 @@
+"""Clock of a sensor under stamps that are late, come in batches, or wrap.
+
+A stamp is never earlier than its sample, so the sensor's own clock is a line under the stamps: the edge of their lower convex
+hull above the middle of a window, which has the least sum of delays (Moon, Skelly and Towsley, Estimation and removal of clock
+skew from network delay measurements, INFOCOM 1999; the hull: Zhang, Liu and Xia, INFOCOM 2002). Straight lines join the middles
+of windows, so that a crystal may drift. Stamps take 8 bytes a sample.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool.recording import nanoseconds
+
+WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds
+GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
+GAP_BATCHES = 1.7  # batches: samples are missing in a longer step, which ends a stretch, as one back does
+WRAPS = {
+    f"{bits} bit of {unit}": 2**bits * ns for bits in (16, 32) for unit, ns in (("ns", 1), ("us", 1000), ("ms", 1_000_000))
+}
+BUNCHED = 0.3  # of the mean period: a shorter step is within a batch
+BATCHED = 0.3  # share of such steps from which on stamps come in batches
+
+
+class Stamps(NamedTuple):
+    """Stamps of a topic without the wraps of its counter, and what was wrong with them.
+
+    Attributes:
+        batch: mean samples in a batch; 1 where they come one by one.
+    """
+
+    stamp_ns: Int64[np.ndarray, " n"]
+    wraps: Counter[str]
+    batch: float
+
+    @property
+    def told(self) -> list[str]:
+        """What is wrong, in words."""
+        words = [
+            f"the clock of the stamps wraps {count} times, as a counter of {name} does" for name, count in self.wraps.items()
+        ]
+        if self.batch > 1.0:
+            words.append(f"stamps come in batches of about {self.batch:.1f} samples: the driver's, not the sensor's")
+        return words
+
+
+def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
+    """Stamps with wraps taken up: steps back by the range of a counter."""
+    steps, wraps = np.diff(stamp_ns), Counter[str]()
+    usual = int(np.median(steps)) if len(steps) else 0
+    for row in np.flatnonzero(steps < -max(usual, 1)):
+        for name, size in WRAPS.items():
+            if size > 16 * usual > 0 and abs(int(steps[row]) + size - usual) <= max(8 * usual, size // 1000):
+                wraps[name] += 1
+                steps[row] += size
+                break
+    whole = np.concatenate([stamp_ns[:1], stamp_ns[:1] + np.cumsum(steps)]) if len(stamp_ns) else stamp_ns
+    near = steps[(steps >= 0) & (steps < GAP_NS)]
+    share = float((near < BUNCHED * near.mean()).mean()) if len(near) > WINDOW else 0.0
+    return Stamps(whole, wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0)
+
+
+def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+    """Stamps on the line under them, by stretches without a gap.
+
+    They increase, but where the clock was set back.
+    """
+    found = read_stamps(stamp_ns)
+    whole, steps = found.stamp_ns, np.diff(found.stamp_ns)
+    near = steps[(steps >= 0) & (steps < GAP_NS)]
+    if not len(near):
+        return whole
+    batch_ns = found.batch * float(near.mean()) if found.batch > 1.0 else float(np.median(near))
+    back = np.flatnonzero(steps < -GAP_NS) + 1
+    ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns) + 1
+    out = whole.copy()
+    for first, end in pairwise([0, *np.union1d(back, ends).tolist(), len(whole)]):
+        if end - first > 2:
+            out[first:end] = whole[first] + np.rint(_line(whole[first:end] - whole[first])).astype(np.int64)
+    for first, end in pairwise([0, *back.tolist(), len(whole)]):
+        number = np.arange(end - first)
+        out[first:end] = np.maximum.accumulate(out[first:end] - number) + number
+    return out
+
+
+def _line(delayed_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Times on the line under the stamps of one stretch."""
+    n = len(delayed_ns)
+    count = max(1, round(n / WINDOW))
+    number, stamp = np.arange(n, dtype=np.float64), delayed_ns.astype(np.float64)
+    bounds = np.linspace(0, n, count + 1).astype(int)
+    knots = [_under(number[a:b], stamp[a:b]) for a, b in pairwise(bounds)]
+    x, y, slope = (np.array(column) for column in zip(*knots, strict=True))
+    line: Float64[np.ndarray, " n"] = np.interp(number, x, y)
+    before, after = number < x[0], number > x[-1]
+    line[before] = y[0] + slope[0] * (number[before] - x[0])
+    line[after] = y[-1] + slope[-1] * (number[after] - x[-1])
+    return line
+
+
+def _under(x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"]) -> tuple[float, float, float]:
+    """Middle, and value and slope there, of the edge of the lower convex hull above the middle."""
+    hull: list[int] = []
+    for row in range(len(x)):
+        while len(hull) > 1 and _turns_right(x, y, hull[-2], hull[-1], row):
+            hull.pop()
+        hull.append(row)
+    middle = float(x.mean())
+    right = max(1, int(np.searchsorted(x[hull], middle)))
+    a, b = hull[right - 1], hull[right]
+    slope = float((y[b] - y[a]) / (x[b] - x[a]))
+    return middle, float(y[a] + slope * (middle - x[a])), slope
+
+
+def _turns_right(x: Float64[np.ndarray, " n"], y: Float64[np.ndarray, " n"], a: int, b: int, c: int) -> bool:
+    """Whether b lies on or above the line from a to c."""
+    return bool((y[b] - y[a]) * (x[c] - x[a]) >= (y[c] - y[a]) * (x[b] - x[a]))

@@ -1,0 +1,239 @@
+"""Correct a converted log: units, axes and stamps of IMUs, world and clock of poses.
+
+Messages are patched where they stand, so everything else of them stays: covariances turn with their vectors, and the poses in
+the judged poses' frame turn with it. The record `imutool_corrections` says what was changed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from imutool import registry
+from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
+from imutool.cleaning.conventions import axis_names
+from imutool.cleaning.stamp_line import read_stamps, restamped
+from imutool.conversion.message_writer import write_log
+from imutool.errors import ConfigError
+from imutool.geometry import quaternion
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import NO_ORIENTATION
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import VELOCITY_KEY
+from imutool.mcap_io.storage.outputs import refuse_existing
+from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
+from imutool.recording.message_log import Message, MessageLog, MessageTopic
+
+RECORD = "imutool_corrections"
+CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
+XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Corrections that a log needs.
+
+    Attributes:
+        imus: by topic, the matrices that lead from its gyro and accel to right ones.
+        world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
+        stamps: new stamps of an IMU's messages, in file order.
+        notes: what is corrected, by topic.
+    """
+
+    imus: Mapping[str, Float64[np.ndarray, "2 3 3"]] = field(default_factory=dict)
+    world: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    frame_id: str = ""
+    late_ns: int = 0
+    stamps: Mapping[str, Int64[np.ndarray, "..."]] = field(default_factory=dict)
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to correct."""
+        return bool(self.notes)
+
+    def put_on(self, content: MessageLog) -> MessageLog:
+        """Log with corrected messages, and the record of what was corrected."""
+        said = [f"{topic}: {note}" for topic, note in self.notes.items()]
+        content.remarks.notes.extend(said)
+        metadata = {**content.metadata, RECORD: dict(self.notes)}
+        return replace(content, messages=lambda: self._each(content.messages()), metadata=metadata)
+
+    def _each(self, messages: Iterator[Message]) -> Iterator[Message]:
+        seen = Counter[str]()
+        for message in messages:
+            name, stamps = message.topic.name, self.stamps.get(message.topic.name)
+            if stamps is None:
+                yield self._corrected(message)
+                continue
+            patch = _Patch(message.topic, bytes(message.payload))
+            patch.move_stamp(int(stamps[seen[name]]) - patch.stamp_ns())
+            seen[name] += 1
+            yield self._corrected(message._replace(payload=bytes(patch.data)))
+
+    def _corrected(self, message: Message) -> Message:
+        topic = message.topic
+        name = schemas.canonical(topic.schema_name)
+        if topic.message_encoding not in ENCODINGS:
+            return message
+        if topic.name in self.imus:
+            return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
+        turned = bool((self.world != np.eye(3)).any())
+        if (turned or self.late_ns) and name in (*MESSAGE_POSES, schemas.TF):
+            return message._replace(payload=self._poses(topic, bytes(message.payload)))
+        if turned and name == schemas.VECTOR3 and VELOCITY_KEY in dict(topic.metadata):
+            patch = _Patch(topic, bytes(message.payload))
+            patch.numbers()[:] = self.world @ patch.numbers()
+            return message._replace(payload=bytes(patch.data))
+        return message
+
+    def _poses(self, topic: MessageTopic, payload: bytes) -> bytes:
+        patch = _Patch(topic, payload)
+        named = 2 if "text" in schemas.SHAPES[patch.schema_name] else 1
+        turn = _quaternion(self.world)
+        for which in range(len(patch.layout.stamps)):
+            if patch.layout.texts[named * which] != self.frame_id:
+                continue
+            numbers = patch.numbers(which)
+            numbers[schemas.POSITION] = self.world @ numbers[schemas.POSITION]
+            q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW][None].astype(np.float64)
+            numbers[schemas.XYZW] = quaternion.multiply(turn, q_wxyz)[0][XYZW_FROM_WXYZ]
+            patch.move_stamp(-self.late_ns, which)
+        return bytes(patch.data)
+
+
+class _Patch:
+    """Payload whose numbers and stamps are written in place."""
+
+    def __init__(self, topic: MessageTopic, payload: bytes) -> None:
+        self.schema_name = schemas.canonical(topic.schema_name)
+        self.layout = schemas.layout_of(self.schema_name, topic.message_encoding, message=payload)
+        self.data = bytearray(payload)
+
+    def numbers(self, which: int = 0) -> np.ndarray:
+        """Numbers of one element: a view."""
+        at, count = self.layout.numbers[which]
+        return np.frombuffer(self.data, f"{self.layout.order}f8", count, at)
+
+    def stamp_ns(self, which: int = 0) -> int:
+        """Stamp of one element."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        return int(seconds[0]) * schemas.NS_PER_S + int(np.frombuffer(self.data, f"{order}u4", 1, at + 4)[0])
+
+    def move_stamp(self, by_ns: int, which: int = 0) -> None:
+        """Shift a stamp."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
+        seconds[0], nanos[0] = divmod(self.stamp_ns(which) + by_ns, schemas.NS_PER_S)
+
+
+def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:
+    """Message of an IMU with both vectors, their covariances and its own orientation in right units and axes."""
+    patch = _Patch(topic, payload)
+    numbers = patch.numbers()
+    for matrix, vector, covariance in (
+        (gyro, schemas.GYRO, schemas.GYRO_COVARIANCE),
+        (accel, schemas.ACCEL, schemas.ACCEL_COVARIANCE),
+    ):
+        numbers[vector] = matrix @ numbers[vector]
+        if numbers[covariance][0] != -1.0:
+            numbers[covariance] = (matrix @ numbers[covariance].reshape(3, 3) @ matrix.T).reshape(-1)
+    if numbers[schemas.ORIENTATION_COVARIANCE][0] != NO_ORIENTATION:
+        P, Q = (np.sign(matrix) * (matrix != 0) for matrix in (gyro, accel))
+        if (P == Q).all() and np.linalg.det(P) > 0:
+            q_wxyz = numbers[schemas.ORIENTATION][WXYZ_FROM_XYZW][None].astype(np.float64)
+            numbers[schemas.ORIENTATION] = quaternion.multiply(q_wxyz, _quaternion(P.T))[0][XYZW_FROM_WXYZ]
+        else:
+            numbers[schemas.ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
+    return bytes(patch.data)
+
+
+def parse_corrections(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of corrections.
+
+    Raises:
+        ConfigError: another name.
+    """
+    for name in names:
+        if name not in (CONVENTIONS, STAMPS):
+            raise ConfigError(f"{name!r}", where="correct", expected=f"{CONVENTIONS} or {STAMPS}")
+    return tuple(names)
+
+
+def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
+    """Corrections that a log shows to be needed.
+
+    Raises:
+        LogError: damage.
+    """
+    imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
+    stamps: dict[str, Int64[np.ndarray, "..."]] = {}
+    notes: dict[str, list[str]] = defaultdict(list)
+    world, frame_id, late_ns = np.eye(3), "", 0
+    with Log(path) as log:
+        for topic in log.imu_topics:
+            if log.topics[topic].message_encoding not in ENCODINGS or log.topics[topic].reflected is not None:
+                continue
+            if STAMPS in wanted:
+                before = np.concatenate([np.zeros(0, np.int64), *(batch.stamp_ns for batch in raw_batches(log, topic))])
+                stamps[topic] = restamped(before)
+                moved_s = 1e-9 * float(np.abs(stamps[topic] - before).max(initial=0))
+                said = "; ".join(read_stamps(before).told)
+                line = f"stamps are now on a line under them, moved by {moved_s:.6f} s at most"
+                notes[topic].append(f"{said}; {line}" if said else line)
+            if CONVENTIONS not in wanted:
+                continue
+            survey = look(log, topic, CleaningSettings(fix=True))
+            if (survey.matrices != np.eye(3)).any():
+                imus[topic] = survey.matrices
+                notes[topic].append(_imu_note(survey))
+            if not frame_id and (survey.pose_delay_ns or (survey.world != np.eye(3)).any()):
+                world, late_ns = survey.world, survey.pose_delay_ns
+                frame_id = next(log.pose_batches(survey.pose_topic)).frame_id
+                notes[survey.pose_topic].append(_pose_note(survey))
+    return Corrections(imus, world, frame_id, late_ns, stamps, {topic: "; ".join(said) for topic, said in notes.items()})
+
+
+def _imu_note(survey: Survey) -> str:
+    gyro, accel = (axis_names(P) for P in survey.axes)
+    scale = f"gyro times {survey.scale[0]:.9g}, accel times {survey.scale[3]:.9g}"
+    return f"{scale}; x, y, z are now {gyro} of gyro and {accel} of accel as recorded"
+
+
+def _pose_note(survey: Survey) -> str:
+    parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
+    parts += [f"stamps are earlier by {survey.pose_delay_ns} ns"] if survey.pose_delay_ns else []
+    return "; ".join(parts)
+
+
+def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
+    """Write a log with what its motion shows to be wrong corrected; notes say what.
+
+    Raises:
+        ImutoolError: damage, or the target cannot be written.
+    """
+    found = find_corrections(log, wanted)
+    if not found:
+        refuse_existing(target, overwrite=overwrite)
+        log.replace(target)
+        return ("the motion shows nothing to correct",)
+    module = registry.load("imutool.converters", "mcap_log")
+    content: MessageLog = module.read_sequence(next(iter(module.sequences(log))))
+    with Log(log) as opened:
+        own = opened.metadata()
+    content = found.put_on(replace(content, metadata=own))
+    write_log(content, target, compression=compression, overwrite=overwrite)
+    return tuple(content.remarks.notes)
+
+
+def _quaternion(R: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "1 4"]:
+    from scipy.spatial.transform import Rotation
+
+    q_wxyz: Float64[np.ndarray, "1 4"] = Rotation.from_matrix(R).as_quat(scalar_first=True)[None]
+    return q_wxyz

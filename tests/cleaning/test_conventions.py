@@ -1,0 +1,150 @@
+"""Every unit, frame and permutation of the axes is named in a made-up log; where the motion shows nothing, nothing is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.imu_defects import batch_of
+
+from imutool.cleaning.conventions import Conventions, judge, signed_permutations
+from imutool.cleaning.first_pass import Survey, examine
+from imutool.cleaning.rule import CleaningSettings
+from imutool.cleaning.rules.axes import TO_Z_UP
+from imutool.cleaning.samples import Motion, Samples
+from imutool.cleaning.truth import Truth, of_poses
+from imutool.cleaning.unit_evidence import FORCES, RATES
+from imutool.recording import GRAVITY_M_S2, Imu, Poses
+from imutool.sensor.made_up_flight import flight
+
+PERMUTATIONS = signed_permutations()
+RATE_HZ = 100
+
+
+def motion_of(imu: Imu) -> Motion:
+    motion = Motion()
+    motion.see(Samples(np.arange(len(imu)), imu.t_ns, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1)))
+    return motion
+
+
+def turned(omega: np.ndarray, a_w: np.ndarray | None = None, noise: float = 0.002) -> tuple[Imu, Poses]:
+    """IMU and poses of a body that turns at the given rates, and accelerates in the world."""
+    t_ns = np.arange(len(omega)) * (1_000_000_000 // RATE_HZ)
+    steps = Rotation.from_rotvec(omega / RATE_HZ)
+    R = [Rotation.identity()]
+    for step in steps[:-1]:
+        R.append(R[-1] * step)
+    R_wb = Rotation.concatenate(R)
+    a_w = np.zeros_like(omega) if a_w is None else a_w
+    rng = np.random.default_rng(5)
+    accel = R_wb.inv().apply(a_w + np.array([0.0, 0.0, GRAVITY_M_S2])) + 10 * noise * rng.normal(size=omega.shape)
+    p_wb = np.cumsum(np.cumsum(a_w, axis=0), axis=0) / RATE_HZ**2
+    return Imu(t_ns, omega + noise * rng.normal(size=omega.shape), accel), Poses(t_ns, p_wb, R_wb.as_quat(scalar_first=True))
+
+
+def waves(seconds: float, sizes: tuple[float, float, float], seed: int = 1) -> np.ndarray:
+    """Smooth signals of three axes."""
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    rng = np.random.default_rng(seed)
+    parts = [np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6, 3)) for f in (0.13, 0.29, 0.41, 0.67)]
+    return np.sum(parts, axis=0) * sizes
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[Imu, Truth]:
+    made = flight(3, duration_s=40.0)
+    truth = of_poses("/ground_truth/pose", made.truth)
+    assert truth is not None
+    return made.imu, truth
+
+
+@pytest.mark.parametrize("number", range(48))
+def test_units_axes_and_worlds_are_named_by_poses(number: int, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    P, Q = PERMUTATIONS[number], PERMUTATIONS[(7 * number + 5) % 48]
+    unit, force_unit = list(RATES)[number % len(RATES)], list(FORCES)[number % len(FORCES)]
+    up = ["+z", *TO_Z_UP][number % 6]
+    C = np.eye(3) if up == "+z" else TO_Z_UP[up].T
+    late_ns = 40_000_000 * (number % 3 - 1)
+    world = truth._replace(
+        t_ns=truth.t_ns + late_ns,
+        p_wb=truth.p_wb @ C.T,
+        q_wb_wxyz=(Rotation.from_matrix(C) * Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True),
+    )
+    planted = Imu(imu.t_ns, imu.gyro @ P / RATES[unit], imu.accel @ Q / FORCES[force_unit])
+    found = judge(motion_of(planted), world, FORCES[force_unit])
+    assert found.gyro is not None
+    assert (found.gyro.axes == P).all()
+    assert found.gyro.unit == unit
+    assert found.accel is not None
+    assert (found.accel.axes == Q).all()
+    assert found.up == up
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(late_ns * 1e-9, abs=0.005)
+
+
+@pytest.mark.parametrize("number", range(48))
+def test_units_and_axes_of_the_gyro_are_named_by_gravity(number: int) -> None:
+    P, unit = PERMUTATIONS[number], list(RATES)[number % len(RATES)]
+    imu, _ = turned(waves(60.0, (0.3, 0.3, 0.3)))
+    found = judge(motion_of(Imu(imu.t_ns, imu.gyro @ P / RATES[unit], imu.accel)), None, 1.0).relative
+    assert found is not None
+    assert (found.axes == P).all()
+    assert found.unit == unit
+
+
+NULLS = {
+    "rest": (waves(60.0, (0.0, 0.0, 0.0)), None),
+    "planar": (waves(60.0, (0.0, 0.0, 0.4)), 1.5 * waves(60.0, (1.0, 1.0, 0.0), 2)),
+    "planar on a rough road": (waves(60.0, (0.02, 0.02, 0.4)), 1.5 * waves(60.0, (1.0, 1.0, 0.3), 3)),
+}
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 4.0])
+@pytest.mark.parametrize("name", NULLS)
+@pytest.mark.parametrize("posed", ["truth", "unknown", ""])
+def test_rest_and_planar_motion_propose_nothing(name: str, posed: str, tilt_deg: float) -> None:
+    omega, a_w = NULLS[name]
+    imu, poses = turned(omega, a_w)
+    mount = Rotation.from_euler("xy", [tilt_deg, -tilt_deg], degrees=True)
+    imu = Imu(imu.t_ns, mount.apply(imu.gyro.copy()), mount.apply(imu.accel.copy()))
+    truth = of_poses("/pose", poses) if posed else None
+    survey = looked(imu, None if truth is None else truth._replace(kind=posed), fix=True)
+    assert not [finding for finding in survey.findings if finding.rule in ("axes", "units")]
+    assert (survey.matrices == np.eye(3)).all()
+
+
+def test_wheel_odometry_of_another_frame_is_no_evidence() -> None:
+    """Poses of unknown kind that turn otherwise than the gyro, about one axis: nothing is said of the gyro's axes."""
+    imu, poses = turned(waves(60.0, (0.01, 0.01, 0.4)), waves(60.0, (1.0, 1.0, 0.1), 4))
+    swapped = Imu(imu.t_ns, imu.gyro[:, [0, 2, 1]], imu.accel)
+    truth = of_poses("/odom", poses)
+    assert truth is not None
+    found = judge(motion_of(swapped), truth._replace(kind="unknown"), 1.0)
+    assert found == Conventions(topic="/odom", up=found.up, accel=found.accel, delay=found.delay)
+    assert found.up in (None, "+z")
+
+
+def test_level_flight_is_no_evidence_without_poses() -> None:
+    """A thrust along z does not turn in the body, whatever the gyro says."""
+    imu, _ = turned(waves(60.0, (0.4, 0.4, 0.2)))
+    thrust = np.tile([0.0, 0.0, GRAVITY_M_S2], (len(imu), 1)) + 0.2 * np.random.default_rng(2).normal(size=(len(imu), 3))
+    assert judge(motion_of(Imu(imu.t_ns, imu.gyro, thrust)), None, 1.0).relative is None
+
+
+def looked(imu: Imu, truth: Truth | None, *, fix: bool) -> Survey:
+    return examine(
+        lambda: [batch_of(imu)], truth, CleaningSettings(only=("axes", "units"), fix=fix), where="made", topic="/imu0"
+    )
+
+
+def test_fix_leads_back_to_the_sensors_that_flew(flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    P, Q = PERMUTATIONS[13], PERMUTATIONS[38]
+    planted = Imu(imu.t_ns, np.rad2deg(imu.gyro @ P), imu.accel @ Q / FORCES["g"])
+    survey = looked(planted, truth, fix=True)
+    gyro, accel = survey.matrices
+    np.testing.assert_allclose(planted.gyro @ gyro.T, imu.gyro, atol=1e-12)
+    np.testing.assert_allclose(planted.accel @ accel.T, imu.accel, atol=1e-12)
+    assert survey.verdict == "usable"
+    assert not looked(Imu(imu.t_ns, planted.gyro @ gyro.T, planted.accel @ accel.T), truth, fix=True).findings

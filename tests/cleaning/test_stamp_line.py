@@ -1,0 +1,63 @@
+"""Stamps in batches, late stamps and counters that wrap: told where they are, and led back to the sensor's clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imutool.cleaning.stamp_line import GAP_NS, read_stamps, restamped
+
+PERIOD_NS = 5_000_321
+START_NS = 1_700_000_000_000_000_000
+
+
+def sampled(n: int = 12_000) -> np.ndarray:
+    """A sensor's clock whose crystal warms up: 20 ppm over the log."""
+    number = np.arange(n)
+    return START_NS + number * PERIOD_NS + (1e-5 * PERIOD_NS * number**2 / n).astype(np.int64)
+
+
+def in_batches(true: np.ndarray, size: int, apart_ns: int = 0, seed: int = 1) -> np.ndarray:
+    """Stamps that a driver puts on when it reads `size` samples, a little late."""
+    last = true[np.minimum(np.arange(len(true)) // size * size + size - 1, len(true) - 1)]
+    late = np.random.default_rng(seed).exponential(200_000, len(true))[np.arange(len(true)) // size]
+    return last + late.astype(np.int64) + apart_ns * (np.arange(len(true)) % size)
+
+
+@pytest.mark.parametrize(("size", "apart_ns"), [(4, 0), (5, 50_000), (20, 0)])
+def test_batches_are_told_and_the_sensors_clock_comes_back(size: int, apart_ns: int) -> None:
+    true = sampled()
+    stamps = in_batches(true, size, apart_ns)
+    assert read_stamps(stamps).batch == pytest.approx(size, rel=0.15)
+    again = restamped(stamps)
+    assert (np.diff(again) > 0).all()
+    assert np.abs(again - true).max() < 300_000  # the stamps themselves are late by up to 20 periods
+    assert read_stamps(again).told == []
+
+
+@pytest.mark.parametrize("name", ["32 bit of us", "32 bit of ns", "16 bit of ms"])
+def test_a_counter_that_wraps_is_named_and_runs_on(name: str) -> None:
+    bits, unit = int(name[:2]), {"us": 1000, "ns": 1, "ms": 1_000_000}[name[-2:]]
+    size = 2**bits * unit
+    true = np.arange(12_000) * PERIOD_NS
+    origin = size - 10_000_000_000 if size > 10_000_000_000 else size // 2
+    counted = (true + origin) // unit * unit % size
+    found = read_stamps(counted)
+    assert dict(found.wraps) == {name: int((np.diff(counted) < 0).sum())}
+    assert np.abs(found.stamp_ns - found.stamp_ns[0] - true).max() <= unit
+    assert (np.diff(restamped(counted)) > 0).all()
+
+
+@pytest.mark.parametrize("jitter_ns", [0, 100_000, 1_000_000])
+def test_stamps_one_by_one_are_no_batches(jitter_ns: int) -> None:
+    stamps = sampled() + np.random.default_rng(3).integers(-jitter_ns, jitter_ns + 1, 12_000)
+    assert read_stamps(stamps).told == []
+
+
+def test_a_clock_set_back_is_no_wrap_and_a_pause_ends_the_line() -> None:
+    true = sampled()
+    assert not read_stamps(np.where(np.arange(12_000) < 6000, true, true - 3_000_000_000)).wraps
+    paused = true + np.where(np.arange(12_000) < 6000, 0, 7_000_000_000)
+    again = restamped(in_batches(paused, 6))
+    assert np.abs(again - paused).max() < 600_000
+    assert again[6000] - again[5999] > GAP_NS

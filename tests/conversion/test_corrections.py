@@ -1,0 +1,76 @@
+"""`convert --fix`: a log in other units, axes and frames comes out as it was recorded, and says what was changed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.conversion.corrections import RECORD
+from imutool.conversion.run import convert
+from imutool.log_info.inspection import inspect
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+from imutool.recording import Imu, Poses, Recording
+from imutool.sensor.made_up_flight import flight
+
+P = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@pytest.fixture(scope="module")
+def made() -> Recording:
+    return flight(3, duration_s=40.0)
+
+
+def in_ned(poses: Poses) -> Poses:
+    q_wxyz = (Rotation.from_matrix(NED) * Rotation.from_quat(poses.q_wb_wxyz.copy(), scalar_first=True)).as_quat(
+        scalar_first=True
+    )
+    return Poses(poses.t_ns, poses.p_wb @ NED.T, q_wxyz, None if poses.v_w is None else poses.v_w @ NED.T)
+
+
+@pytest.mark.parametrize("accel_axes", [P, -P], ids=["both turned", "accel negated too"])
+def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarray, made: Recording, tmp_path: Path) -> None:
+    wrong = Imu(made.imu.t_ns, np.rad2deg(made.imu.gyro @ P.T), made.imu.accel @ accel_axes.T / 9.80665)
+    write(replace(made, imu=wrong, truths={k: in_ned(v) for k, v in made.truths.items()}), tmp_path / "wrong.mcap")
+    before = (tmp_path / "wrong.mcap").read_bytes()
+    assert [w for w in inspect(tmp_path / "wrong.mcap").warnings if "--fix" in w]
+    report = convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "right.mcap")
+    np.testing.assert_allclose(fixed.imu.gyro, made.imu.gyro, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(fixed.imu.accel, made.imu.accel, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(fixed.truth.p_wb, made.truth.p_wb, rtol=0, atol=0)
+    turn = Rotation.from_quat(fixed.truth.q_wb_wxyz.copy(), scalar_first=True)
+    true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
+    assert (turn * true.inv()).magnitude().max() < 1e-7
+    assert inspect(tmp_path / "right.mcap").warnings == []
+    with Log(tmp_path / "right.mcap") as log:
+        assert set(log.metadata()[RECORD]) == {"/imu0", "/ground_truth/pose"}
+    assert any("times 9.80665" in note for note in report.notes)
+    assert (tmp_path / "wrong.mcap").read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["right.mcap", "wrong.mcap"]
+
+
+def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
+    write(made, tmp_path / "made.mcap")
+    report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", correct=["conventions"])
+    assert read(tmp_path / "same.mcap").imu == made.imu
+    assert report.notes == ["same.mcap: the motion shows nothing to correct"]
+
+
+def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: Path) -> None:
+    last = np.minimum(np.arange(len(made.imu)) // 4 * 4 + 3, len(made.imu) - 1)
+    bunched = Imu(made.imu.t_ns[last] + 20_000 * (np.arange(len(made.imu)) % 4), made.imu.gyro, made.imu.accel)
+    write(replace(made, imu=bunched), tmp_path / "bunched.mcap")
+    (warning,) = inspect(tmp_path / "bunched.mcap").warnings
+    assert "batches of about 4.0" in warning
+    convert(tmp_path / "bunched.mcap", tmp_path / "even.mcap", correct=["stamps"])
+    even = read(tmp_path / "even.mcap").imu
+    assert np.abs(even.t_ns - made.imu.t_ns).max() < 100_000
+    assert (even.gyro == made.imu.gyro).all()
+    assert inspect(tmp_path / "even.mcap").warnings == []
