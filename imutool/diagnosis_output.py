@@ -81,10 +81,10 @@ def write(
 
 
 def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
-    """Write findings.json with the closed loop, and the page of the second diagnosis."""
+    """Write findings.json with the closed loop, and a page with figures of both simulations."""
     (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
     if find_spec("matplotlib") is not None:
-        _page(again, folder / CLOSED)
+        _page(again, folder / CLOSED, d)
 
 
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
@@ -111,10 +111,10 @@ def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | No
     return remarks
 
 
-def _page(d: Diagnosis, path: Path) -> None:
+def _page(d: Diagnosis, path: Path, first: Diagnosis | None = None) -> None:
     from imutool.viewing.html.diagnosis_page import write as write_page
 
-    write_page(d, path, logs=LOG if (path.parent / LOG).exists() else None)
+    write_page(d, path, logs=LOG if (path.parent / LOG).exists() else None, first=first)
 
 
 def _logs(logs: list[RunData], path: Path) -> None:

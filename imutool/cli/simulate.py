@@ -80,7 +80,7 @@ def simulate(
     report = SimulationReport(**values | {"motion": MotionQuality(**values["motion"])})
     if write_json(report, json_to, overwrite=overwrite):
         return
-    acting = [effect["name"] for effect in report.physics["effect"]]
+    acting = [effect["name"] for effect in report.physics["effect"] if not effect["column"]]
     acting += [f"a curve of {curve['variable']}" for curve in report.physics["unknown"]]
     acting += [term["term"] for term in report.physics["term"]] + ["bias"] * (report.physics["bias"] is not None)
     names = ", ".join(acting) or "ideal"

@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from scipy.signal import welch
 
-from imutool.diagnosis.estimation.whitening import burg
+from imutool.diagnosis.estimation.whitening import autoregression
 from imutool.diagnosis.result import Diagnosis
-from imutool.noise.datasheet import Axes, Colour, Filters, Levels, Noise
+from imutool.noise.datasheet import Colour, Filters, Levels, Noise
 from imutool.units import SENSORS
 
 ORDER = 40  # of the autoregression: lines of a vibration need many
 WINDOW_S = 1.0  # over which the size of the noise comes and goes
-QUANTILES = 11
+QUANTILES = 21
+SEGMENT = 1024  # of a spectrum
+BANDS = 10  # of it, of which the lowest is the white noise
+WHITE = 0.7  # of the lowest band: an autoregression fills valleys
+LEAST_POWER = 1e-6  # of the highest density, which is taken for nothing
+LEAST_REST = 1e-3  # of the power, below which all of it is white
 
 
 def to_noise_file(d: Diagnosis) -> Noise | None:
@@ -31,36 +37,51 @@ def to_noise_file(d: Diagnosis) -> Noise | None:
     std = np.sqrt((left**2 * known).sum(axis=0) / known.sum(axis=0))
     if not (std > 0.0).all():
         return None
-    filters = [tuple(burg(left[:, k], known[:, k], ORDER)[1:].tolist()) for k in range(6)]
-    levels = [_levels((left / std)[:, part], known[:, part], rate_hz) for part in (slice(0, 3), slice(3, 6))]
+    powers = [welch(left[:, k] / std[k], rate_hz, nperseg=min(SEGMENT, len(left)))[1] / known[:, k].mean() for k in range(6)]
+    floors = WHITE * np.array([min(band.mean() for band in np.array_split(power, BANDS)) for power in powers])
+    white = np.sqrt(np.minimum(0.5 * floors * rate_hz, 1.0))  # of a density from both sides
+    filters = [_filter(power, floor, rate_hz) for power, floor in zip(powers, floors.tolist(), strict=True)]
+    parts = (slice(0, 3), slice(3, 6))
+    levels = [_levels((left / std)[:, part], known[:, part], white[part], rate_hz) for part in parts]
     names = ", ".join(trace.log for trace in d.traces)
     return Noise(
-        gyro_density=_axes(std[:3] / np.sqrt(rate_hz)),
-        accel_density=_axes(std[3:] / np.sqrt(rate_hz)),
+        gyro_density=_three(std[:3] / np.sqrt(rate_hz)),
+        accel_density=_three(std[3:] / np.sqrt(rate_hz)),
         sources={f"{sensor}_density": f"what the findings leave of {names}" for sensor in SENSORS},
         colour=Colour(
             rate_hz=rate_hz,
             window_s=WINDOW_S,
             gyro=_filters(filters[:3]),
             accel=_filters(filters[3:]),
+            gyro_white=_three(white[:3]),
+            accel_white=_three(white[3:]),
             gyro_levels=levels[0],
             accel_levels=levels[1],
         ),
     )
 
 
-def _levels(x: Float64[np.ndarray, "n 3"], known: Bool[np.ndarray, "n 3"], rate_hz: float) -> Levels:
-    """Quantiles of the local size, over the size of all."""
+def _filter(power: Float64[np.ndarray, " f"], floor: float, rate_hz: float) -> tuple[float, ...]:
+    """Autoregression of what stands above the white noise."""
+    a, _ = autoregression(np.maximum(power - floor, LEAST_POWER * power.max()), rate_hz, ORDER)
+    return tuple(a[1:].tolist())
+
+
+def _levels(
+    x: Float64[np.ndarray, "n 3"], known: Bool[np.ndarray, "n 3"], white: Float64[np.ndarray, "3"], rate_hz: float
+) -> Levels:
+    """Quantiles of the local size of what is not white, over its size in all."""
     count = max(2, round(WINDOW_S * rate_hz))
     windows = x[: len(x) // count * count].reshape(-1, count, 3)
     whole = known[: len(windows) * count].reshape(-1, count, 3).all(axis=(1, 2))
-    if not whole.any():
+    rest = float((1.0 - white**2).mean())
+    if not whole.any() or rest < LEAST_REST:
         return (1.0, 1.0)
-    size = np.sqrt((windows[whole] ** 2).mean(axis=(1, 2)))
-    return tuple(np.quantile(size, np.linspace(0.0, 1.0, QUANTILES)).tolist())
+    power = ((windows[whole] ** 2).mean(axis=1) - white**2).mean(axis=1)
+    return tuple(np.quantile(np.sqrt(np.maximum(power, 0.0) / rest), np.linspace(0.0, 1.0, QUANTILES)).tolist())
 
 
-def _axes(values: Float64[np.ndarray, "3"]) -> Axes:
+def _three(values: Float64[np.ndarray, "3"]) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
 

@@ -45,6 +45,7 @@ def to_physics_file(d: Diagnosis) -> PhysicsFile:
                     name=finding.effect,
                     signal=_signal(finding.signal),
                     driver=finding.driver,
+                    column="" if _signal(finding.signal) else finding.signal,
                     equation=finding.equation,
                     parameters=values,
                 )

@@ -109,7 +109,7 @@ def write(source: Path, out: Path, form: str, noise: str | Path | None, overwrit
     for file, text in texts.items():
         with Target(out / file, overwrite=overwrite) as target:
             target.write(text.encode())
-    left_out = [entry.name for entry in twin.physics.effect if entry.name not in twin.used]
+    left_out = [entry.name for entry in twin.physics.effect if entry.name not in twin.used or entry.column]
     if text_of is not None:
         left_out += [f"a curve of {curve.variable}" for curve in twin.physics.unknown] + [t.term for t in twin.physics.term]
         left_out += ["the colour of the noise"] * (twin.noise.colour is not None)
@@ -143,7 +143,7 @@ def _of_fleet(files: list[PhysicsFile]) -> PhysicsFile:
     found: dict[tuple[str, str, str], list[Entry]] = {}
     for file in files:
         for entry in file.effect:
-            found.setdefault((entry.name, entry.signal, entry.driver), []).append(entry)
+            found.setdefault((entry.name, entry.signal or entry.column, entry.driver), []).append(entry)
     common = [entries for entries in found.values() if 2 * len(entries) > len(files)]
     return PhysicsFile(effect=tuple(_pooled(entries) for entries in common))
 

@@ -4,14 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
+from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
 from imutool.cleaning.rule import TopicSummary
+from imutool.cleaning.rules.axes import Axes
+from imutool.cleaning.rules.units import Units
+from imutool.cleaning.samples import Motion, Samples
+from imutool.cleaning.truth import Truth
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.log_info.report import Convention
+from imutool.recording import Imu
 
 NO_POSES = "the log has no poses but odometry"
 NO_TURN = "the motion turns too little, or about one axis only"
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
+
+
+def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
+    """Totals for the rules about conventions; nothing is converted."""
+    motion = Motion()
+    motion.see(Samples(np.arange(len(imu)), imu.t_ns, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1)))
+    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+
+
+def convention_warnings(whole: TopicSummary) -> list[str]:
+    """Warnings about units, axes and frames; a note without a correction is none."""
+    findings = [*Units().findings(whole), *Axes().findings(whole)]
+    fix = "; imutool convert LOG OUT --fix corrects it"
+    return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:

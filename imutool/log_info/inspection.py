@@ -13,18 +13,15 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from imutool.cleaning import CleaningSettings, raw_batches
+from imutool.cleaning import raw_batches
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
-from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.rules.units import Units
-from imutool.cleaning.samples import Motion, Samples
 from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_info.conventions import conventions
+from imutool.log_info.conventions import convention_summary, convention_warnings, conventions
 from imutool.log_info.pose_agreement import agreement
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
@@ -137,7 +134,7 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
-    rest, whole = _rest(imu), _summary(imu, truth)
+    rest, whole = _rest(imu), convention_summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
         warnings=_imu_warnings(counts, imu, whole, stamps),
@@ -237,21 +234,7 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stam
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
-    return [*warnings, *_convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
-
-
-def _summary(imu: Imu, truth: Truth | None) -> TopicSummary:
-    """Totals for the rules about conventions, by which `clean` judges too; nothing is converted."""
-    motion = Motion()
-    motion.see(Samples(np.arange(len(imu)), imu.t_ns, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1)))
-    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
-
-
-def _convention_warnings(whole: TopicSummary) -> list[str]:
-    """Warnings about units, axes and frames, with the way to correct them; a note without one is no warning."""
-    findings = [*Units().findings(whole), *Axes().findings(whole)]
-    fix = "; imutool convert LOG OUT --fix corrects it"
-    return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
+    return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 
 def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:

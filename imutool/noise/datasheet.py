@@ -43,21 +43,26 @@ Value = Annotated[float, Meta(ge=0.0)]
 Axes = tuple[Value | None, Value | None, Value | None]
 _NONE: Axes = (None, None, None)
 Filters = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+Shares = tuple[Share, Share, Share]
 Levels = Annotated[tuple[Value, ...], Meta(min_length=2)]
 
 
 class Colour(Settings, frozen=True, kw_only=True):
     """Spectrum of the noise, and how its size comes and goes, as recorded at one rate.
 
-    The noise n of an axis is autoregressive, n(k) + a_1 n(k-1) + ... = white, with (a_1, ...) of `gyro` and `accel` (Box and
-    Jenkins, Time Series Analysis, section 3.2); its standard deviation is density * sqrt(rate). In stretches of `window_s` all
-    axes of a sensor are larger or smaller by one factor, drawn from `*_levels`, its quantiles in equal steps of probability.
+    The standard deviation of an axis is density * sqrt(rate). The share `*_white` of it is white and steady. The rest n is
+    autoregressive, n(k) + a_1 n(k-1) + ... = white, with (a_1, ...) of `gyro` and `accel` (Box and Jenkins, Time Series
+    Analysis, section 3.2). In stretches of `window_s` the rest is larger or smaller by one factor for all axes of a sensor,
+    drawn from `*_levels`, its quantiles in equal steps of probability.
     """
 
     rate_hz: Annotated[float, Meta(gt=0.0)]
     window_s: Annotated[float, Meta(gt=0.0)]
     gyro: Filters
     accel: Filters
+    gyro_white: Shares
+    accel_white: Shares
     gyro_levels: Levels
     accel_levels: Levels
 
@@ -82,7 +87,8 @@ class Colour(Settings, frozen=True, kw_only=True):
             out[:, axis] = made / np.linalg.norm(lfilter([1.0], [1.0, *a], np.eye(1, SETTLED)[0]))
         window = ((t_s - t_s.min()) / self.window_s).astype(int)
         size = np.interp(rng.uniform(size=int(window.max()) + 1), np.linspace(0.0, 1.0, len(levels)), levels)
-        return np.asarray(out * size[window][:, None])
+        steady = np.array(getattr(self, f"{sensor}_white"))
+        return np.asarray(steady * rng.normal(size=out.shape) + np.sqrt(1.0 - steady**2) * out * size[window][:, None])
 
 
 class Noise(Settings, frozen=True, kw_only=True):

@@ -54,6 +54,7 @@ from imutool.sensor.unnamed_effects import DRIVEN, VARIABLES
 from imutool.units import SENSORS, Sensor
 
 SCHEMA = "imutool.physics/1"
+OTHER = "# Of another signal than the IMU's: simulate and debias do not apply it."
 Three = tuple[float, float, float]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
@@ -69,11 +70,15 @@ class Value(Settings, frozen=True, kw_only=True):
 
 
 class Entry(Settings, frozen=True, kw_only=True):
-    """Effect by name; `signal` is where it was seen, `driver` the channel behind a `driven` one."""
+    """Effect by name; `signal` is where it was seen, `driver` the channel behind a `driven` one.
+
+    `column` is the TOPIC.field of another signal than an IMU's: the file tells of it, and no simulation of an IMU applies it.
+    """
 
     name: str
     signal: Literal["gyro", "accel", "both", ""] = ""
     driver: str = ""
+    column: str = ""
     equation: str = ""
     parameters: dict[str, Value]
 
@@ -115,13 +120,15 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
     term: tuple[Term, ...] = ()
 
     def acting(self, where: str | Path = "physics", known: Known = catalogue.effects) -> list[tuple[Effect, Theta]]:
-        """Effects with their parameters; `known` finds them by name.
+        """Effects of the IMU with their parameters; `known` finds them by name.
 
         Raises:
             ConfigError: an unknown effect, parameter, unit, signal, variable or term (the nearest is named), or a wrong value.
         """
         found: list[tuple[Effect, Theta]] = []
         for k, entry in enumerate(self.effect):
+            if entry.column:
+                continue
             place = f"effect[{k}]"
             effect = _driven(entry, where, place) if entry.name == DRIVEN else _named(entry.name, known, where, place)
             found.append((effect, _theta(entry, effect, where, place)))
@@ -169,8 +176,9 @@ def to_toml(file: PhysicsFile) -> str:
     """Text of the file."""
     lines = ["# Physics of an IMU, as `imutool simulate --physics FILE` takes it", f"schema = {_text(file.schema)}"]
     for entry in file.effect:
-        lines += ["", "[[effect]]", f"name = {_text(entry.name)}"]
-        lines += [f"{key} = {_text(text)}" for key in ("signal", "driver", "equation") if (text := getattr(entry, key))]
+        lines += ["", *([OTHER] if entry.column else []), "[[effect]]", f"name = {_text(entry.name)}"]
+        keys = ("signal", "driver", "column", "equation")
+        lines += [f"{key} = {_text(text)}" for key in keys if (text := getattr(entry, key))]
         if not entry.parameters:
             lines.append("parameters = {}")
         for name, value in entry.parameters.items():

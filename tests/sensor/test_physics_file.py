@@ -26,6 +26,7 @@ ENTRIES = st.builds(
     name=st.text(),
     signal=st.sampled_from(["gyro", "accel", "both", ""]),
     driver=st.text(),
+    column=st.text(),
     equation=st.text(),
     parameters=st.dictionaries(st.text(), VALUES, max_size=3),
 )
@@ -156,6 +157,16 @@ def ideal() -> SensorSamples:
 def one(file: PhysicsFile) -> tuple[Effect, Theta]:
     (pair,) = file.acting()
     return pair
+
+
+def test_effects_of_other_signals_are_told_and_do_not_act(tmp_path: Path) -> None:
+    friction = Entry(
+        name="coulomb_friction", column="/joint_states.effort[0]", parameters={"level": Value(value=0.5, unit="N m")}
+    )
+    arm = Entry(name="lever_arm", parameters={"x": Value(value=0.1, unit="m")})
+    write(PhysicsFile(effect=(friction, arm)), tmp_path / "physics.toml")
+    assert "do not apply it" in (tmp_path / "physics.toml").read_text()
+    assert [effect.name for effect, _ in read(tmp_path / "physics.toml").acting()] == ["lever_arm"]
 
 
 def test_a_bias_is_added(ideal: SensorSamples) -> None:

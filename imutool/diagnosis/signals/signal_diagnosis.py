@@ -42,7 +42,7 @@ from imutool.sensor.robot_effects import (
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
 LEARNT_ERROR = 0.003  # of the efforts themselves
-SMALL_GAIN = 1e-3  # of the largest effect's squares, which such an error may take (3 % of its size)
+SMALL_GAIN = 3e-3  # of the largest effect's squares, which such an error may take (5 % of its size)
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 CERTAIN = 6.0  # deviations from which a constant is a finding
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
@@ -191,14 +191,14 @@ def _above_model_error(log: WhitenedLog, selection: Selection, level: Float64[np
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if pair.band_hz is None or not selection.selected:
         return selection, []
-    least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
-    kept, small, scale = list[SelectedEffect](), list[SelectedEffect](), pair.scale()
-    for selected in selection.selected:
-        held_out = finding_of([log], selection, selected, level).held_out
-        size = float(np.sqrt(max(held_out.rms_before**2 - held_out.rms_after**2, 0.0)))
+    least, scale = SMALL_GAIN * max(selected.gain for selected in selection.selected), pair.scale()
+    gains = [finding_of([log], selection, selected, level).held_out for selected in selection.selected]
+    sizes = [float(np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0))) for gain in gains]
+    kept, small = list[SelectedEffect](), list[SelectedEffect]()
+    for selected, size in zip(selection.selected, sizes, strict=True):
         columns = [pair.names.index(name) for name in selected.effect.sensors] or list(range(pair.columns))
-        large = selected.gain >= least and size >= LEARNT_ERROR * min(scale.size[k] for k in columns)
-        (kept if large else small).append(selected)
+        error = max(LEARNT_ERROR * min(scale.size[k] for k in columns), float(np.sqrt(SMALL_GAIN)) * max(sizes))
+        (kept if selected.gain >= least and size >= error else small).append(selected)
     names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names
 

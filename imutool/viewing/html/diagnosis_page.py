@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from imutool import __version__
 from imutool.diagnosis.result import SCHEMA, Diagnosis, Finding, Traces
@@ -37,17 +40,21 @@ DIFFERENCE = '<span class="key" style="background: var(--before)"></span>real mi
 HELD = '<span class="key" style="background: var(--held); opacity: 0.5"></span>time unseen by any fit'
 
 
-def write(d: Diagnosis, path: Path, *, logs: str | None = None, overwrite: bool = False) -> None:
+def write(
+    d: Diagnosis, path: Path, *, logs: str | None = None, first: Diagnosis | None = None, overwrite: bool = False
+) -> None:
     """Write the page as one file from which no request leaves, for screens and paper.
+
+    With `first`, the diagnosis before its physics was simulated, the figures compare that simulation with the one of `d`.
 
     Raises:
         ConfigError: matplotlib is not installed, or the file exists (without `overwrite`) or cannot be written.
     """
     with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
-        target.write(html(d, logs=logs).encode())
+        target.write(html(d, logs=logs, first=first).encode())
 
 
-def html(d: Diagnosis, *, logs: str | None = None) -> str:
+def html(d: Diagnosis, *, logs: str | None = None, first: Diagnosis | None = None) -> str:
     """Text of the page of `write`; `logs` names a page about the logs in the same folder.
 
     Raises:
@@ -67,7 +74,7 @@ def html(d: Diagnosis, *, logs: str | None = None) -> str:
         *([f'<p><a href="{text(logs)}">The recordings themselves</a>: signals, spectra, events.</p>'] if logs else []),
         *_findings(d),
         *_locations(d),
-        *_before_and_after(d),
+        *_before_and_after(d if first is None else _closed(first, d)),
         *_curves(d),
         *_left(d),
         *_provenance(d),
@@ -139,6 +146,30 @@ def _locations(d: Diagnosis) -> Iterator[str]:
             '<span class="key" style="background: var(--mark)"></span>located misfit' + HELD
         )
         yield _figure(figures.misfit_strip(d, trace), f"w{k}", caption)
+
+
+def _closed(first: Diagnosis, again: Diagnosis) -> Diagnosis:
+    """The first findings with samples of both: expected by the first simulation before, and by the second after."""
+    traces = []
+    t_s, expected = (np.concatenate([getattr(trace, name) for trace in first.traces]) for name in ("t_s", "before"))
+    for after in again.traces:
+        of_before, of_after = np.isin(t_s, after.t_s), np.isin(after.t_s, t_s)
+        if not of_after.any():
+            continue
+        ideal = after.ideal
+        traces.append(
+            replace(
+                after,
+                t_s=after.t_s[of_after],
+                real=after.real[of_after],
+                before=expected[of_before],
+                after=after.before[of_after],
+                held_out=after.held_out[of_after],
+                truth=None if after.truth is None else after.truth.rows(of_after),
+                ideal=None if ideal is None else ideal[of_after],
+            )
+        )
+    return replace(again, traces=tuple(traces), findings=first.findings, signals={})
 
 
 def _before_and_after(d: Diagnosis) -> Iterator[str]:
