@@ -16,10 +16,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
 
+from fuzz.numbers import put_log
 from imutool.bias import io
 from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
@@ -210,6 +212,32 @@ def test_a_value_that_is_no_number_is_left_out(tmp_path: Path, imutool: Run, val
     assert done.returncode == 3
     assert "1 samples are no measurement and left out (1 not finite)" in done.stderr
     assert "799 on /imu/debiased" in done.stdout
+
+
+ODD = {"zero": 0.0, "huge": 1e30, "denormal": 5e-324, "not a number": np.nan, "infinite": np.inf}
+TAKING_SAMPLES: tuple[tuple[str, ...], ...] = (
+    ("audit", "odd.mcap", "--json", "-"),
+    ("evaluate", "odd.mcap", "--json", "-"),
+    ("live", "--from", "odd.mcap", "--speed", "1e9", "--no-view", "--json", "-"),
+    ("view", "odd.mcap", "--html", "out.html"),
+)  # train: tests/fuzz/numbers.py
+
+
+@pytest.mark.parametrize("words", TAKING_SAMPLES, ids=lambda words: words[0])
+@pytest.mark.parametrize("what", ODD)
+def test_samples_of_no_sensor_are_left_out_or_refused(tmp_path: Path, imutool: Run, words: Sequence[str], what: str) -> None:
+    """All of the accelerometer's samples are so: a finite answer in strict JSON, or a message and its exit code."""
+    recording = flight(1, duration_s=4.0)
+    accel = np.full_like(recording.imu.accel, ODD[what])
+    put_log(tmp_path / "odd.mcap", recording.imu.t_ns, recording.imu.gyro, accel, next(iter(recording.truths.values())))
+    done = imutool(*words, cwd=tmp_path)
+    assert "Traceback" not in done.stderr
+    assert "RuntimeWarning" not in done.stderr
+    assert done.returncode in {0, 3, 4, 5, 7}, done.stderr
+    if done.returncode == 0 and "--json" in words:
+        msgspec.json.decode(done.stdout)  # strict: it refuses NaN
+    elif done.returncode:
+        assert "error: " in done.stderr or done.returncode == 3
 
 
 def test_time_going_back_in_a_log_stops_debias(tmp_path: Path, refuse: Refuse) -> None:

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.evo import statistics
 
 from imutool.bias import linear
 from imutool.bias.io import save
@@ -41,7 +38,6 @@ PUBLISHED = {
 }
 PUBLISHED_DEG = 0.1
 EDGES_S = 0.02  # samples before the first true pose of the common stretch and after its last one are not scored
-EVO = Path(sys.executable).parent
 EVO_TOLERANCE = 1e-6  # relative: evo reads stamps as floats and quaternions through other arithmetic
 FIELDS = {  # contracts.md, JSON of evaluate
     "log": str,
@@ -95,31 +91,16 @@ def test_what_evo_says_of_the_written_trajectories(converted: Callable[[str], Pa
         "MH_04_difficult_truth.tum",
     ]
     raw, static = results
-    for result, figure, words in (
+    runs = (
         (raw, "ape_m", ("-r", "trans_part")),
         (raw, "aoe_deg", ("-r", "angle_deg")),
         (raw, "aoe_aligned_deg", ("--align", "-r", "angle_deg")),
         (static, "aoe_aligned_deg", ("--align", "-r", "angle_deg")),
-    ):
-        found = evo_ape(tmp_path, "MH_04_difficult_truth.tum", f"MH_04_difficult_{result['model']}.tum", *words)
-        assert result[figure] == pytest.approx(found, rel=EVO_TOLERANCE), (result["model"], figure)
-
-
-def evo_ape(folder: Path, truth: str, estimate: str, *words: str) -> float:
-    """Root mean square of evo's own command; its settings go to the folder, not to the user's home."""
-    if not (EVO / "evo_ape").exists():
-        pytest.skip(f"evo is not installed beside {sys.executable}")
-    result = folder / f"{estimate}{'_'.join(words)}.zip"
-    subprocess.run(
-        [EVO / "evo_ape", "tum", truth, estimate, *words, "--save_results", result, "--no_warnings"],
-        cwd=folder,
-        env={**os.environ, "HOME": str(folder), "MPLBACKEND": "agg"},
-        check=True,
-        capture_output=True,
-        timeout=120,
     )
-    with zipfile.ZipFile(result) as archive:
-        return float(json.loads(archive.read("stats.json"))["rmse"])
+    truth = "MH_04_difficult_truth.tum"
+    found = statistics(tmp_path, [("ape", truth, f"MH_04_difficult_{one['model']}.tum", *words) for one, _, words in runs])
+    for (result, figure, _), evos in zip(runs, found, strict=True):
+        assert result[figure] == pytest.approx(evos["rmse"], rel=EVO_TOLERANCE), (result["model"], figure)
 
 
 # ── made-up recordings ───────────────────────────────────────────────────────────────────────────────────────────────

@@ -105,6 +105,7 @@ class TrainingLog(Section, frozen=True):
     name: str
     file: str
     sha256: str
+    poses: str | UnsetType = UNSET  # what they are worth; older models have none
 
 
 class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"):

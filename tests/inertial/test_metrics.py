@@ -96,7 +96,8 @@ RELATIVE = {
 @pytest.fixture(scope="module")
 def evos(pair: tuple[Poses, Poses, np.ndarray, Path]) -> dict[str | tuple[str, str], dict[str, float]]:
     """evo's statistics of the pair, by our names of the figures."""
-    lines = [("ape", *words) for words in ABSOLUTE.values()] + [("rpe", *words) for words in RELATIVE.values()]
+    files = ("ref.txt", "est.txt")
+    lines = [("ape", *files, *words) for words in ABSOLUTE.values()] + [("rpe", *files, *words) for words in RELATIVE.values()]
     return dict(zip([*ABSOLUTE, *RELATIVE], statistics(pair[3], lines), strict=True))
 
 

@@ -23,12 +23,12 @@ for command, *words in json.loads(sys.argv[1]):
 
 
 def statistics(folder: Path, lines: Sequence[Sequence[str]]) -> list[dict[str, float]]:
-    """Statistics of each run (`ape` or `rpe`, then its words) of est.txt against ref.txt; evo's settings go to the folder."""
+    """Statistics of each run: `ape` or `rpe`, true file, estimated file, further words. evo's settings go to the folder."""
     if importlib.util.find_spec("evo") is None:
         pytest.skip(f"evo is not installed for {sys.executable}")
     results = [folder / f"{number}.zip" for number in range(len(lines))]
     runs = [
-        [command, "tum", "ref.txt", "est.txt", *words, "--save_results", str(result), "--no_warnings"]
+        [command, "tum", *words, "--save_results", str(result), "--no_warnings"]
         for (command, *words), result in zip(lines, results, strict=True)
     ]
     env = {**os.environ, "HOME": str(folder), "MPLBACKEND": "agg"}

@@ -147,7 +147,7 @@ def test_errors_after_alignment_are_those_of_evo(stretch: Stretch, tmp_path: Pat
     estimate = moved(path, Rotation.from_rotvec([0.3, -0.2, 0.9]), np.array([4.0, 5.0, 6.0]))  # origin has work to do
     write_tum(true.rows(valid), tmp_path / "ref.txt")
     write_tum(estimate.rows(valid), tmp_path / "est.txt")
-    rmse = statistics(tmp_path, [("ape", word)])[0]["rmse"]
+    rmse = statistics(tmp_path, [("ape", "ref.txt", "est.txt", word)])[0]["rmse"]
     got = errors(aligned(estimate, true, valid, alignment)[0], true, valid).position_total_m[valid]
     assert float(np.sqrt(np.mean(got**2))) == pytest.approx(rmse, rel=EVO_TOLERANCE)
     assert rmse > 1e-3
