@@ -12,6 +12,7 @@ import re
 import struct
 from collections.abc import Iterator
 from functools import partial
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from ._files import find_files, head
 
 GENERAL = True
 MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"
+HEADER_BYTES = 16
 LEAST_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 Q_ENU_FROM_NED_WXYZ = np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]])
@@ -71,6 +73,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         raise DataError("holds no data", where=sequence.path, expected="a log with messages")
     if ulog.file_corruption:
         remarks.losses.append("the file is damaged: some of its messages could not be read")
+    elif _is_cut(sequence.path):
+        remarks.losses.append("the file ends within a message: what came after is lost")
     if ulog.dropouts:
         lost_s = sum(dropout.duration for dropout in ulog.dropouts) * 1e-3
         remarks.notes.append(f"PX4's dropouts: {len(ulog.dropouts)}, {lost_s:.3f} s in all: the topics have gaps there")
@@ -112,6 +116,15 @@ def _open(path: Path) -> Any:
             return ULog(file, None, True)
     except Exception as error:  # pyulog raises TypeError, struct.error, KeyError, IndexError: whatever the bytes lead to
         raise DataError(f"cannot be read as a ULog ({error or type(error).__name__})", where=path) from error
+
+
+def _is_cut(path: Path) -> bool:
+    """Whether a sound ULog ends within a message, as after a loss of power; pyulog does not tell."""
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as raw:
+        position = HEADER_BYTES
+        while position + 3 <= len(raw):  # size of what follows (two bytes) and kind (one)
+            position += 3 + raw[position] + 256 * raw[position + 1]
+        return position != len(raw)
 
 
 def _metadata(sequence: Sequence, ulog: Any) -> dict[str, dict[str, str]]:

@@ -68,7 +68,8 @@ def caught() -> Iterator[None]:
         if error.filename is None:  # then it is a stream, and stdout the only one we fill
             _forget_stdout()
         place = f"{error.filename}: " if error.filename else ""
-        _fail(f"{place}{error.strerror or error}. Choose another place or make room.", ConfigError.exit_code)
+        fix = "Look whether it is still there" if isinstance(error, FileNotFoundError) else "Choose another place or make room"
+        _fail(f"{place}{error.strerror or error}. {fix}.", ConfigError.exit_code)
     except Exception as error:
         if was_interrupted(error):
             _fail(f"interrupted. {NOTHING_LEFT}.", INTERRUPTED)

@@ -170,6 +170,15 @@ def test_what_cannot_be_read_is_refused_in_one_sentence(convert, tmp_path, raw, 
     assert "Traceback" not in done.stderr
 
 
+def test_a_file_that_ends_within_a_message_is_told(convert, tmp_path):
+    whole = flight().write(tmp_path / "a.ulg").read_bytes()
+    (tmp_path / "a.ulg").write_bytes(whole[:-300])
+    done = convert(tmp_path / "a.ulg", tmp_path / "a.mcap")
+    assert done.returncode == 3
+    assert "ends within a message" in done.stderr
+    assert len(read(tmp_path / "a.mcap", imu="/imu").imu.t_ns) == 250  # what is there comes in
+
+
 @pytest.mark.parametrize("sample", ["sample_log_small", "sample_px4_events"])
 def test_the_public_samples_hold_the_values_that_pyulog_reads(tmp_path, data, sample, convert):
     from pyulog import ULog
