@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from imutool.diagnosis.result import Diagnosis
@@ -38,7 +39,7 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
     """Refuse a folder that cannot take a diagnosis; ask before hours of work.
 
     Raises:
-        ConfigError: a file of that name, or a diagnosis in it already (without `overwrite`).
+        ConfigError: a file of that name, a diagnosis in it already (without `overwrite`), or a place that cannot be written.
     """
     if folder.exists() and not folder.is_dir():
         raise ConfigError("is a file", where=folder, expected="a folder, which need not exist")
@@ -47,6 +48,9 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
         raise ConfigError(
             f"holds a diagnosis already ({', '.join(existing)})", where=folder, fix="Choose another folder, or add --overwrite"
         )
+    above = next(parent for parent in folder.absolute().parents if parent.is_dir())
+    with _told(folder), TemporaryDirectory(dir=above, prefix=".imutool-"):
+        pass  # even the superuser cannot write everywhere
 
 
 def write(
