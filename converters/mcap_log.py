@@ -70,10 +70,19 @@ def read(source: Path) -> Iterator[MessageLog]:
 def _refusing(path: Path) -> Iterator[None]:
     """Turn the errors of damaged logs into a DataError with the place."""
     from mcap.exceptions import McapError
+    from zstandard import ZstdError
 
     try:
         yield
-    except (McapError, struct.error, OSError, EOFError, UnicodeDecodeError) as error:
+    except (
+        McapError,
+        ZstdError,
+        RuntimeError,
+        struct.error,
+        OSError,
+        EOFError,
+        UnicodeDecodeError,
+    ) as error:  # lz4: RuntimeError
         reason = str(error).partition("\n")[0] or type(error).__name__
         fix = "Save what is intact with imutool repair, and convert that"
         raise DataError(f"cannot be read as an MCAP log ({reason})", where=path, fix=fix) from error

@@ -149,7 +149,7 @@ class SurveyReport(Section, frozen=True, kw_only=True):
     last_ns: int
     duration_s: float
     scale: dict[str, float]
-    axes: dict[str, str]
+    axes: dict[str, str] | UnsetType = UNSET  # reports of 0.1.0 have none
     rules: list[str]
     findings: list[FindingReport]
 

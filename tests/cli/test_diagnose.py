@@ -124,7 +124,7 @@ def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
     lines = said.stdout.splitlines()
     assert lines[0].startswith("The accel differs")
     assert "(lever_arm)" in lines[0]
-    assert lines[-1] == f"{place}: findings.json, physics.toml, report.html, log.html, view.rrd"
+    assert lines[-1] == f"{place}: findings.json, physics.toml, noise.toml, report.html, log.html, view.rrd"
     (closer,) = [line for line in lines if "imulated again with everything that was found" in line]
     assert "accel rms" in closer
     assert "% of the misfit removed" in closer
@@ -214,7 +214,8 @@ def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "rerun", None)
     (remark,) = diagnosis_output.write(diagnoses.NOTHING, tmp_path / "out", overwrite=True)
     assert remark == "view.rrd is left out: rerun is not installed (pip install 'imutool[view]')"
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["findings.json", "physics.toml", "report.html"]
+    files = ["findings.json", "noise.toml", "physics.toml", "report.html"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == files
 
 
 def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

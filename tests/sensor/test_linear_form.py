@@ -178,18 +178,18 @@ def test_an_effect_on_the_wrong_sensor_or_given_twice_is_refused() -> None:
 # ── what each one is ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def exact_signals(n: int = 60) -> tuple[Signals, Callable[..., np.ndarray], Callable[..., np.ndarray]]:
+def exact_signals(n: int = 60) -> tuple[Signals, Callable[..., np.ndarray]]:
     """Signals of a true motion, its angular acceleration the true one, and the force that a point of the body feels."""
     path = trajectory(4)
     t_ns = path.start_ns + 5_000_000_000 + np.arange(n, dtype=np.int64) * 5_000_000
     motion = path.at(t_ns)
     columns = np.zeros((n, COUNT))
     columns[:, GYRO], columns[:, ACCEL], columns[:, ALPHA] = motion.omega_b, motion.specific_force(), motion.alpha_b
-    return Signals(np.arange(n) / RATE_HZ, columns), motion.specific_force, motion.acceleration
+    return Signals(np.arange(n) / RATE_HZ, columns), motion.specific_force
 
 
 def test_a_lever_arm_is_the_rigid_body_law() -> None:
-    signals, felt_at, _ = exact_signals()
+    signals, felt_at = exact_signals()
     r_b = np.array([0.1, -0.2, 0.3])
     (effect,) = catalogue.trained("accel", ["lever_arm"])
     error = effect.compiled(r_b)(signals)
