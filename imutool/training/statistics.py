@@ -82,9 +82,10 @@ def turn_on_prior(
     Logs of one switching-on are one draw of the turn-on bias. From S sessions with means m_s the next one has the variance
     (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more.
     Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
-    Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`.
+    Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`. Where most logs that follow each other closely
+    differ all the same, the next log is of a session of its own, and no session is returned.
     """
-    groups = _sessions(rest, spans_ns)
+    groups, broken = _sessions(rest, spans_ns)
     means = np.stack([rest[group].mean(axis=0) for group in groups])
     usual, turn_on = (np.repeat([size[sensor] for sensor in SENSORS], 3) for size in (USUAL_STD, TURN_ON_STD))
     squares = sum(((rest[group] - mean) ** 2).sum(axis=0) for group, mean in zip(groups, means, strict=True))
@@ -100,22 +101,25 @@ def turn_on_prior(
             np.sqrt(within * (1 + 1 / len(group))),
         )
         for group, of_group in zip(groups, means, strict=True)
+        if broken <= len(rest) - len(groups)
     ]
     return mean, np.sqrt(between + within), sessions
 
 
-def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Logs of each switching-on: hours apart at most, and biases alike."""
+def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> tuple[list[list[int]], int]:
+    """Logs of each switching-on, hours apart at most and with biases alike; how many follow closely and are not alike."""
     step = np.repeat([SESSION_STEP[sensor] for sensor in SENSORS], 3)
     groups: list[list[int]] = []
+    broken = 0
     for log in sorted(range(len(rest)), key=lambda log: spans_ns[log]):
         before = groups[-1][-1] if groups else None
         near = before is not None and spans_ns[log][0] - spans_ns[before][1] <= nanoseconds(SESSION_GAP_S)
         if near and bool((np.abs(rest[log] - rest[before]) < step).all()):
             groups[-1].append(log)
         else:
+            broken += near
             groups.append([log])
-    return groups
+    return groups, broken
 
 
 def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float64[np.ndarray, "logs 6"]) -> Vector6:

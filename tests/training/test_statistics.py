@@ -39,6 +39,12 @@ def test_sessions_are_hours_apart_or_have_other_biases() -> None:
     np.testing.assert_allclose(std[0], np.sqrt(between), rtol=0.03)
 
 
+def test_logs_that_follow_closely_and_differ_say_nothing_of_the_next_one() -> None:
+    _, std, sessions = turn_on_prior(biases(0.01, 0.02, 0.014, 0.006), spans(0.0, 1.0, 2.0, 3.0))
+    assert sessions == []
+    assert (std > TURN_ON_STD["gyro"]).all()
+
+
 def test_one_log_is_a_session_of_its_own() -> None:
     _, std, (session,) = turn_on_prior(biases(0.01), spans(0.0))
     np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + MOST_TAIL * USUAL[0] ** 2))
