@@ -164,7 +164,11 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
         rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
-        rows += [(imu["topic"], entry["subject"], entry["evidence"]) for entry in imu.get("conventions", [])]
+        alike: dict[str, list[str]] = {}
+        for entry in imu.get("conventions", []):
+            alike.setdefault(entry["evidence"], []).append(entry["subject"])
+        for evidence, subjects in alike.items():  # what poses would show, they fail to show for one reason
+            rows.append((imu["topic"], subjects[0] if len(subjects) == 1 else "axes against poses", evidence))
         for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
             noise = imu["noise"]
             if noise is not None:

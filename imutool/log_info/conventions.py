@@ -17,7 +17,7 @@ from imutool.cleaning.unit_evidence import accel_reading
 from imutool.log_info.report import Convention
 from imutool.recording import Imu
 
-NO_POSES = "the log has no poses but odometry"
+NO_POSES = "the log has no true poses"
 NO_TURN = "the motion turns too little, or about one axis only"
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
