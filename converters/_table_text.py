@@ -121,7 +121,7 @@ def read_csv(text: str, columns: Columns, path: Path) -> None:
             columns.values[name], columns.texts[name], columns.units[name] = values, texts, units.get(name, "")
         elif (t_ns := _dates(texts)) is not None:
             columns.values[name], columns.units[name] = t_ns, "ns"
-            if not any(texts[0].endswith(zone) for zone in ("Z", "UTC")) and not re.search(r":\d\d[.,\d]*[+-]", texts[0]):
+            if not texts[0].endswith(("Z", "UTC")) and not re.search(r":\d\d[.,\d]*[+-]", texts[0]):
                 columns.remarks.notes.append(f"{name}: its times name no zone and count as UTC")
     if commas:
         columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
@@ -138,7 +138,7 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
 
 
 def _dates(texts: list[str]) -> np.ndarray | None:
-    """Calendar times in nanoseconds since 1970; None of other texts."""
+    """Calendar times in nanoseconds since 1970; None for other texts."""
     found = []
     for text in texts:
         if (match := DATE.fullmatch(text)) is None:

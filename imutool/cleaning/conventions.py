@@ -123,7 +123,7 @@ class _Choice(NamedTuple):
 
 
 def _choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"]) -> _Choice | None:
-    """Best row of errors, by Student's likelihood; None of too little time.
+    """Best row of errors, by Student's likelihood; None for too little time.
 
     `certain` is the smallest ratio of the mean of the blocks' likelihood ratios to its standard error.
     """

@@ -66,7 +66,7 @@ def _correlation(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> 
 
 
 def _peak(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) -> float:
-    """Place of the largest value between steps; NaN at the end or of a weak one."""
+    """Place of the largest value, between steps; NaN if it is weak or at an end."""
     best = int(np.argmax(values))
     if values[best] < WEAK or best in (0, len(lags) - 1):
         return float("nan")

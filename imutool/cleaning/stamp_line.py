@@ -50,7 +50,7 @@ class Stamps(NamedTuple):
 
 
 def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
-    """Stamps with wraps taken up: steps back by the range of a counter."""
+    """Stamps whose wraps are undone; a wrap is a step back by the range of a counter."""
     steps, wraps = np.diff(stamp_ns), Counter[str]()
     usual = int(np.median(steps)) if len(steps) else 0
     for row in np.flatnonzero(steps < -max(usual, 1)):
@@ -68,7 +68,7 @@ def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
 def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     """Stamps on the line under them, by stretches without a gap.
 
-    They increase, but where the clock was set back.
+    They increase, except where the clock was set back.
     """
     found = read_stamps(stamp_ns)
     whole, steps = found.stamp_ns, np.diff(found.stamp_ns)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from imutool.noise_identification import IdentifiedNoise
 
 
-IS_EPOCH_NS = 10**9 * 365 * 86400  # an earlier first stamp is no date, but time since a start
+EARLIEST_DATE_NS = 365 * 86400 * 10**9  # of 1971: an earlier first stamp counts from a start
 
 
 @app.command(epilog="Example: [bold]imutool info MH_04.mcap[/] or [bold]imutool info still.mcap --noise --noise-toml i.toml[/]")
@@ -128,10 +128,11 @@ def _span(report: LogInfo) -> str:
     size = f"{report.bytes / 1e6:.1f} MB, {report.messages} messages"
     if report.first_ns is None or report.duration_s is None:
         return size
-    begin = f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    if report.first_ns < IS_EPOCH_NS:
-        begin = f"{report.first_ns * 1e-9:.3f} s on its own clock"
-    return f"{size}, {report.duration_s:.3f} s from {begin}"
+    if report.first_ns < EARLIEST_DATE_NS:
+        return f"{size}, {report.duration_s:.3f} s from {report.first_ns * 1e-9:.3f} s on its own clock"
+    return (
+        f"{size}, {report.duration_s:.3f} s from {datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    )
 
 
 def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
@@ -167,8 +168,8 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         alike: dict[str, list[str]] = {}
         for entry in imu.get("conventions", []):
             alike.setdefault(entry["evidence"], []).append(entry["subject"])
-        for evidence, subjects in alike.items():  # what poses would show, they fail to show for one reason
-            rows.append((imu["topic"], subjects[0] if len(subjects) == 1 else "axes against poses", evidence))
+        for evidence, subjects in alike.items():  # only what the poses leave open has a reason in common
+            rows.append((imu["topic"], subjects[0] if len(subjects) == 1 else "against poses", evidence))
         for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
             noise = imu["noise"]
             if noise is not None:

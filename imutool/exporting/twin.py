@@ -290,10 +290,10 @@ def _unit(unit: str) -> str:
     return f"  # {unit}" if unit else ""
 
 
+# By format: the name of its file, and the function that makes its text (None: only the files that `imutool simulate` takes).
 FORMATS: Mapping[str, tuple[str, Callable[[Twin], str] | None]] = {
     "mujoco": ("imu.xml", _mujoco),
     "gazebo": ("imu.sdf", _gazebo),
     "isaac": ("imu.py", _isaac),
     "toml": (PHYSICS, None),
 }
-"""Name of the file, and its text; without one the two files that `imutool simulate` takes."""

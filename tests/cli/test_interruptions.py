@@ -231,6 +231,16 @@ def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None
 # ── an input that changes, two runs at once ──
 
 
+def change_input(source: Path, change: str) -> None:
+    if change == "grows":
+        with source.open("ab") as file:
+            file.write(b"\0" * 100_000)
+    elif change == "vanishes":
+        source.unlink()
+    else:
+        os.truncate(source, source.stat().st_size // 2)
+
+
 @pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
 @pytest.mark.parametrize("name", ["convert a log", "debias", "repair", "export"])
 def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: str, change: str) -> None:
@@ -242,14 +252,7 @@ def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: 
         time.sleep(POLL_S)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGSTOP)
-    source = here / "in.mcap"
-    if change == "grows":
-        with source.open("ab") as file:
-            file.write(b"\0" * 100_000)
-    elif change == "vanishes":
-        source.unlink()
-    else:
-        os.truncate(source, source.stat().st_size // 2)
+    change_input(here / "in.mcap", change)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGCONT)
     _, stderr = process.communicate(timeout=WAIT_S)
@@ -285,13 +288,7 @@ def test_an_input_that_changes_at_a_read(
 
     def changing(self: Source, offset: int, length: int) -> bytes:
         if self.path.name == source.name and next(reads) == CHANGED_AT:
-            if change == "grows":
-                with source.open("ab") as file:
-                    file.write(b"\0" * 100_000)
-            elif change == "vanishes":
-                source.unlink()
-            else:
-                os.truncate(source, source.stat().st_size // 2)
+            change_input(source, change)
         return read(self, offset, length)
 
     monkeypatch.setattr(Source, "_read", changing)

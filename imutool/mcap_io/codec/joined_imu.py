@@ -49,7 +49,7 @@ class JoinedImu:
 
 
 def parse_parts(text: str) -> tuple[str, str] | None:
-    """Topics of `gyro=/a,accel=/b`; None of any other name.
+    """Topics of `gyro=/a,accel=/b`; None for any other name.
 
     Raises:
         ConfigError: it begins like that, and one of the two is missing.

@@ -35,6 +35,7 @@ TAIL = 0.005  # of the samples: spikes may cross into the next run
 SHIFTED = "Each run is drawn below the one before by the step at the right, so that it does not cover it."
 ZOOM_S = 4.0
 SIGMAS = 3.0
+ROUNDING = 1e-7  # of the largest density: below is the rounding of a difference that is constant
 BAND_POINTS = 300
 MIN_REST_S = 4.0  # in one piece, for an Allan deviation
 NOUNS = {"gyro": "Angular rate", "accel": "Specific force"}
@@ -243,6 +244,9 @@ def _draw_spectrum(
         for k, axes in enumerate(panels):
             label = f"{run_name(trace)}: raw minus debiased, {AXES[k]}"
             axes.plot(at, np.sqrt(np.where(power[:, k] > 0.0, power[:, k], np.nan)), label=label, **style)
+    for axes in panels:
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], ROUNDING * axes.get_ylim()[1]))
     _decades(panels)
     panels[-1].set_xlabel("frequency (Hz)")
     legend(figure, lines)

@@ -162,7 +162,7 @@ def key_numbers(data: RunData) -> list[tuple[str, str]]:
     if chosen is not None and (window := _window(chosen, 10.0)) is not None:
         numbers.append((format_quantity(window, "°"), f"drift in 10 s, {run_name(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
-        numbers.append((f"{count:,}", "events"))
+        numbers.append((f"{count:,}", "event" if count == 1 else "events"))
     return numbers
 
 

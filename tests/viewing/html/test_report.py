@@ -185,6 +185,11 @@ def test_every_run_has_its_curve_in_every_panel_it_belongs_to(seen: RunData, pag
             assert titles.count(f"{report_wording.run_name(seen.traces[names.index(name)])}: raw minus debiased, x") == 2
         # signals, their zoom, spectra and Allan deviations of two sensors, and the biases of a model
         assert titles.count(f"{name}, z") == 8 + 2 * (name != "raw")
+    spectra = [svg for svg in svgs(page) if "spectrum" in svg]
+    assert len(spectra) == 2
+    for svg in spectra:  # the differences are constant: the spectrum of their rounding, below 1e-18, stretches no axis
+        assert ">1e-" in svg
+        assert not re.search(r">1e-[1-9]\d<", svg)
     assert titles.count("true, y") == 2
     assert titles.count("±3 σ, x") == 2
     assert titles.count("truth") == len([svg for svg in svgs(page) if "Paths:" in svg])
