@@ -244,9 +244,11 @@ def _draw_spectrum(
         for k, axes in enumerate(panels):
             label = f"{run_name(trace)}: raw minus debiased, {AXES[k]}"
             axes.plot(at, np.sqrt(np.where(power[:, k] > 0.0, power[:, k], np.nan)), label=label, **style)
-    for axes in panels:
-        axes.set_yscale("log")
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], ROUNDING * axes.get_ylim()[1]))
+    for k, axes in enumerate(panels):
+        largest = max(float(np.sqrt(density[:, k].max())) for _, _, density in curves)
+        if largest > 0.0:
+            axes.set_yscale("log")
+            axes.set_ylim(bottom=max(axes.get_ylim()[0], ROUNDING * largest))
     _decades(panels)
     panels[-1].set_xlabel("frequency (Hz)")
     legend(figure, lines)
