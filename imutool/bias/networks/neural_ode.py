@@ -112,16 +112,22 @@ class Network(BiasNetwork):
         field, start = self._joint_start(segment)
         return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias beta + C(u) at each sample; beta is linear between the steps of the drift."""
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """C(u) at each sample; the joint scheme tells no such part from the gyro's bias."""
+        u, _ = segment.of(sensor)
+        if self.config.joint and sensor == "gyro":
+            return torch.zeros_like(u)
+        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
+        return motion
+
+    def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """beta at each sample, linear between the steps of the drift; in the joint scheme the gyro's whole bias."""
         if self.config.joint and sensor == "gyro":
             field, start = self._joint_start(segment)
             return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
-        u, rest = segment.of(sensor)
-        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
         if sensor not in self.config.drift:
-            return rest[:, None] + motion
-        return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
+            return super().rest_bias(sensor, segment)
+        return self._rest_path(segment.t, *segment.of(sensor), self.drift[sensor])
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Set the linear part of the curve, or of the joint field."""
