@@ -145,10 +145,12 @@ class Network(BiasNetwork):
         steps = math.ceil((n - 1) / stride)
         whole = (n - 1) // stride
         knots = self._filtered(u, DRIFT_FILTER_S)[:, : whole * stride + 1 : stride][:, :steps]
-        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
         step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
-
-        beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
+        if self.config.solver == "euler":
+            beta = _euler(drift, knots, step_s, rest)
+        else:
+            path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
+            beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
         index = torch.arange(n, device=u.device) / stride
         j = index.long().clamp(max=steps - 1)
         return torch.lerp(beta[j], beta[j + 1], (index - j)[:, None, None].to(u)).transpose(0, 1)
@@ -175,6 +177,17 @@ class _OnGrid(nn.Module):
         u, du = self.path.value(index), self.path.derivative(index) / self.step_s
         rate: Tensor = self.drift(beta, u, du)
         return self.step_s * rate
+
+
+def _euler(
+    drift: nn.Module, knots: Float[Tensor, "b steps 3"], step_s: Float[Tensor, "b 1"], rest: Float[Tensor, "b 3"]
+) -> Float[Tensor, "m b 3"]:
+    """Euler's steps, which see the path at its knots alone: there it is the sample, and its slope that to the one before."""
+    slopes = torch.diff(knots, dim=1, prepend=knots[:, :1]) / step_s[:, None]
+    beta = [rest]
+    for u, du in zip(knots.unbind(1), slopes.unbind(1), strict=True):
+        beta.append(beta[-1] + step_s * drift(beta[-1], u, du))
+    return torch.stack(beta)
 
 
 def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:
