@@ -51,11 +51,10 @@ from imutool.mcap_io.storage.target import Target
 from imutool.sensor import catalogue, unnamed_effects
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.unnamed_effects import DRIVEN, VARIABLES
-from imutool.units import SENSORS, Sensor
+from imutool.units import SENSORS, Sensor, Three
 
 SCHEMA = "imutool.physics/1"
 OTHER = "# Of another signal than the IMU's: simulate and debias do not apply it."
-Three = tuple[float, float, float]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
 Known = Callable[[Sequence[str]], tuple[Effect, ...]]
