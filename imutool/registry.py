@@ -44,11 +44,12 @@ def _listed(list_points: Callable[..., Iterable[EntryPoint]], group: str, path: 
     return {point.name: point for point in list_points(group=group)}
 
 
-def _own(group: str) -> set[str]:
-    """Keys of the files in this package."""
+@cache
+def _own(group: str) -> frozenset[str]:
+    """Keys of the files in this package: its folders are listed once a process."""
     spec = importlib.util.find_spec(GROUPS[group])
     places = list(spec.submodule_search_locations or ()) if spec else []
-    found = {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
+    found = frozenset(module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_"))
     return found - NOT_PLUGINS.get(group, frozenset())
 
 
