@@ -24,14 +24,14 @@ from imutool.viewing.html import report
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import layout, scene
-from imutool.viewing.rerun.entities.styles import MODEL_COLORS
+from imutool.viewing.rerun.entities.styles import MODEL_COLORS, RAW_COLOR
 from imutool.viewing.rerun.web import export
 
 VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "support" / "viewers.py")))
 
 SIZE = (1280, 720)
 COLORS = 256
-LEAST = 200  # pixels of a curve in a viewer that has drawn it
+LEAST = 300  # pixels of a curve in a viewer that has drawn it
 TABS = ("Signals", "Bias", "Spectrum", "Errors", "Events", "Report")
 TOLD_S = 10.0  # for which a viewer tells of itself in a corner
 
@@ -83,8 +83,8 @@ def paper(browser: Any, page_path: Path, scheme: str) -> Any:
 
 
 def draws(picture: Any) -> bool:
-    """Whether the error of the debiased path is drawn, which is beside every tab."""
-    return bool(VIEWERS.drawn(picture, MODEL_COLORS[0]) >= LEAST)
+    """Whether the errors of both paths are drawn, which are beside every tab (the viewer itself has blue and a little orange)."""
+    return min(VIEWERS.drawn(picture, color) for color in (RAW_COLOR, MODEL_COLORS[0])) >= LEAST
 
 
 def save(picture: Any, path: Path) -> None:
