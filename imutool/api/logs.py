@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, did_you_mean
 from imutool.exporting import ExportReport, euroc, rosbag2, twin
 from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
@@ -202,8 +201,7 @@ def export(
         '/imu0'
     """
     if format not in FORMATS:
-        near = difflib.get_close_matches(format, FORMATS, n=1)
-        fix = f"Did you mean {near[0]}?" if near else ""
+        fix = did_you_mean(format, FORMATS)
         raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
     check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)

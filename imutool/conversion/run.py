@@ -5,7 +5,6 @@ Sequences convert in worker processes, one log a sequence; a sequence that fails
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from imutool import registry
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
-from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -184,12 +183,11 @@ def _only(source_sequences: _Sequences, wanted: Sequence[str]) -> _Sequences:
     names = source_sequences.names()
     for name in wanted:
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
             raise ConfigError(
                 f"{name!r} is not in the source",
                 where="sequences",
                 expected=f"one of {', '.join(sorted(names))}",
-                fix=f"Did you mean {near[0]!r}?" if near else "",
+                fix=did_you_mean(name, names, "{!r}"),
             )
     return _Sequences(
         [job for job in source_sequences.jobs if job.sequence.name in wanted],
