@@ -31,7 +31,7 @@ def with_signals(
     """
     if named:
         for name in named:
-            pair = SignalPair.of_fields(*(on_one_clock(read_field(log, name)) for log in (real, sim)), name)
+            pair = SignalPair.of_fields(on_one_clock(read_field(real, name)), on_one_clock(read_field(sim, name)), name)
             report(3, 4, name)
             diagnosis = _with_signal(diagnosis, diagnose_signal(pair, others(real, name), settings))
         return diagnosis
