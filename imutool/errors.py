@@ -21,6 +21,7 @@ a sentence (``fix="Give `model`"``, ``expected="`init=prior`"``). The command li
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -113,6 +114,14 @@ def redact(text: str) -> str:
     if "://" in text or ":/" in text:
         text = URL_TAIL.sub(r"\1***", URL_LOGIN.sub(r"\1***@", text))
     return SECRET.sub(r"\1***", text) if "=" in text else text
+
+
+def did_you_mean(word: str, known: Iterable[str], shown: str = "{}") -> str:
+    """Question that names the known word nearest to a wrong one, shown in a format; empty if none is near."""
+    import difflib
+
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"Did you mean {shown.format(near[0])}?" if near else ""
 
 
 def was_interrupted(error: BaseException | None) -> bool:

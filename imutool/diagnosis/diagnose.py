@@ -29,7 +29,7 @@ from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.reference.coverage import (
+from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
     check_without_reference,
@@ -37,11 +37,11 @@ from imutool.diagnosis.reference.coverage import (
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.reference.errors import reference_caveat, reference_errors, turned_reference
+from imutool.diagnosis.reference_errors import reference_caveat, reference_errors, turned_reference
 from imutool.diagnosis.result import Diagnosis, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.compared_signals import with_signals
-from imutool.diagnosis.to_physics_file import NO_EFFECT
+from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
 from imutool.mcap_io.fields import read_field

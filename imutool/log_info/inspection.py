@@ -21,8 +21,7 @@ from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_info.conventions import convention_summary, convention_warnings, conventions
-from imutool.log_info.pose_agreement import agreement
+from imutool.log_info.conventions import agreement, convention_summary, convention_warnings, conventions
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
