@@ -402,6 +402,9 @@ def test_an_existing_target_stays_without_overwrite(here: Path, refuse: Refuse) 
     assert "--overwrite" in refuse(CONFIG, "train", "flight_1.mcap", "-o", "linear.safetensors", "--method", "linear")
 
 
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # Python leaves it half written there
+
+
 def full_disk() -> None:
     """In the child: no file may grow beyond some size; writing on then fails as on a full disk (Python ignores SIGXFSZ)."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, DISK_BYTES))
@@ -411,13 +414,13 @@ def full_disk() -> None:
 def test_a_full_disk_leaves_nothing(here: Path, refuse: Refuse, name: str) -> None:
     write_asl(flight(3, duration_s=10.0), here / "seq")
     words = [word.format(".") for word in TARGETS[name]]
-    message = refuse(CONFIG, *words, preexec_fn=full_disk)
+    message = refuse(CONFIG, *words, preexec_fn=full_disk, env=NO_BYTECODE)
     assert "out." in message
 
 
 def test_a_full_disk_leaves_no_half_model(here: Path, refuse: Refuse) -> None:
     words = ["train", "flight_1.mcap", "-o", "m.safetensors", *QUICK, "--set", "validate_every=5"]
-    assert "m.safetensors" in refuse(CONFIG, *words, preexec_fn=full_disk)
+    assert "m.safetensors" in refuse(CONFIG, *words, preexec_fn=full_disk, env=NO_BYTECODE)
 
 
 def test_results_into_a_full_disk_are_told(here: Path, command: str) -> None:
