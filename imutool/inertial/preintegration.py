@@ -69,16 +69,16 @@ def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> 
     force = (R @ accel[..., None])[..., 0]
     force_by_gyro_bias = -R @ hat(accel) @ R_by_bias
 
-    to_velocity, to_position = np.zeros((2, n))  # trapezoidal weights
-    for weights, of_step in ((to_velocity, dt), (to_position, dt * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:])))):
-        weights[:-1] = of_step
-        weights[1:] += of_step
-        weights *= 0.5
+    weights = np.zeros((2, n))  # trapezoidal, to velocity and to position
+    weights[0, :-1], weights[1, :-1] = dt, dt * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:]))
+    weights[:, 1:] += weights[:, :-1].copy()
+    weights *= 0.5
+    to_velocity, to_position = weights
     by_bias = np.zeros((9, 6))
     by_bias[:3, :3] = R_by_bias[-1]
-    for rows, weights in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
-        by_bias[rows, :3] = np.einsum("n,nij->ij", weights, force_by_gyro_bias)
-        by_bias[rows, 3:] = -np.einsum("n,nij->ij", weights, R)
+    for rows, of_sample in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
+        by_bias[rows, :3] = np.einsum("n,nij->ij", of_sample, force_by_gyro_bias)
+        by_bias[rows, 3:] = -np.einsum("n,nij->ij", of_sample, R)
     turned_rad = float(np.sqrt((step * step).sum(axis=1)).sum())
     return Increment(float(t_s[-1] - t_s[0]), R[-1], to_velocity @ force, to_position @ force, by_bias, turned_rad)
 
