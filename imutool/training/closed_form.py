@@ -111,8 +111,7 @@ def solve(
     turns = ROTATION[sensor] if nuisances else slice(0, 0)
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
-    carried: dict[int, Float[Tensor, "m n 3 3"]] = {}  # by window length: the gyro does not change here
-    motion: dict[int, Float[Tensor, "m n 3"]] = {}  # nor does what the samples alone add
+    known: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
         own[:, :3] = rest[:, columns]
         now = torch.cat([W.flatten()[:known], own.flatten()])
@@ -121,11 +120,10 @@ def solve(
             if not len(first):
                 continue
             windows = pool.windows(first, n, rest[pool.log[first]])
-            if sensor == "accel" and n not in carried:
-                carried[n] = carried_attitudes(model, windows)
-            if n not in motion:
-                motion[n] = model.motion_bias(sensor, windows.segment)
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None, carried.get(n), motion[n])
+            if n not in known:
+                carried = carried_attitudes(model, windows) if sensor == "accel" else None
+                known[n] = carried, model.motion_bias(sensor, windows.segment)
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None, *known[n])
             rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
             by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
             apart = own.clone()
