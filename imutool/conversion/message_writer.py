@@ -16,7 +16,7 @@ from jaxtyping import Shaped, UInt8
 
 import imutool
 from imutool.conversion.sensor_pairs import SensorPairs
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError, not_installed
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
@@ -189,8 +189,7 @@ def _reflected(topic: MessageTopic, first: bytes) -> Reflected | None:
     try:
         return reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
     except ImportError as error:
-        fix = "Install it with: pip install 'imutool[protobuf]'"
-        raise ConfigError("reading protobuf messages needs protobuf", where=topic.name, fix=fix) from error
+        raise not_installed("protobuf", "protobuf", where=topic.name, user="reading such messages") from error
 
 
 def _write_metadata(log: LogWriter, source: MessageLog) -> None:
