@@ -13,6 +13,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
 
+from fuzz import bounded
 from fuzz.numbers import put_log
 from imutool.bias import io
 from imutool.cli.demo import write_asl
@@ -238,6 +240,35 @@ def test_samples_of_no_sensor_are_left_out_or_refused(tmp_path: Path, imutool: R
         msgspec.json.decode(done.stdout)  # strict: it refuses NaN
     elif done.returncode:
         assert "error: " in done.stderr or done.returncode == 3
+
+
+CLOCK_S = 8.0
+JUMPING: tuple[tuple[str, ...], ...] = (
+    ("info", "in.mcap"),
+    ("evaluate", "in.mcap"),
+    ("audit", "in.mcap"),
+    ("convert", "in.mcap", "out.mcap"),
+    ("export", "in.mcap", "out", "--format", "euroc"),
+    ("clean", "in.mcap", "--json", "-"),
+    ("view", "in.mcap", "--html", "out.html"),
+)  # debias: tests/bias_start/test_stretches.py; train: tests/training/test_segments.py
+
+
+@pytest.mark.parametrize("words", JUMPING, ids=lambda words: words[0])
+def test_a_clock_that_jumps_from_1970_costs_nothing_and_is_told(tmp_path: Path, imutool: Run, words: Sequence[str]) -> None:
+    """A robot without a battery for its clock, until it hears of the time."""
+    recording = flight(1, duration_s=CLOCK_S)
+    poses = next(iter(recording.truths.values()))
+    since_1970, set_ns = int(recording.imu.t_ns[0]) - 10**9, int(recording.imu.t_ns[len(recording.imu) // 3])
+    imu_ns, pose_ns = (np.where(t < set_ns, t - since_1970, t) for t in (recording.imu.t_ns, poses.t_ns))
+    put_log(tmp_path / "in.mcap", imu_ns, recording.imu.gyro, recording.imu.accel, replace(poses, t_ns=pose_ns))
+    with bounded():
+        done = imutool(*words, cwd=tmp_path)
+    assert done.returncode in {0, LOG}, done.stderr
+    page = tmp_path / "out.html"
+    assert re.search(
+        "clock jumps by|the clock was set", done.stdout + done.stderr + (page.read_text() if page.exists() else "")
+    )
 
 
 def test_time_going_back_in_a_log_stops_debias(tmp_path: Path, refuse: Refuse) -> None:

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError, LogError, not_installed
 from imutool.location import to_location
 from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
@@ -37,6 +37,13 @@ def open_source(name: str, malformed: Malformed, *, imu: str | None = None, spee
         ConfigError: no such source, or it cannot be opened.
         LogError: a log without an IMU, or with several.
     """
+    samples = _source(name, malformed, imu, speed)
+    next(samples)  # it is open: whoever drops the iterator closes it
+    return samples
+
+
+def _source(name: str, malformed: Malformed, imu: str | None, speed: float) -> Samples:
+    """Open source; its first item is None."""
     parts = urlsplit(name)
     if name in {"-", "stdin"}:
         return _lines(malformed)
@@ -63,6 +70,7 @@ def _replay(name: str, imu: str | None, speed: float) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with log:
+            yield None
             began, first_ns = time.perf_counter(), None
             for batch in log.imu_batches(imu or topics[0]):
                 for stamp_ns, gyro, accel in zip(
@@ -83,6 +91,7 @@ def _lines(malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         rest = b""
+        yield None
         while True:
             if os.name == "posix" and not select.select([descriptor], [], [], WAIT_S)[0]:
                 yield None
@@ -116,6 +125,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with line:
+            yield None
             while True:
                 try:
                     datagram = line.recv(MAX_BYTES)
@@ -132,7 +142,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
 def _rosbridge(name: str, malformed: Malformed) -> Samples:
     """Samples of a topic from a rosbridge server (https://github.com/RobotWebTools/rosbridge_suite)."""
     if find_spec("websockets") is None:
-        raise ConfigError("a rosbridge needs websockets, which is not installed", where=name, fix="pip install 'imutool[live]'")
+        raise not_installed("websockets", "live", where=name, user="a rosbridge")
     from websockets.exceptions import ConnectionClosed, InvalidHandshake
     from websockets.sync.client import connect
 
@@ -151,6 +161,7 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with connection, contextlib.suppress(ConnectionClosed):
+            yield None
             while True:
                 try:
                     text = line.recv(timeout=WAIT_S)
@@ -165,7 +176,7 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
 def _zenoh(name: str, malformed: Malformed) -> Samples:
     """Samples that are published under a key: JSON, or the CDR of a sensor_msgs/Imu, as rmw_zenoh sends it."""
     if find_spec("zenoh") is None:
-        raise ConfigError("needs eclipse-zenoh, which is not installed", where=name, fix="pip install 'imutool[live]'")
+        raise not_installed("eclipse-zenoh", "live", where=name, user="the source")
     import zenoh
 
     parts, config, arrived = urlsplit(name), zenoh.Config(), Queue[tuple[float, bytes]](MOST_WAITING)
@@ -191,6 +202,7 @@ def _zenoh(name: str, malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with session:
+            yield None
             while True:
                 try:
                     arrival_s, payload = arrived.get(timeout=WAIT_S)
