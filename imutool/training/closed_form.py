@@ -111,7 +111,7 @@ def solve(
     turns = ROTATION[sensor] if nuisances else slice(0, 0)
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
-    known: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
+    fixed: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
         own[:, :3] = rest[:, columns]
         now = torch.cat([W.flatten()[:known], own.flatten()])
@@ -120,10 +120,10 @@ def solve(
             if not len(first):
                 continue
             windows = pool.windows(first, n, rest[pool.log[first]])
-            if n not in known:
+            if n not in fixed:
                 carried = carried_attitudes(model, windows) if sensor == "accel" else None
-                known[n] = carried, model.motion_bias(sensor, windows.segment)
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None, *known[n])
+                fixed[n] = carried, model.motion_bias(sensor, windows.segment)
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None, *fixed[n])
             rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
             by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
             apart = own.clone()
