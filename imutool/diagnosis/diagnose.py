@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from imutool.bias_start.stretches import measured_recording
 from imutool.diagnosis import summarize
-from imutool.diagnosis.audit.audit import simulator_remarks
+from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
