@@ -116,7 +116,7 @@ def _wrong_gravity(samples: Samples) -> str:
 
 def _evidence(model: BiasModel, samples: Samples, prior: BiasPrior) -> _Evidence:
     """Evidence of samples, minus the model's motion-dependent bias, about a prior of a constant bias."""
-    blocks = list(filter_blocks(model, [samples], replace(prior, walk=np.zeros(6)), ahead=True))
+    blocks = list(filter_blocks(model, [samples], replace(prior, walk=np.zeros(6))))
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
     innovations = np.array([_innovation(block) for block in blocks])
@@ -131,9 +131,9 @@ def _evidence(model: BiasModel, samples: Samples, prior: BiasPrior) -> _Evidence
     return _Evidence(float(innovations[:, 1].sum()), surprising, difference, variance)
 
 
-def _innovation(block: FilteredBlock, settings: FilterSettings | None = None) -> tuple[float, float]:
+def _innovation(block: FilteredBlock) -> tuple[float, float]:
     """Chi-square of a block's velocity, and its log-likelihood under Student's distribution."""
-    s, expected = settings or FilterSettings(), block.step.expected
+    s, expected = FilterSettings(), block.step.expected
     length_s = block.end_s - block.start_s
     noise = s.rest_m_s**2 if block.resting else 2.0 * s.speed_m_s**2 * s.speed_correlation_s / length_s
     S = expected.P[VELOCITY, VELOCITY] + noise * np.eye(3)
