@@ -26,8 +26,8 @@ from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
 from imutool.mcap_io.index import LogIndex
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
-from imutool.recording.two_sensors import joined
 
 ENCODINGS = ("cdr", "ros1")
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
