@@ -232,7 +232,7 @@ class TrajectoryBiasStream:
 
 
 def filter_blocks(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> Iterator[FilteredBlock]:
-    """Filtered blocks of samples, minus the model's motion-dependent bias; a stop is known as it begins."""
+    """Filtered blocks of samples, minus the model's motion-dependent bias."""
     motion = model.stream(prior.mean)
     filter_ = BiasFilter(prior, ahead=True)
     for t_s, gyro, accel in batches:
