@@ -106,7 +106,7 @@ def convert(
 
     Args:
         source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
-        out: Log file for one sequence, folder for several.
+        out: Log file for one sequence, folder for several; `logs/` is a folder for one too.
         format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
         sequences: Names of the sequences to convert; by default all.
         compression: `zstd`, `lz4` or `none`.
@@ -129,9 +129,10 @@ def convert(
         ['flight_1.mcap', 'flight_2.mcap']
     """
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
+    target = local(out, "out")
     return conversion.convert(
         local(source, "source"),
-        local(out, "out"),
+        f"{target}/" if str(out).endswith("/") else target,
         format=format,
         sequences=sequences,
         compression=compression,
