@@ -129,10 +129,9 @@ def convert(
         ['flight_1.mcap', 'flight_2.mcap']
     """
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
-    target = local(out, "out")
     return conversion.convert(
         local(source, "source"),
-        f"{target}/" if str(out).endswith("/") else target,
+        f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
         format=format,
         sequences=sequences,
         compression=compression,
