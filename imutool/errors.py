@@ -85,6 +85,18 @@ class UsageError(ConfigError):
     exit_code = 2
 
 
+def not_installed(
+    package: str, extra: str, *, where: object = None, user: str = "", error: ImportError | None = None
+) -> ConfigError:
+    """Error of a missing package, with the extra that brings it.
+
+    `user` is what needs the package, `error` why an installed one cannot be imported.
+    """
+    why = "" if error is None or isinstance(error, ModuleNotFoundError) else f" ({error})"
+    what = f"{user} needs {package}, which is not installed" if user else f"{package} is not installed"
+    return ConfigError(what + why, where=where, fix=f"Install it with: pip install 'imutool[{extra}]'")
+
+
 class DataError(ImutoolError):
     """The source data contradict themselves or their format."""
 

@@ -14,7 +14,7 @@ import typer
 from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written, app
 from imutool.cli.evaluate import Score
 from imutool.cli.terminal import epoch_line, err, figures, plain, progress, say, write_json
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, not_installed
 from imutool.report import Report
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def _check(out: Path, overwrite: bool) -> None:
     """Check everything that would stop the demo half-way."""
     for module, extra in (("rerun", "view"), ("matplotlib", "report")):
         if importlib.util.find_spec(module) is None:
-            raise ConfigError(f"{module} is not installed", where="demo", fix=f"pip install 'imutool[{extra}]'")
+            raise not_installed(module, extra, where="demo")
     if out.exists() and not out.is_dir():
         raise ConfigError("is a file", where=out, expected="a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:

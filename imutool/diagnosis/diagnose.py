@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias_start.stretches import measured_recording
+from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
@@ -119,7 +119,7 @@ def diagnose(
 
 def read_log(log: Location, *, imu: str | None = None, truth: str | None = None) -> Recording:
     """A recording or a simulation, which may fall freely, without samples that no sensor gives."""
-    return measured_recording(read(log, imu=imu, truth=truth), free_fall=True)
+    return measured_recording(longest_stretch(read(log, imu=imu, truth=truth)), free_fall=True)
 
 
 def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:

@@ -17,6 +17,7 @@ from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, StampCheck, check_finite
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
+from imutool.recording.columns import clock_jumps, jump_warnings
 
 logger = logging.getLogger(__name__)
 
@@ -194,13 +195,13 @@ class _Columns:
     def imu(self) -> Imu:
         with self.log.named(self.imu_topic):
             stamp_ns, (gyro, accel) = self.columns(self.imu_topic, 3, 3)
+            for warning in jump_warnings(clock_jumps(stamp_ns)):
+                logger.warning("%s %s: %s", self.log.path, self.imu_topic, warning)
             return Imu(stamp_ns, gyro, accel)
 
     def truths(self, wanted: str | None) -> dict[str, Poses]:
         names: list[str] = []
-        for topic in self.truth_topics:
-            if topic in self.left_out:
-                continue
+        for topic in (name for name in self.truth_topics if name not in self.left_out):
             if self.log.topics[topic].schema_name == schemas.TF:
                 names += [name for name in self.kept if name.startswith(f"{topic}/")]
             else:

@@ -14,6 +14,7 @@ from jaxtyping import Float64, Int64
 
 from imutool.errors import DataError
 from imutool.recording import Imu
+from imutool.recording.columns import longest_run
 
 STEP_S = 0.005
 SMOOTHED = 11  # steps; the same of both sensors, so that it adds no delay
@@ -37,9 +38,9 @@ def sensor_delay(
     accel: Float64[np.ndarray, "m 3"],
 ) -> SensorDelay | None:
     """Delay of the accelerometer; None where the motion does not show it."""
-    start = max(int(gyro_ns[0]), int(accel_ns[0]))
-    length = (min(int(gyro_ns[-1]), int(accel_ns[-1])) - start) * 1e-9
-    count = int(length / STEP_S)
+    on_one_clock = gyro_ns[longest_run(gyro_ns)]
+    start = max(int(on_one_clock[0]), int(accel_ns[0]))
+    count = int((min(int(on_one_clock[-1]), int(accel_ns[-1])) - start) * 1e-9 / STEP_S)
     most = round(LONGEST_S / STEP_S)
     if count < PARTS * 10 * most:
         return None
