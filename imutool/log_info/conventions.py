@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,6 +17,8 @@ from imutool.cleaning.truth import Truth
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.log_info.report import Convention
 from imutool.recording import Imu
+
+logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
 NO_TURN = "the motion turns too little, or about one axis only"
@@ -34,6 +37,12 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
     findings = [*Units().findings(whole), *Axes().findings(whole)]
     fix = "; imutool convert LOG OUT --fix corrects it"
     return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
+
+
+def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
+    """Log the warnings about units, axes and frames for whoever uses the samples as they are."""
+    for warning in convention_warnings(convention_summary(imu, truth)) if len(imu) else []:
+        logger.warning("%s: %s", where, warning)
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:

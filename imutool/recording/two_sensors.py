@@ -11,6 +11,7 @@ from imutool.errors import DataError
 from imutool.recording import Imu
 from imutool.recording.sensor_delay import sensor_delay
 
+SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
 
@@ -77,6 +78,8 @@ def _delay_sentence(rates: Cleaned, forces: Cleaned) -> str:
     delay = sensor_delay(rates.t_ns, rates.values, forces.t_ns, forces.values)
     if delay is None:
         return "the motion does not show the delay between them"
+    if abs(delay.seconds) < SHOWN_STDS * delay.std_s:
+        return f"the motion shows no delay between them ({1e3 * delay.seconds:+.1f} ± {1e3 * delay.std_s:.1f} ms)"
     side = "later" if delay.seconds > 0 else "earlier"
     size = f"{abs(delay.seconds) * 1e3:.1f} ms {side} than the gyro's (standard deviation {delay.std_s * 1e3:.1f} ms)"
     return f"by the motion the accelerometer's stamps are {size}, which is not corrected"

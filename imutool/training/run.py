@@ -16,10 +16,12 @@ from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias_start.stretches import measured_recording
+from imutool.cleaning.truth import truth_of
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import rotation_residual
+from imutool.log_info.conventions import warn_of_conventions
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
@@ -85,6 +87,7 @@ def train(
         config_of(chosen)  # a misspelt setting is an error before any log is read
     recordings = [measured_recording(read(log, imu=imu, truth=truth)) for log in logs]
     for recording in recordings:
+        warn_of_conventions(recording.imu, truth_of(recording), f"{recording.name} {recording.imu_topic}")
         if recording.truth_caveat:
             logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
