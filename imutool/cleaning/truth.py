@@ -10,6 +10,7 @@ from jaxtyping import Float64, Int64
 
 from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
+from imutool.mcap_io.codec.schemas import TF
 from imutool.mcap_io.log import Log
 from imutool.recording import Poses, Recording, seconds
 
@@ -38,13 +39,17 @@ def read_truth(
 ) -> Truth | None:
     """Poses up to `end_ns` of the first readable topic of the true ones, or of `topics`; None below three.
 
+    A transform of a topic is named as TOPIC/CHILD_FRAME.
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
     for topic in log.truth_topics if topics is None else topics:
         times, places, turns = [], [], []
         last = -(2**62)
+        named = topic if topic in log.topics else next(t.name for t in log.with_schema((TF,)) if topic.startswith(f"{t.name}/"))
         try:
-            for batch in log.pose_batches(topic, end_ns=end_ns):
+            for batch in log.pose_batches(named, end_ns=end_ns):
+                if topic not in (named, f"{named}/{batch.child_frame_id.lstrip('/')}"):
+                    continue
                 keep = _thinned(batch.stamp_ns, last)
                 if len(keep):
                     last = int(batch.stamp_ns[keep[-1]])
@@ -60,7 +65,7 @@ def read_truth(
         good = norm > 0.5
         if good.sum() >= FEWEST:
             columns = np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None]
-            return Truth(topic, *columns, log.topics[topic].pose_kind)
+            return Truth(topic, *columns, log.topics[named].pose_kind)
     return None
 
 
@@ -74,8 +79,7 @@ def of_poses(topic: str, poses: Poses, kind: str = "truth") -> Truth | None:
 
 def truth_of(recording: Recording) -> Truth | None:
     """First poses of a recording at 10 Hz; None without any."""
-    kinds = recording.other_poses
-    return next((of_poses(topic, poses, kinds.get(topic, "truth")) for topic, poses in recording.truths.items()), None)
+    return next((of_poses(topic, poses, recording.kind_of(topic)) for topic, poses in recording.truths.items()), None)
 
 
 def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarray, " m"]:

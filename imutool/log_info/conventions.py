@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -13,10 +13,10 @@ from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import Motion, Samples
-from imutool.cleaning.truth import Truth
+from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.log_info.report import Convention
-from imutool.recording import Imu
+from imutool.recording import Imu, Recording
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +43,12 @@ def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
     """Log the warnings about units, axes and frames for whoever uses the samples as they are."""
     for warning in convention_warnings(convention_summary(imu, truth)) if len(imu) else []:
         logger.warning("%s: %s", where, warning)
+
+
+def warn_of_recordings(recordings: Iterable[Recording]) -> None:
+    """Log those warnings for recordings in memory."""
+    for recording in recordings:
+        warn_of_conventions(recording.imu, truth_of(recording), f"{recording.name} {recording.imu_topic}")
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:

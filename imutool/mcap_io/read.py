@@ -86,6 +86,7 @@ def read_recording(
         topics = columns.topics if samples is None else columns.topics[1:]
         for topic, rows in log.rows(topics, start_ns, end_ns):
             columns.take(topic, rows)
+    poses = dict.fromkeys([*log.pose_topics, *truths])
     return Recording(
         name=own.get("name", log.path.stem),
         imu=columns.imu() if samples is None else samples,
@@ -95,7 +96,7 @@ def read_recording(
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
-        other_poses={t: k for t in log.pose_topics if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths},
+        other_poses={t: k for t in poses if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths},
     )
 
 
