@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from imutool.bag.scan import Bag
-from imutool.errors import ConfigError, DataError, LogError
+from imutool.errors import ConfigError, DataError, LogError, not_installed
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
 from . import Sequence, _asl
@@ -213,9 +213,7 @@ def _decoder(path: Path) -> Callable[[bytes, str], Any]:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise ConfigError(
-            "reading ROS 1 bags needs rosbags", where=path, fix="Install it with: pip install 'imutool[bags]'"
-        ) from error
+        raise not_installed("rosbags", "bags", where=path, user="reading ROS 1 bags") from error
     store = get_typestore(Stores.ROS1_NOETIC)
 
     def decode(raw: bytes, kind: str) -> Any:

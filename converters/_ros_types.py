@@ -12,7 +12,7 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from imutool.errors import ConfigError
+from imutool.errors import not_installed
 from imutool.recording.message_log import MessageTopic
 
 HEADER, TIME, DURATION = "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
@@ -35,9 +35,7 @@ def need_rosbags(where: Path) -> None:
     try:
         import rosbags.typesys  # noqa: F401
     except ImportError as error:
-        raise ConfigError(
-            "reading ROS bags needs rosbags", where=where, fix="Install it with: pip install 'imutool[bags]'"
-        ) from error
+        raise not_installed("rosbags", "bags", where=where, user="reading ROS bags") from error
 
 
 def ros2_name(kind: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError, not_installed
 
 from ._archive import refusing
 from ._table_text import Columns, is_text_table, read_csv, text_of
@@ -180,9 +180,7 @@ def _module(name: str, path: Path) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition(".")[0]
-        raise ConfigError(
-            f"reading it needs {package}", where=path, fix="Install it with: pip install 'imutool[tables]'"
-        ) from error
+        raise not_installed(package, "tables", where=path, user="reading it") from error
 
 
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {

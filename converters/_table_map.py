@@ -15,8 +15,7 @@ import numpy as np
 
 from imutool.errors import ConfigError
 from imutool.recording.message_log import KINDS
-from imutool.recording.sensor_delay import unit_by_gravity
-from imutool.recording.two_sensors import in_order
+from imutool.recording.two_sensors import in_order, unit_by_gravity
 
 from ._table_text import Columns
 

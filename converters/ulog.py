@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError, not_installed
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
@@ -104,9 +104,7 @@ def _open(path: Path) -> Any:
     try:
         from pyulog import ULog
     except ImportError as error:
-        raise ConfigError(
-            "reading ULogs needs pyulog", where=path, fix="Install it with: pip install 'imutool[ulog]'"
-        ) from error
+        raise not_installed("pyulog", "ulog", where=path, user="reading ULogs") from error
     if head(path, len(ENCRYPTED)) == ENCRYPTED:
         raise DataError("is encrypted", where=path, fix="Decrypt it with PX4's Tools/decrypt_ulog.py first")
     printing = logging.getLogger("pyulog")

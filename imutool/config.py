@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import tomllib
 from collections.abc import Iterable
@@ -11,7 +10,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, did_you_mean
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -124,12 +123,11 @@ def _refuse_unknown(cls: type[Settings], values: dict[str, Any], where: str | Pa
     fields = {field.encode_name: field.type for field in msgspec.structs.fields(cls)}
     for key, value in values.items():
         if key not in fields:
-            near = difflib.get_close_matches(key, fields, n=1)
             raise ConfigError(
                 f"{prefix}{key} is not a setting",
                 where=where or "settings",
                 expected=f"one of {', '.join(sorted(fields))}",
-                fix=f"Did you mean {prefix}{near[0]}?" if near else "",
+                fix=did_you_mean(key, fields, f"{prefix}{{}}"),
             )
         inner = fields[key]
         if isinstance(value, dict) and isinstance(inner, type) and issubclass(inner, Settings):

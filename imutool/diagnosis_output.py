@@ -16,8 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from imutool.diagnosis.result import Diagnosis
-from imutool.diagnosis.to_noise_file import to_noise_file
-from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.noise import datasheet

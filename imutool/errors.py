@@ -21,6 +21,7 @@ a sentence (``fix="Give `model`"``, ``expected="`init=prior`"``). The command li
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
@@ -84,6 +85,18 @@ class UsageError(ConfigError):
     exit_code = 2
 
 
+def not_installed(
+    package: str, extra: str, *, where: object = None, user: str = "", error: ImportError | None = None
+) -> ConfigError:
+    """Error of a missing package, with the extra that brings it.
+
+    `user` is what needs the package, `error` why an installed one cannot be imported.
+    """
+    why = "" if error is None or isinstance(error, ModuleNotFoundError) else f" ({error})"
+    what = f"{user} needs {package}, which is not installed" if user else f"{package} is not installed"
+    return ConfigError(what + why, where=where, fix=f"Install it with: pip install 'imutool[{extra}]'")
+
+
 class DataError(ImutoolError):
     """The source data contradict themselves or their format."""
 
@@ -113,6 +126,14 @@ def redact(text: str) -> str:
     if "://" in text or ":/" in text:
         text = URL_TAIL.sub(r"\1***", URL_LOGIN.sub(r"\1***@", text))
     return SECRET.sub(r"\1***", text) if "=" in text else text
+
+
+def did_you_mean(word: str, known: Iterable[str], shown: str = "{}") -> str:
+    """Question that names the known word nearest to a wrong one, shown in a format; empty if none is near."""
+    import difflib
+
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"Did you mean {shown.format(near[0])}?" if near else ""
 
 
 def was_interrupted(error: BaseException | None) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import importlib
 import importlib.util
 import pkgutil
@@ -14,7 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, did_you_mean
 
 GROUPS = {
     "imutool.converters": "imutool.converters",
@@ -61,12 +60,11 @@ def load(group: str, name: str) -> ModuleType:
     """
     known = names(group)
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
         raise ConfigError(
             f"{name!r} is not known",
             where=group.removeprefix("imutool."),
             expected=f"one of {', '.join(known)}",
-            fix=f"Did you mean {near[0]!r}?" if near else "",
+            fix=did_you_mean(name, known, "{!r}"),
         )
     return _loaded(group, name, _outside(group))
 

@@ -13,7 +13,6 @@ takes `kw_only=True` where such a key stands before one that every report has. U
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import json
 import math
@@ -23,7 +22,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, did_you_mean
 
 __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", "json_text", "json_values", "report_type"]
 
@@ -93,12 +92,11 @@ def report_type(name: str) -> type[Report]:
     """
     short = name.removeprefix("imutool.").partition("/")[0]
     if short not in REPORTS:
-        near = difflib.get_close_matches(short, REPORTS, n=1)
         raise ConfigError(
             f"no report is named {name!r}",
             where="schema",
             expected=f"one of {', '.join(sorted(REPORTS))}",
-            fix=f"Did you mean {near[0]}?" if near else "",
+            fix=did_you_mean(short, REPORTS),
         )
     module, _, kind = REPORTS[short].partition(":")
     report = getattr(importlib.import_module(module), kind)

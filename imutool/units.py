@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 Sensor = Literal["gyro", "accel"]
+Three = tuple[float, float, float]  # one number an axis
 SENSORS: tuple[Sensor, Sensor] = ("gyro", "accel")
 AXES = ("x", "y", "z")
 UNITS = {"gyro": "rad/s", "accel": "m/s²"}  # as people read them
@@ -14,3 +16,9 @@ ASCII_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}  # as JSON and logs hold them
 def with_superscripts(unit: str) -> str:
     """A unit as people read it: `m/s²` for `m/s^2`."""
     return unit.replace("^2", "²").replace("^3", "³")
+
+
+def three(values: Iterable[float]) -> Three:
+    """Three numbers, one an axis, as plain floats."""
+    x, y, z = map(float, values)
+    return x, y, z

@@ -22,6 +22,10 @@ os.environ["COLUMNS"] = "80"  # the width of the commands' tables, which are mad
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # small arrays side by side: a second thread of BLAS or torch only waits
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command does: idle threads must not spin while others test
 
+# hundreds of processes start here: each would compile the whole package again
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # a shell starts background jobs with SIGINT ignored, and they pass that on: the tests of Ctrl-C would test nothing
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
 
+from fuzz import bounded
 from fuzz.numbers import put_log
 from imutool.bias import io
 from imutool.cli.demo import write_asl
@@ -240,6 +242,35 @@ def test_samples_of_no_sensor_are_left_out_or_refused(tmp_path: Path, imutool: R
         assert "error: " in done.stderr or done.returncode == 3
 
 
+CLOCK_S = 8.0
+JUMPING: tuple[tuple[str, ...], ...] = (
+    ("info", "in.mcap"),
+    ("evaluate", "in.mcap"),
+    ("audit", "in.mcap"),
+    ("convert", "in.mcap", "out.mcap"),
+    ("export", "in.mcap", "out", "--format", "euroc"),
+    ("clean", "in.mcap", "--json", "-"),
+    ("view", "in.mcap", "--html", "out.html"),
+)  # debias: tests/bias_start/test_stretches.py; train: tests/training/test_segments.py
+
+
+@pytest.mark.parametrize("words", JUMPING, ids=lambda words: words[0])
+def test_a_clock_that_jumps_from_1970_costs_nothing_and_is_told(tmp_path: Path, imutool: Run, words: Sequence[str]) -> None:
+    """A robot without a battery for its clock, until it hears of the time."""
+    recording = flight(1, duration_s=CLOCK_S)
+    poses = next(iter(recording.truths.values()))
+    since_1970, set_ns = int(recording.imu.t_ns[0]) - 10**9, int(recording.imu.t_ns[len(recording.imu) // 3])
+    imu_ns, pose_ns = (np.where(t < set_ns, t - since_1970, t) for t in (recording.imu.t_ns, poses.t_ns))
+    put_log(tmp_path / "in.mcap", imu_ns, recording.imu.gyro, recording.imu.accel, replace(poses, t_ns=pose_ns))
+    with bounded():
+        done = imutool(*words, cwd=tmp_path)
+    assert done.returncode in {0, LOG}, done.stderr
+    page = tmp_path / "out.html"
+    assert re.search(
+        "clock jumps by|the clock was set", done.stdout + done.stderr + (page.read_text() if page.exists() else "")
+    )
+
+
 def test_time_going_back_in_a_log_stops_debias(tmp_path: Path, refuse: Refuse) -> None:
     back = [*STAMPS[:500], STAMPS[450], *STAMPS[501:]]
     imu_log(tmp_path / "back.mcap", back)
@@ -371,6 +402,9 @@ def test_an_existing_target_stays_without_overwrite(here: Path, refuse: Refuse) 
     assert "--overwrite" in refuse(CONFIG, "train", "flight_1.mcap", "-o", "linear.safetensors", "--method", "linear")
 
 
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}  # Python leaves it half written there
+
+
 def full_disk() -> None:
     """In the child: no file may grow beyond some size; writing on then fails as on a full disk (Python ignores SIGXFSZ)."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, DISK_BYTES))
@@ -380,13 +414,13 @@ def full_disk() -> None:
 def test_a_full_disk_leaves_nothing(here: Path, refuse: Refuse, name: str) -> None:
     write_asl(flight(3, duration_s=10.0), here / "seq")
     words = [word.format(".") for word in TARGETS[name]]
-    message = refuse(CONFIG, *words, preexec_fn=full_disk)
+    message = refuse(CONFIG, *words, preexec_fn=full_disk, env=NO_BYTECODE)
     assert "out." in message
 
 
 def test_a_full_disk_leaves_no_half_model(here: Path, refuse: Refuse) -> None:
     words = ["train", "flight_1.mcap", "-o", "m.safetensors", *QUICK, "--set", "validate_every=5"]
-    assert "m.safetensors" in refuse(CONFIG, *words, preexec_fn=full_disk)
+    assert "m.safetensors" in refuse(CONFIG, *words, preexec_fn=full_disk, env=NO_BYTECODE)
 
 
 def test_results_into_a_full_disk_are_told(here: Path, command: str) -> None:

@@ -127,7 +127,7 @@ VERSIONS = {"Job": "batch/v1", "RayJob": "ray.io/v1"}
 def test_the_links_of_the_package_are_absolute_where_the_repository_is_known() -> None:
     hook = SimpleNamespace(**runpy.run_path(str(ROOT / "hatch_build.py")))
     text = hook.absolute((ROOT / "README.md").read_text(), HOME, "0.1.0")
-    assert f"![A EuRoC flight in the viewer]({HOME}/raw/v0.1.0/docs/images/viewer-signals.png)" in text
+    assert f"![A EuRoC flight in the viewer]({HOME}/raw/v0.1.0/docs/images/viewer-signals-dark.png)" in text
     assert f"]({HOME}/blob/v0.1.0/docs/viewing.md)" in text
     assert not re.findall(r"\]\((?!https?:|#)", text)
     assert hook.absolute(text, HOME, "0.1.0") == text

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from imutool.api.logs import Progress
+from imutool.api.logs import NamedProgress, Progress
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen
@@ -79,7 +79,7 @@ def clean(
     wanted = chosen(rules, skip_rules, force, fix)
     check_outputs([OutputFile("target", target, outputs.LOG)], [source, model], overwrite=overwrite)
     if target is None:
-        return _survey(source, imus, wanted)
+        return survey_imus(source, imus, wanted)
     from imutool.debiasing import debias
 
     report = debias(
@@ -96,13 +96,23 @@ def clean(
     return CleanReport(tuple(report.surveys.values()), report.losses, dict(report.rewrite.added))
 
 
-def _survey(source: LogPath, imus: Sequence[str], rules: CleaningSettings) -> CleanReport:
-    with RecoveredLog(location(source)) as log:
+def survey_imus(
+    source: LogPath,
+    imus: Sequence[str],
+    rules: CleaningSettings,
+    max_chunk: int | None = None,
+    tell: NamedProgress = lambda done, total, topic: None,
+) -> CleanReport:
+    """Survey of each IMU of a log, and the losses of a damaged log."""
+    with RecoveredLog(location(source), max_chunk=max_chunk) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
             raise LogError("no IMU topic", where=source, expected=log.listing())
-        surveys = tuple(look(log, topic, rules) for topic in topics)
-        return CleanReport(surveys, log.losses, {})
+        surveys = []
+        for done, topic in enumerate(topics):
+            tell(done, len(topics), topic)
+            surveys.append(look(log, topic, rules))
+        return CleanReport(tuple(surveys), log.losses, {})
 
 
 def repair(
@@ -142,5 +152,5 @@ def repair(
     if not is_bag(here):
         return repair_log(here, there, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)
     if damaged != "drop":
-        raise ConfigError(NO_ATTACHMENTS, where="damaged", fix="Leave `damaged` out")
+        raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
     return repair_bag(here, there, overwrite=overwrite, progress=progress)

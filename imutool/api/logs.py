@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, did_you_mean
 from imutool.exporting import ExportReport, euroc, rosbag2, twin
 from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
@@ -107,7 +106,7 @@ def convert(
 
     Args:
         source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
-        out: Log file for one sequence, folder for several.
+        out: Log file for one sequence, folder for several; `logs/` is a folder for one too.
         format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
         sequences: Names of the sequences to convert; by default all.
         compression: `zstd`, `lz4` or `none`.
@@ -132,7 +131,7 @@ def convert(
     check_outputs([OutputFile("out", out, files=("*.mcap",), keeps=True)], [source], overwrite=overwrite)
     return conversion.convert(
         local(source, "source"),
-        local(out, "out"),
+        f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
         format=format,
         sequences=sequences,
         compression=compression,
@@ -201,8 +200,7 @@ def export(
         '/imu0'
     """
     if format not in FORMATS:
-        near = difflib.get_close_matches(format, FORMATS, n=1)
-        fix = f"Did you mean {near[0]}?" if near else ""
+        fix = did_you_mean(format, FORMATS)
         raise ConfigError(f"unknown format {format!r}", where="format", expected=" or ".join(FORMATS), fix=fix)
     source, folder = local(log, "log"), local(out, "out")
     check_outputs([OutputFile("out", folder, files=("*",), keeps=True)], [source, noise], overwrite=overwrite)

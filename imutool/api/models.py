@@ -18,10 +18,9 @@ from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.fitness import judge
+from imutool.bias_start.fitness import Fitness, judge
 from imutool.bias_start.initial_bias import InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
-from imutool.bias_start.verdict import Fitness
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.debiasing import DebiasedBlock
-from imutool.errors import ConfigError
 from imutool.location import LogPath, local, location
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.storage import outputs
@@ -20,7 +19,7 @@ from imutool.recording import Imu
 from imutool.viewing import Output, notebook
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
-from imutool.viewing.model.trajectory_error import ALIGNMENTS, Alignment
+from imutool.viewing.model.trajectory_error import alignment
 from imutool.viewing.outputs import Outputs, RequestedOutputs
 from imutool.viewing.rerun import live
 
@@ -71,16 +70,9 @@ def load_run(
         smooth=smooth,
         imu=imu,
         truth=truth,
-        align=_alignment(align),
+        align=alignment(align),
         findings=None if findings is None else local(findings, "findings"),
     )
-
-
-def _alignment(name: str) -> Alignment:
-    for known in ALIGNMENTS:
-        if known == name:
-            return known
-    raise ConfigError(f"{name!r}", where="align", expected=", ".join(ALIGNMENTS))
 
 
 def view(

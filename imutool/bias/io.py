@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 import re
@@ -18,7 +17,7 @@ from safetensors.numpy import save as save_bytes
 from imutool import registry
 from imutool.bias.model import BiasModel
 from imutool.config import build, plain
-from imutool.errors import ImutoolError, ModelError
+from imutool.errors import ImutoolError, ModelError, did_you_mean
 from imutool.mcap_io.storage.target import Target
 
 FORMAT = "imutool.model/1"
@@ -178,11 +177,10 @@ def shipped(name: str) -> Path:
     """
     files = {model.stem: model for model in library().glob("*.safetensors")}
     if name not in files:
-        near = difflib.get_close_matches(name, files, n=1)
         raise ModelError(
             f"no model {name[:200]!r}",
             expected=f"a file, or one of {', '.join(sorted(files)) or '(none ship)'}",
-            fix=f"Did you mean {near[0]!r}?" if near else "",
+            fix=did_you_mean(name, files, "{!r}"),
         )
     return files[name]
 

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float64
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, relative_samples, tracked_from_prior
-from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, MOST_GAP_S, measured
+from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured
 from imutool.recording import Imu, nanoseconds
+from imutool.recording.columns import MOST_GAP_S
 
 GAP_NS, MOST_GAP_NS = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
 BLOCK_SAMPLES = 1 << 14  # corrected at once: a covariance has 288 bytes

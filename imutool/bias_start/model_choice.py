@@ -19,7 +19,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.fitness import CHECKED_S, judge
+from imutool.bias_start.fitness import CHECKED_S, Fitness, judge
 from imutool.bias_start.initial_bias import (
     InitialBias,
     NoRestError,
@@ -29,7 +29,6 @@ from imutool.bias_start.initial_bias import (
     smoothed_start,
 )
 from imutool.bias_start.stretches import Sieve, measured
-from imutool.bias_start.verdict import Fitness
 from imutool.cleaning import Survey, cleaned
 from imutool.cleaning.first_pass import raw_batches
 from imutool.cleaning.truth import read_truth

@@ -20,11 +20,11 @@ from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.topics import CLEAN_FIX
 from imutool.recording import Imu, Recording, nanoseconds
+from imutool.recording.columns import MOST_GAP_S, jump_warnings, longest_run
 
-MOST_GAP_S = 3600.0  # of a gap on the filters' clock: beyond, the time says nothing about the bias
 MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
 LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
-MOST_STRETCHES, MOST_WARNINGS = 1000, 5  # that a report lists, and that the terminal shows
+MOST_STRETCHES = 1000  # that a report lists
 NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
 
 logger = logging.getLogger(__name__)
@@ -32,7 +32,10 @@ Rows3 = Float64[np.ndarray, "n 3"]
 
 
 class Stretch(NamedTuple):
-    """Beginning of a stretch: its first stamp, and the step to it (negative: set back)."""
+    """Beginning of a stretch: its first stamp, and the step to it (negative: set back).
+
+    On the filters' clock a step counts as at most `MOST_GAP_S`: beyond, the time says nothing about the bias.
+    """
 
     start_ns: int
     step_s: float
@@ -82,6 +85,16 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
 def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
     """A recording without the IMU samples that are no measurement, as `measured_imu`."""
     return replace(recording, imu=measured_imu(recording.imu, recording.name, free_fall=free_fall))
+
+
+def longest_stretch(recording: Recording) -> Recording:
+    """Longest part of a recording on one setting of its clock."""
+    t_ns = recording.imu.t_ns[longest_run(recording.imu.t_ns)]
+    if len(t_ns) == len(recording.imu):
+        return recording
+    first_ns, last_ns = int(t_ns[0]), int(t_ns[-1])
+    logger.warning("%s: only its longest stretch on one clock is used, from %d to %d ns", recording.name, first_ns, last_ns)
+    return recording.between(first_ns, last_ns)
 
 
 class StretchClock:
@@ -163,11 +176,7 @@ class Sieve:
             total = sum(self.left_out.values())
             kinds = described(self.left_out)
             yield f"{total} samples are no measurement and left out ({kinds}), the first at {self.first_ns} ns"
-        jumps = [stretch for stretch in self.clock.stretches if stretch.jump]
-        for stretch in jumps[:MOST_WARNINGS]:
-            yield f"the clock jumps by {stretch.step_s:+.6g} s to {stretch.start_ns} ns; a new stretch begins there"
-        if len(jumps) > MOST_WARNINGS:
-            yield f"the clock jumps {len(jumps) - MOST_WARNINGS} times more"
+        yield from jump_warnings([stretch for stretch in self.clock.stretches if stretch.jump])
 
     def record(self) -> dict[str, str]:
         """Entries of the log's metadata; none for a log without defects."""

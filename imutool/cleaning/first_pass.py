@@ -20,7 +20,7 @@ from imutool.cleaning.samples import Motion, Samples, blocks
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
@@ -266,7 +266,7 @@ def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int |
         LogError: no such IMU topic, another encoding, or damage.
     """
     described = log.topic(topic, (schemas.IMU,))
-    for _, rows in log.rows([described.name], start_ns, end_ns):
+    for rows in messages.joined(rows for _, rows in log.rows([described.name], start_ns, end_ns)):
         with log.named(described.name):
             yield from described.decode_imu(rows)
 

@@ -81,12 +81,16 @@ def between(
     first_s: Float64[np.ndarray, " n"],
     last_s: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Mean of the values between two times, from the integral of the steps' means."""
-    full = np.arange(int(step[0]), int(step[-1]) + 1)
-    even = np.stack([np.interp(full, step, column) for column in values.T], axis=1)
-    whole = np.concatenate([np.zeros((1, 3)), np.cumsum(even * STEP_S, axis=0)])
-    edges = STEP_S * np.append(full, full[-1] + 1)
-    a, b = (np.stack([np.interp(t, edges, column) for column in whole.T], axis=1) for t in (first_s, last_s))
+    """Mean of the values between two times, from the integral of the steps' means.
+
+    Missing steps count as one wide step with the mean of its neighbours: the cost goes by samples, whatever the stamps say.
+    """
+    edges = STEP_S * np.stack([step, step + 1], axis=1).reshape(-1)
+    means = np.repeat(values, 2, axis=0)[:-1]
+    means[1::2] = 0.5 * (values[1:] + values[:-1])
+    whole = np.concatenate([np.zeros((1, 3)), np.cumsum(means * np.diff(edges)[:, None], axis=0)])
+    edges, rows = np.unique(edges, return_index=True)
+    a, b = (np.stack([np.interp(t, edges, column) for column in whole[rows].T], axis=1) for t in (first_s, last_s))
     mean: Float64[np.ndarray, "n 3"] = (b - a) / (last_s - first_s)[:, None]
     return mean
 

@@ -80,6 +80,7 @@ class Motion:
         self.start_ns: int | None = None
         self.end_ns = 0
         self.samples = 0
+        self._sampled_ns = 0  # without gaps and jumps of the clock
         self._steps: list[Int64[np.ndarray, " m"]] = []
         self._sums: list[Float64[np.ndarray, "m 7"]] = []
         self._open: tuple[int, Float64[np.ndarray, "7"]] | None = None
@@ -88,15 +89,15 @@ class Motion:
     @property
     def middle_ns(self) -> int:
         """Start of the steps for what lies in their middle: the mean of a step's samples is half a period before that."""
-        period_ns = (self.end_ns - (self.start_ns or 0)) // max(self.samples - 1, 1)
-        return (self.start_ns or 0) - min(period_ns, STEP_NS) // 2
+        return (self.start_ns or 0) - self._sampled_ns // max(self.samples - 1, 1) // 2
 
     def see(self, samples: Samples) -> None:
         """Add samples, with increasing stamps."""
         if not len(samples.number):
             return
         if self.start_ns is None:
-            self.start_ns = int(samples.stamp_ns[0])
+            self.start_ns = self.end_ns = int(samples.stamp_ns[0])
+        self._sampled_ns += int(np.minimum(np.diff(samples.stamp_ns, prepend=self.end_ns), STEP_NS).sum())
         self.end_ns = int(samples.stamp_ns[-1])
         self.samples += len(samples.number)
         step = (samples.stamp_ns - self.start_ns) // STEP_NS

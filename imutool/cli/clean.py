@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,12 +10,12 @@ import typer
 
 from imutool.cli.app import HTML, LOG, LOST, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError
 from imutool.location import to_location
 from imutool.report import UNSET
 
 if TYPE_CHECKING:
-    from imutool.cleaning import CleaningSettings, Survey
+    from imutool.cleaning import Survey
     from imutool.mcap_io.recovery.losses import Losses
 
 COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
@@ -56,8 +56,11 @@ def clean(
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     added: dict[str, int] = {}
     if target is None:
+        from imutool.api.cleaning import survey_imus
+
         with progress("Looking through", verbose, quiet) as tell:
-            surveys, losses = _looked(source, imu or (), rules, max_chunk, tell)
+            found = survey_imus(source, imu or (), rules, max_chunk, tell)
+        surveys, losses = list(found.surveys), found.losses
     else:
         from imutool.debiasing import debias
 
@@ -109,24 +112,6 @@ def _tell(
         tell_losses(losses.plain())
     if losses:
         raise typer.Exit(LOST)
-
-
-def _looked(
-    source: str, imus: Sequence[str], rules: CleaningSettings, max_chunk: int | None, tell: Callable[[int, int, str], None]
-) -> tuple[list[Survey], Losses]:
-    """Survey of each IMU of a log, and the losses of a damaged log."""
-    from imutool.cleaning import look
-    from imutool.mcap_io.recovery.recovered_log import RecoveredLog
-
-    with RecoveredLog(to_location(source), max_chunk=max_chunk) as log:
-        topics = list(imus) or log.imu_topics
-        if not topics:
-            raise LogError("no IMU topic", where=source, expected=log.listing())
-        surveys = []
-        for done, topic in enumerate(topics):
-            tell(done, len(topics), topic)
-            surveys.append(look(log, topic, rules))
-        return surveys, log.losses
 
 
 def show(survey: Survey) -> None:

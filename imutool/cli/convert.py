@@ -60,7 +60,7 @@ class Export(Report, frozen=True, tag="imutool.export/1"):
 )
 def convert(
     source: Annotated[Path, typer.Argument(help="Bag, log, sequence folder or archive, or a folder of them.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="File for one sequence, folder for several."), LOGS],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="File for one sequence, folder (or NAME/) for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
     compression: Annotated[Compression, typer.Option(help="Compression of the chunks.")] = Compression.zstd,

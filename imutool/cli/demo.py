@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool.conversion.run import convert
 from imutool.debiasing import debias
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, not_installed
 from imutool.evaluation import evaluate
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import ACCEL, GYRO, FlightSettings, flight
@@ -107,7 +107,7 @@ def _check(out: Path, overwrite: bool) -> None:
     """Check everything that would stop the demo half-way."""
     for module, extra in (("rerun", "view"), ("matplotlib", "report")):
         if importlib.util.find_spec(module) is None:
-            raise ConfigError(f"{module} is not installed", where="demo", fix=f"pip install 'imutool[{extra}]'")
+            raise not_installed(module, extra, where="demo")
     if out.exists() and not out.is_dir():
         raise ConfigError("is a file", where=out, expected="a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:

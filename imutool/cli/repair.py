@@ -9,8 +9,6 @@ import typer
 
 from imutool.cli.app import LOST, Json, MaxChunk, Overwrite, Quiet, Verbose, Written, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
-from imutool.errors import ConfigError
-from imutool.location import to_location
 from imutool.report import UNSET, Report, UnsetType
 
 REPAIRED = Written((".mcap", ".bag"))
@@ -53,33 +51,26 @@ def repair(
 
     The log may be cut short, overwritten, unfinished, or joined from parts.
     """
-    from imutool.bag.repair import NO_ATTACHMENTS, is_bag, repair_bag
-    from imutool.mcap_io.repair import repair as repair_log
+    from imutool.api.cleaning import repair as run
+    from imutool.bag.repair import BagReport
 
-    log_in, log_out = to_location(source), to_location(target)
     with progress("Repairing", verbose, quiet) as tell:
-        if is_bag(log_in):
-            if damaged is Damaged.keep:
-                raise ConfigError(NO_ATTACHMENTS, where="damaged=keep", fix="Leave `damaged` out")
-            bag = repair_bag(log_in, log_out, overwrite=overwrite, progress=lambda done, total: tell(done, total, ""))
-            report = Repair(output=target, whole=bag.whole, messages=dict(bag.messages), chunks=bag.chunks, losses=bag.plain())
-        else:
-            log = repair_log(
-                log_in,
-                log_out,
-                damaged=damaged.value,
-                max_chunk=max_chunk,
-                overwrite=overwrite,
-                progress=lambda done, total: tell(done, total, ""),
-            )
-            report = Repair(
-                output=target,
-                whole=log.whole,
-                messages=dict(log.messages),
-                chunks=log.chunks,
-                kept=log.kept,
-                losses=log.losses.plain(),
-            )
+        repaired = run(
+            source,
+            target,
+            damaged=damaged.value,
+            max_chunk=max_chunk,
+            overwrite=overwrite,
+            progress=lambda done, total: tell(done, total, ""),
+        )
+    report = Repair(
+        output=target,
+        whole=repaired.whole,
+        messages=dict(repaired.messages),
+        chunks=repaired.chunks,
+        kept=UNSET if isinstance(repaired, BagReport) else repaired.kept,
+        losses=repaired.plain() if isinstance(repaired, BagReport) else repaired.losses.plain(),
+    )
     if not write_json(report, json_to, overwrite=overwrite):
         tell_losses(report.losses)
         counts = ", ".join(f"{count} on {topic}" for topic, count in report.messages.items()) or "no message"

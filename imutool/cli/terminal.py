@@ -109,9 +109,10 @@ def _print(columns: Sequence[Sequence[str]], width: int) -> None:
     from rich.table import Table
 
     grid = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    tall = any("\n" in cell for _, *cells in columns for cell in cells)  # what a row begins with stands in its first line
     for header, *cells in columns:
         numbers = all(NUMBER.fullmatch(cell) for cell in cells)
-        grid.add_column(header, overflow="fold", justify="right" if numbers else "left", vertical="bottom")
+        grid.add_column(header, overflow="fold", justify="right" if numbers else "left", vertical="top" if tall else "bottom")
     for row in zip(*(column[1:] for column in columns), strict=True):
         grid.add_row(*row)
     # a terminal folds what does not fit; where nobody looks at a terminal, nothing may be folded

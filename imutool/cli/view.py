@@ -5,19 +5,15 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from imutool.cli.app import HTML, Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import progress, say, write_json
-from imutool.errors import ConfigError
 from imutool.mcap_io.storage import outputs
 from imutool.report import Report
 from imutool.viewing import Output
-
-if TYPE_CHECKING:
-    from imutool.viewing.model.trajectory_error import Alignment
 
 AT_HELP = "Start of the cursor: seconds, or worst (the largest orientation error of a model)."
 ALIGN_HELP = "Align each path with the truth before taking errors: by its start, heading, or completely."
@@ -72,9 +68,10 @@ def view(
     saved.
     """
     from imutool.viewing.model.runs import load
+    from imutool.viewing.model.trajectory_error import alignment
     from imutool.viewing.outputs import Outputs, RequestedOutputs
 
-    aligned = _alignment(align)
+    aligned = alignment(align)
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
     asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, overwrite)
     with Outputs(asked) as outputs:
@@ -92,17 +89,3 @@ def view(
         if outputs.refused is not None:
             raise outputs.refused
         outputs.serve()
-
-
-def _alignment(word: str) -> Alignment:
-    """Alignment by name.
-
-    Raises:
-        ConfigError: there is none.
-    """
-    from imutool.viewing.model.trajectory_error import ALIGNMENTS
-
-    for name in ALIGNMENTS:
-        if name == word:
-            return name
-    raise ConfigError(f"{word!r}", where="--align", expected=", ".join(ALIGNMENTS))

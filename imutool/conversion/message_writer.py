@@ -16,7 +16,7 @@ from jaxtyping import Shaped, UInt8
 
 import imutool
 from imutool.conversion.sensor_pairs import SensorPairs
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError, not_installed
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
@@ -25,6 +25,8 @@ from imutool.mcap_io.read import RECORD
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import BODY, CHUNK_BYTES, WORLD, Series, chunks, scalar_series, velocity_series
 from imutool.mcap_io.writer import Chunk, LogWriter
+from imutool.recording import nanoseconds
+from imutool.recording.columns import MOST_GAP_S, clock_jumps, jump_warnings
 from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind
 
 BULKY = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
@@ -33,6 +35,7 @@ PACKED = ("sensor_msgs/msg/CompressedImage",)  # compressing these again costs t
 ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
     f"{sign}{size}": f"{name}{8 * size}" for sign, name in (("i", "int"), ("u", "uint")) for size in (1, 2, 4, 8)
 }
+MOST_JUMPS = 1000  # of the clock, that are counted
 ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
 
 
@@ -131,11 +134,15 @@ class _Stream:
 
     def chunks(self) -> Iterator[tuple[Chunk, str | None]]:
         """Chunks of about 1 MiB as they fill, and the rest at the end."""
+        last, longest, jumps = None, nanoseconds(MOST_GAP_S), list[tuple[int, float]]()
         for topic, log_time, publish_time, payload in self._source.messages():
             if (number := self._channels.get(topic)) is None:
                 number = self._define(topic, payload)
             if log_time < 0:
                 raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="no time before 1970")
+            if last is not None and abs(log_time - last) > longest and len(jumps) < MOST_JUMPS:
+                jumps.append((log_time, (log_time - last) * 1e-9))
+            last = log_time
             self._pairs.take(topic, payload)
             if number in self._reflected:
                 self._put_as_cdr(number, topic, log_time, publish_time, bytes(payload))
@@ -145,6 +152,7 @@ class _Stream:
         for buffer in {id(b): b for b in (*self._shared, *self._buffers.values())}.values():
             if buffer.parts:
                 yield buffer.pop()
+        self._source.remarks.notes += jump_warnings(jumps)
         for topic, number in self._channels.items():
             self.counts[topic.name] += self._sequence[number]
         for name, count in self._lacking.items():
@@ -181,8 +189,7 @@ def _reflected(topic: MessageTopic, first: bytes) -> Reflected | None:
     try:
         return reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
     except ImportError as error:
-        fix = "Install it with: pip install 'imutool[protobuf]'"
-        raise ConfigError("reading protobuf messages needs protobuf", where=topic.name, fix=fix) from error
+        raise not_installed("protobuf", "protobuf", where=topic.name, user="reading such messages") from error
 
 
 def _write_metadata(log: LogWriter, source: MessageLog) -> None:
@@ -194,6 +201,9 @@ def _write_metadata(log: LogWriter, source: MessageLog) -> None:
 
 
 def _imus(log: LogWriter, source: MessageLog) -> list[Series]:
+    """IMUs; jumps of their clocks go to the remarks."""
+    for topic, imu in source.imus.items():
+        source.remarks.notes += [f"{topic}: {warning}" for warning in jump_warnings(clock_jumps(imu.t_ns))]
     return [
         Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
         for topic, imu in source.imus.items()

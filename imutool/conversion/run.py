@@ -5,7 +5,7 @@ Sequences convert in worker processes, one log a sequence; a sequence that fails
 
 from __future__ import annotations
 
-import difflib
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
@@ -16,7 +16,7 @@ from imutool import registry
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
-from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -63,7 +63,7 @@ class _Sequences:
 
 def convert(
     source: Path,
-    out: Path,
+    out: str | Path,
     *,
     format: str = AUTO,
     sequences: Sequence[str] = (),
@@ -78,7 +78,7 @@ def convert(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
-    """Convert one sequence to the file `out`, or several sequences to the folder `out`.
+    """Convert one sequence to the file `out`, or several sequences to the folder `out`; `logs/` is a folder for one too.
 
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
     are worth. `mapping` is a file that states what the columns of a table mean.
@@ -183,12 +183,11 @@ def _only(source_sequences: _Sequences, wanted: Sequence[str]) -> _Sequences:
     names = source_sequences.names()
     for name in wanted:
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1)
             raise ConfigError(
                 f"{name!r} is not in the source",
                 where="sequences",
                 expected=f"one of {', '.join(sorted(names))}",
-                fix=f"Did you mean {near[0]!r}?" if near else "",
+                fix=did_you_mean(name, names, "{!r}"),
             )
     return _Sequences(
         [job for job in source_sequences.jobs if job.sequence.name in wanted],
@@ -196,15 +195,16 @@ def _only(source_sequences: _Sequences, wanted: Sequence[str]) -> _Sequences:
     )
 
 
-def _targets(names: Sequence[str], out: Path, *, many: bool) -> list[Path]:
-    """Target of each log; missing folders are made.
+def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]:
+    """Target of each log; missing folders are made. A text that ends with a slash names a folder.
 
     Raises:
         ConfigError: several logs but `out` names a file, or a folder cannot be made.
     """
+    slash, out = str(out).endswith(("/", os.sep)), Path(out)
     if many and (out.suffix == SUFFIX or out.is_file()):
         raise ConfigError("several sequences do not fit into one file", where=out, expected="a folder")
-    into_folder = many or out.is_dir()
+    into_folder = many or slash or out.is_dir()
     folder = out if into_folder else out.parent
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -250,7 +250,7 @@ def _worker_count(workers: int | None, jobs: int) -> int:
 def _from_stream(
     module: ModuleType,
     source: Path,
-    out: Path,
+    out: str | Path,
     wanted: Sequence[str],
     ways: Job,
     progress: Progress | None,

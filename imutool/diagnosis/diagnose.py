@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias_start.stretches import measured_recording
+from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
@@ -29,7 +29,7 @@ from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
-from imutool.diagnosis.reference.coverage import (
+from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
     check_without_reference,
@@ -37,11 +37,11 @@ from imutool.diagnosis.reference.coverage import (
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.reference.errors import reference_caveat, reference_errors, turned_reference
+from imutool.diagnosis.reference_errors import reference_caveat, reference_errors, turned_reference
 from imutool.diagnosis.result import Diagnosis, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.compared_signals import with_signals
-from imutool.diagnosis.to_physics_file import NO_EFFECT
+from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
 from imutool.log_info.conventions import warn_of_recordings
@@ -121,7 +121,7 @@ def diagnose(
 
 def read_log(log: Location, *, imu: str | None = None, truth: str | None = None) -> Recording:
     """A recording or a simulation, which may fall freely, without samples that no sensor gives."""
-    return measured_recording(read(log, imu=imu, truth=truth), free_fall=True)
+    return measured_recording(longest_stretch(read(log, imu=imu, truth=truth)), free_fall=True)
 
 
 def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:

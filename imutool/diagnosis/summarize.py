@@ -28,10 +28,10 @@ from imutool.diagnosis.held_out import (
     with_effects,
 )
 from imutool.diagnosis.localization import locate_findings, locate_residual
-from imutool.diagnosis.reference.coverage import at_limit, unusable_axes
+from imutool.diagnosis.reference_coverage import at_limit, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Located, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS, UNITS

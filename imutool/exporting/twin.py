@@ -23,8 +23,8 @@ from imutool.mcap_io.storage.target import Target
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.sensor import physics_file
-from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Three, Value
-from imutool.units import AXES, SENSORS, Sensor
+from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
+from imutool.units import AXES, SENSORS, Sensor, three
 
 PHYSICS, NOISE = "physics.toml", "noise.toml"
 RATE_HZ = 200.0  # of a noise without a rate
@@ -132,7 +132,7 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     sheet = datasheet.read(noise) if noise is not None else _middle(noises)
     biases = {s: np.array([getattr(file.bias, s) for file in files if file.bias is not None]).reshape(-1, 3) for s in SENSORS}
     known = {s: rows for s, rows in biases.items() if len(rows)}
-    mean = Bias(**{s: _three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
+    mean = Bias(**{s: three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
     std: dict[Sensor, Vector] = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
     physics = files[0] if len(files) == 1 else _of_fleet(files)
     return Twin(msgspec.structs.replace(physics, bias=mean), std, sheet, len(files))
@@ -162,11 +162,6 @@ def _middle(noises: list[Noise]) -> Noise:
     """The unit with the middle noise; a colour cannot be averaged."""
     sizes = [float(np.nansum(noise.values("accel_density"))) for noise in noises]
     return noises[int(np.argsort(sizes)[len(sizes) // 2])]
-
-
-def _three(values: Vector) -> Three:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def _numbers(values: Float64[np.ndarray, " n"] | tuple[float, ...]) -> str:
@@ -267,7 +262,7 @@ def _isaac(twin: Twin) -> str:
         "IMU = ImuCfg(",
         '    prim_path="{ENV_REGEX_NS}/Robot/base",',
         f"    update_period={1.0 / twin.rate_hz:.9g},",
-        f"    offset=ImuCfg.OffsetCfg(pos={_three(twin.vector('lever_arm'))}, rot={wxyz}),  # w, x, y, z; since 3.0 x, y, z, w",
+        f"    offset=ImuCfg.OffsetCfg(pos={three(twin.vector('lever_arm'))}, rot={wxyz}),  # w, x, y, z; since 3.0 x, y, z, w",
         ")",
     ]
     for sensor in SENSORS:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, not_installed
 from imutool.fleet.layers import APPLICATION, LAYERS, PROPERTIES, Layers
 
 if TYPE_CHECKING:
@@ -56,9 +56,7 @@ def require_catalog() -> None:
     """
     missing = [name for name in ("rerun", "datafusion") if find_spec(name) is None]
     if missing:
-        raise ConfigError(
-            f"the catalog needs {missing[0]}, which is not installed", where="view", fix="pip install 'imutool[catalog,fleet]'"
-        )
+        raise not_installed(missing[0], "catalog,fleet", where="view", user="the catalog")
 
 
 class Catalog:

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import msgspec
 
 from imutool.conversion.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
-from imutool.errors import ConfigError, LogError, redact
+from imutool.errors import ConfigError, LogError, not_installed, redact
 from imutool.fleet.task import Result, Task
 from imutool.fleet.work import work
 from imutool.mcap_io.storage import system
@@ -290,5 +290,5 @@ def _ray() -> Any:
         import ray
         import ray.exceptions
     except ImportError as error:
-        raise ConfigError("a cluster needs ray, which is not installed", fix="pip install 'imutool[fleet]'") from error
+        raise not_installed("ray", "fleet", user="a cluster") from error
     return ray

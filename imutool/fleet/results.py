@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from imutool import __version__
-from imutool.errors import ConfigError
+from imutool.errors import not_installed
 from imutool.fleet.robots import FleetDiagnosis
 from imutool.fleet.task import Result
 from imutool.location import Location
@@ -62,7 +62,7 @@ def arrow() -> Any:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
-        raise ConfigError("a fleet needs pyarrow, which is not installed", fix="pip install 'imutool[fleet]'") from error
+        raise not_installed("pyarrow", "fleet", user="a fleet") from error
     assert pq.__name__, "pyarrow.parquet is what is used of it"
     return pa
 

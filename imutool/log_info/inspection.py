@@ -6,7 +6,7 @@ first: stamps that go back, repeated stamps, and values that are not finite.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -21,14 +21,21 @@ from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_info.conventions import convention_summary, convention_warnings, conventions
-from imutool.log_info.pose_agreement import agreement, coverage, transforms
+from imutool.log_info.conventions import (
+    agreement,
+    convention_summary,
+    convention_warnings,
+    conventions,
+    coverage,
+    transforms,
+)
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import Imu
+from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.report import UNSET
 from imutool.units import SENSORS
 
@@ -143,7 +150,7 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     rest, whole = _rest(imu), convention_summary(imu, truth)
     return ImuInfo(
         topic=topic.name,
-        warnings=_imu_warnings(counts, imu, whole, stamps),
+        warnings=_imu_warnings(counts, imu, whole, stamps, clock_jumps(t_ns)),
         conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
         samples=len(t_ns),
@@ -230,7 +237,9 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
-def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stamps: Stamps) -> list[str]:
+def _imu_warnings(
+    counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stamps: Stamps, jumps: Sequence[tuple[int, float]]
+) -> list[str]:
     words = {
         "out_of_order": "samples out of order",
         "duplicated": "samples with a repeated stamp",
@@ -240,6 +249,7 @@ def _imu_warnings(counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stam
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
+    warnings += jump_warnings(jumps)
     return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 

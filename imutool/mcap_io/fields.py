@@ -6,7 +6,6 @@ numpy pass. One chunk is in memory at a time.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from imutool.errors import LogError
+from imutool.errors import LogError, did_you_mean
 from imutool.location import Location
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.messages import Rows
@@ -243,11 +242,10 @@ class _Reader:
 
     def _unknown(self, path: str, walk: ros2_definition.Walk) -> LogError:
         known = list(_paths(ros2_definition.Walk(walk.payload, self.definition)))
-        near = difflib.get_close_matches(path, known, n=1)
         return LogError(
             f"there is no number {path} in {self.topic.schema_name}",
             expected=_listed(known),
-            fix=f"Did you mean {self.topic.name}.{near[0]}?" if near else "",
+            fix=did_you_mean(path, known, f"{self.topic.name}.{{}}"),
         )
 
     def t_ns(self) -> Int64[np.ndarray, " n"]:

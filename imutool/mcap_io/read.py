@@ -17,6 +17,7 @@ from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, StampCheck, check_finite
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
+from imutool.recording.columns import clock_jumps, jump_warnings
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +87,6 @@ def read_recording(
         topics = columns.topics if samples is None else columns.topics[1:]
         for topic, rows in log.rows(topics, start_ns, end_ns):
             columns.take(topic, rows)
-    poses = dict.fromkeys([*log.pose_topics, *truths])
     return Recording(
         name=own.get("name", log.path.stem),
         imu=columns.imu() if samples is None else samples,
@@ -96,7 +96,9 @@ def read_recording(
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
-        other_poses={t: k for t in poses if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths},
+        other_poses={
+            t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths
+        },
     )
 
 
@@ -195,17 +197,15 @@ class _Columns:
     def imu(self) -> Imu:
         with self.log.named(self.imu_topic):
             stamp_ns, (gyro, accel) = self.columns(self.imu_topic, 3, 3)
+            for warning in jump_warnings(clock_jumps(stamp_ns)):
+                logger.warning("%s %s: %s", self.log.path, self.imu_topic, warning)
             return Imu(stamp_ns, gyro, accel)
 
     def truths(self, wanted: str | None) -> dict[str, Poses]:
         names: list[str] = []
-        for topic in self.truth_topics:
-            if topic in self.left_out:
-                continue
-            if self.log.topics[topic].schema_name == schemas.TF:
-                names += [name for name in self.kept if name.startswith(f"{topic}/")]
-            else:
-                names.append(topic)
+        for topic in (name for name in self.truth_topics if name not in self.left_out):
+            tree = self.log.topics[topic].schema_name == schemas.TF
+            names += [name for name in self.kept if name.startswith(f"{topic}/")] if tree else [topic]
         if wanted is not None and wanted not in self.log.topics:
             if wanted not in names:
                 raise LogError(

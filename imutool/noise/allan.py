@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.errors import ConfigError
+from imutool.errors import not_installed
 from imutool.units import Sensor
 
 LONGEST = 4  # averaging times up to the stretch over this: beyond, a single disagreement decides
@@ -82,9 +82,7 @@ def library() -> ModuleType:
     try:
         import allantools
     except ImportError as error:
-        raise ConfigError(
-            "Allan deviations need the package allantools", where="noise", fix="Install it with: pip install 'imutool[noise]'"
-        ) from error
+        raise not_installed("allantools", "noise", where="noise", user="an Allan deviation") from error
     module: ModuleType = allantools
     return module
 

@@ -9,7 +9,6 @@ An unknown value is None, in a file `"unknown"`; zero means no noise.
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ from jaxtyping import Float64
 from msgspec import Meta
 
 from imutool.config import Settings, build, toml
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, did_you_mean
 from imutool.mcap_io.storage.target import Target
 
 UNITS = {
@@ -176,12 +175,11 @@ def read(name: str | Path) -> Noise:
         return SHEETS[name]
     path = Path(name)
     if not path.exists():
-        near = difflib.get_close_matches(str(name), SHEETS, n=1)
         raise ConfigError(
             "no such noise",
             where=path,
             expected=f"{', '.join(SHEETS)} or a TOML file",
-            fix=f"Did you mean {near[0]}?" if near else "",
+            fix=did_you_mean(str(name), SHEETS),
         )
     values = toml(path, "noise")
     return build(Noise, {key: _axes(value) if key in UNITS else value for key, value in values.items()}, where=path)

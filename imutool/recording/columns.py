@@ -5,6 +5,7 @@ Base class of the array types of `imutool.recording`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -12,6 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from imutool.errors import DataError
+
+MOST_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps is a jump of their clock
+SET_BACK_NS = 1_000_000_000  # by which stamps go back at a jump; less is a sample that came late
+MOST_TOLD = 5  # jumps
 
 
 class Columns:
@@ -132,3 +137,27 @@ def true_ranges(mask: Bool[np.ndarray, " n"]) -> list[tuple[int, int]]:
     """Index ranges `[first, end)` in which a mask holds."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def clock_jumps(t_ns: Int64[np.ndarray, " n"]) -> list[tuple[int, float]]:
+    """Jumps of a clock: the first stamp behind each, and the step to it (s); stamps may go back."""
+    step = np.diff(t_ns)
+    stays_back = np.append(t_ns[2:], t_ns[-1:]) < t_ns[:-1] if len(t_ns) > 1 else step < 0
+    rows = np.flatnonzero((step > MOST_GAP_S * 1e9) | ((step <= -SET_BACK_NS) & stays_back))
+    return [(int(t_ns[row + 1]), float(step[row]) * 1e-9) for row in rows]
+
+
+def longest_run(t_ns: Int64[np.ndarray, " n"]) -> slice:
+    """Rows of the longest stretch on one setting of the clock, of stamps that increase."""
+    starts = np.searchsorted(t_ns, [start_ns for start_ns, _ in clock_jumps(t_ns)])
+    edges = np.concatenate([[0], starts, [len(t_ns)]])
+    longest = int(np.argmax(np.diff(edges)))
+    return slice(int(edges[longest]), int(edges[longest + 1]))
+
+
+def jump_warnings(jumps: Sequence[tuple[int, float]]) -> Iterator[str]:
+    """Jumps of a clock in words."""
+    for start_ns, step_s in jumps[:MOST_TOLD]:
+        yield f"the clock jumps by {step_s:+.6g} s to {start_ns} ns; a new stretch begins there"
+    if len(jumps) > MOST_TOLD:
+        yield f"the clock jumps {len(jumps) - MOST_TOLD} times more"

@@ -27,10 +27,9 @@ from jaxtyping import Float64
 from imutool.errors import DataError
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import Signals
-from imutool.units import AXES
+from imutool.units import AXES, Three
 
 Kind = Literal["catalogue", "driven", "unknown"]
-Three = tuple[float, float, float]
 Theta = Float64[np.ndarray, "_"]  # effects that act together have parameters of their own, so this length binds no other
 
 

@@ -14,10 +14,10 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta, Three
+from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import COUNT, Signals
-from imutool.units import Sensor
+from imutool.units import Sensor, Three
 
 # Size of the parameters with which `forward` is asked for an error: beside that error the reading is lost in rounding, and to
 # divide by a power of two is exact. So the error has all its digits, and not only those that a reading leaves to it.

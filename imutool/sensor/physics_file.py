@@ -34,7 +34,6 @@ gain (c(t - lag) - mean of c), c the channel named by `driver`.
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -46,16 +45,15 @@ import numpy as np
 from msgspec import Meta
 
 from imutool.config import Settings, build, toml
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import ConfigError, ImutoolError, did_you_mean
 from imutool.mcap_io.storage.target import Target
 from imutool.sensor import catalogue, unnamed_effects
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.unnamed_effects import DRIVEN, VARIABLES
-from imutool.units import SENSORS, Sensor
+from imutool.units import SENSORS, Sensor, Three
 
 SCHEMA = "imutool.physics/1"
 OTHER = "# Of another signal than the IMU's: simulate and debias do not apply it."
-Three = tuple[float, float, float]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 ThreeStd = tuple[NotNegative, NotNegative, NotNegative]
 Known = Callable[[Sequence[str]], tuple[Effect, ...]]
@@ -258,9 +256,8 @@ def _theta(entry: Entry, effect: Effect, where: str | Path, place: str) -> Theta
 
 
 def _unknown(key: str, name: str, names: Sequence[str], where: str | Path) -> ConfigError:
-    near = difflib.get_close_matches(name, names, n=1)
-    fix = f"Did you mean {near[0]}?" if near else ""
-    return ConfigError(f"{key}: {name!r} is not known", where=where, expected=f"one of {', '.join(names)}", fix=fix)
+    expected, fix = f"one of {', '.join(names)}", did_you_mean(name, names)
+    return ConfigError(f"{key}: {name!r} is not known", where=where, expected=expected, fix=fix)
 
 
 # ── effects without a name ──

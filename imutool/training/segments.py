@@ -17,6 +17,7 @@ from torch import Tensor
 
 from imutool.bias.networks import static
 from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.bias_start.stretches import StretchClock
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
@@ -96,7 +97,7 @@ class Pool:
             raise error.at(recording.name) from error
         imu = both.imu
         poses, trusted = with_velocity(both.truth).at(imu.t_ns)
-        t = seconds(imu.t_ns, int(imu.t_ns[0]))
+        t = seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]))
         R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
         flags = (trusted, t > (1 - HELD_OUT) * t[-1], np.diff(t, prepend=t[0]) > GAP_PERIODS * imu.period_s)
         sampled = (imu.gyro, imu.accel, R_wb, poses.v_w, poses.p_wb)

@@ -21,7 +21,7 @@ from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from imutool import config
-from imutool.errors import ConfigError, NumericsError
+from imutool.errors import NumericsError, not_installed
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
 from imutool.vio.camera import EUROC, Frame, StereoRig
@@ -77,9 +77,7 @@ def load() -> Any:
     try:
         import gtsam
     except ImportError as error:
-        raise ConfigError(
-            "GTSAM is not installed", where="imutool vio", fix="Install it with: pip install 'imutool[vio]'"
-        ) from error
+        raise not_installed("GTSAM", "vio", where="imutool vio") from error
     return gtsam
 
 

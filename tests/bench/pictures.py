@@ -1,7 +1,7 @@
-"""Makes the README's pictures of what is seen: `python tests/bench/pictures.py LOG [--model M] [--init auto] [-o docs/images]`.
+"""Makes the pictures of what is seen: `python tests/bench/pictures.py LOG [--model M] [--init auto] [-o docs/images]`.
 
-Rerun's own viewer (dark: the theme of a viewer without a window), its web page in light and dark, the report in light and dark,
-each as it comes up of a real log; PNGs of at most 256 colours. Takes Chromium and a Vulkan driver (`make viewers`).
+Every tab in Rerun's own viewer (dark: the theme of a viewer without a window) and in its web viewer (light), and the report in
+both, each as it comes up of a real log; PNGs of at most 256 colours. Takes Chromium and a Vulkan driver (`make viewers`).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 from PIL import Image
 
@@ -23,37 +24,48 @@ from imutool.viewing.html import report
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import layout, scene
-from imutool.viewing.rerun.entities.styles import RAW_FADE, XYZ, blend_to_grey
+from imutool.viewing.rerun.entities.styles import MODEL_COLORS, RAW_COLOR
 from imutool.viewing.rerun.web import export
 
 VIEWERS = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[1] / "support" / "viewers.py")))
 
 SIZE = (1280, 720)
 COLORS = 256
-LEAST = 200  # pixels of each axis' colour, in a viewer that has drawn curves
+LEAST = 300  # pixels of a curve in a viewer that has drawn it
+TABS = ("Signals", "Bias", "Spectrum", "Errors", "Events", "Report")
 TOLD_S = 10.0  # for which a viewer tells of itself in a corner
 
 
-def native(logs: list[RunData], tab: str | None) -> Any:
-    """Rerun's own viewer with the cursor at the end, and a tab in front."""
-    blueprint = layout.blueprint(logs)
-    right = blueprint.root_container.contents[1]
-    right.active_tab = next((k for k, part in enumerate(right.contents) if part.name == tab), 0)
+def in_front(tab: str) -> Any:
+    """Every layout made meanwhile has a tab in front."""
+    made = layout.blueprint
+
+    def blueprint(*logs: Any, **settings: Any) -> Any:
+        done = made(*logs, **settings)
+        right = done.root_container.contents[1]
+        right.active_tab = next(k for k, part in enumerate(right.contents) if part.name == tab)
+        return done
+
+    return mock.patch.object(layout, "blueprint", blueprint)
+
+
+def native(logs: list[RunData]) -> Any:
+    """Rerun's own viewer with the cursor at the end."""
 
     def look(viewer: Any) -> Any:
-        viewer.show(lambda to: scene.log(logs, to, source=False), blueprint)
+        viewer.show(lambda to: scene.log(logs, to, source=False), layout.blueprint(logs))
         time.sleep(TOLD_S)
         return viewer.picture()
 
     return VIEWERS.seen(look, SIZE)
 
 
-def web(browser: Any, folder: Path, scheme: str) -> Any:
-    """The exported folder in Chromium."""
+def web(browser: Any, folder: Path) -> Any:
+    """The exported folder in a light Chromium."""
     handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        page = browser.new_page(color_scheme=scheme, viewport={"width": SIZE[0], "height": SIZE[1]})
+        page = browser.new_page(color_scheme="light", viewport={"width": SIZE[0], "height": SIZE[1]})
         page.goto(f"http://127.0.0.1:{server.server_port}/")
         picture = VIEWERS.steady(page.screenshot, draws, 300.0)
         page.close()
@@ -71,8 +83,8 @@ def paper(browser: Any, page_path: Path, scheme: str) -> Any:
 
 
 def draws(picture: Any) -> bool:
-    """Whether curves of all three axes are there, faint or not."""
-    return all(max(VIEWERS.drawn(picture, c) for c in (color, blend_to_grey(color, RAW_FADE))) >= LEAST for color in XYZ)
+    """Whether the errors of both paths are drawn, which are beside every tab. The viewer itself has blue."""
+    return min(VIEWERS.drawn(picture, color) for color in (RAW_COLOR, MODEL_COLORS[0])) >= LEAST
 
 
 def save(picture: Any, path: Path) -> None:
@@ -93,14 +105,15 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     logs = [load(options.log, models=[options.model], init=options.init)]
     duration_s = logs[0].duration_s
-    for tab in ("Signals", "Bias", "Errors", "Spectrum"):
-        save(native(logs, tab), options.output / f"viewer-{tab.lower()}.png")
     with tempfile.TemporaryDirectory() as folder, VIEWERS.chromium() as browser:
+        for tab in TABS:
+            with in_front(tab):
+                export(logs, Path(folder) / tab, source=False, at_s=duration_s)
+                save(native(logs), options.output / f"viewer-{tab.lower()}-dark.png")
+            save(web(browser, Path(folder) / tab), options.output / f"viewer-{tab.lower()}-light.png")
         report.write_page(logs, Path(folder) / "report.html")
-        export(logs, Path(folder) / "web", source=False, at_s=duration_s)
         for scheme in ("light", "dark"):
             save(paper(browser, Path(folder) / "report.html", scheme), options.output / f"report-{scheme}.png")
-            save(web(browser, Path(folder) / "web", scheme), options.output / f"web-{scheme}.png")
 
 
 if __name__ == "__main__":

@@ -13,9 +13,8 @@ from imutool.bias import linear, static
 from imutool.bias.io import save
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import auto
-from imutool.bias_start.fitness import judge
+from imutool.bias_start.fitness import Fitness, judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
-from imutool.bias_start.verdict import Fitness
 from imutool.errors import ModelError
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight

@@ -16,11 +16,12 @@ from imutool.bias.io import load
 from imutool.bias.model import BiasModel
 from imutool.bias_start.correction import OnlineDebiaser, apply_with_std
 from imutool.bias_start.initial_bias import tracked_from_prior
-from imutool.bias_start.stretches import MOST_GAP_S, Sieve, StretchClock, measured
+from imutool.bias_start.stretches import Sieve, StretchClock, measured
 from imutool.debiasing import DebiasedBlock, DebiasReport, debias
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
+from imutool.recording.columns import MOST_GAP_S
 from imutool.sensor.made_up_flight import flight
 
 MODELS = Path(__file__).parents[2] / "models"

@@ -20,7 +20,7 @@ from imutool.cli import load
 from imutool.diagnosis.closed_loop import LOG
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
-from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read

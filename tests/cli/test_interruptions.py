@@ -30,6 +30,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.local import MARK_PART, PARTIAL, remove_abandoned, temporary_path
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
@@ -38,6 +39,7 @@ CONFIG, LOST, INTERRUPTED, TERMINATED, KILLED = 3, 3, 130, 143, -signal.SIGKILL
 WAIT_S, POLL_S, TRIES = 60.0, 0.002, 10
 SOON_S, SLACK_S = 2.0, 3.0  # after SIGTERM, for a process and all its children; for a machine busy with other tests
 DISK_BYTES = 1500  # less than any output here
+BRIEF_S = 13.0  # of which three at rest
 CHANGED_AT = 6  # read of the log: behind its summary, before its messages
 
 # words of each command that writes a file, and the file; in.mcap is a log of 20 s, seq a raw sequence
@@ -73,6 +75,16 @@ def made(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
 def here(made: Path, tmp_path: Path) -> Path:
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path
+
+
+@pytest.fixture
+def brief(here: Path, name: str) -> Path:
+    """As `here`, with logs that are quickly done: in.mcap just long enough for the command, and a shorter one."""
+    write(flight(1, duration_s=0.4 * BRIEF_S, rate_hz=100.0), here / "short.mcap")
+    if name != "conceal":  # it asks for twenty seconds
+        (here / "in.mcap").unlink()
+        write(flight(1, duration_s=BRIEF_S, rate_hz=100.0), here / "in.mcap")
+    return here
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -193,39 +205,46 @@ def test_ctrl_c_while_modules_are_imported_is_an_interrupt(tmp_path: Path, comma
 # ── a full disk, a locked folder ──
 
 
-@contextlib.contextmanager
-def full_disk() -> Iterator[None]:
-    """The system refuses files beyond some size, as a full disk does."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+@pytest.fixture
+def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Within it the system refuses files beyond some size, as a full disk does; Python would leave half-written bytecode."""
+
+    @contextlib.contextmanager
+    def full() -> Iterator[None]:
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, limits[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    return full
 
 
 @pytest.mark.parametrize("name", [name for name in WRITERS if name not in RERUN])
-def test_a_full_disk_leaves_nothing(here: Path, imutool: Run, name: str) -> None:
-    before = digests(here)
+def test_a_full_disk_leaves_nothing(
+    brief: Path, imutool: Run, full_disk: Callable[[], contextlib.AbstractContextManager[None]], name: str
+) -> None:
+    before = digests(brief)
     words, _ = WRITERS[name]
-    imutool(*words[:1], "--help", cwd=here)  # what is imported is compiled, and may be written
     with full_disk():
-        done = imutool(*words, "-q", cwd=here)
+        done = imutool(*words, "-q", cwd=brief)
     assert done.returncode == CONFIG, done.stderr
     assert "cannot be written (File too large)" in done.stderr
-    assert digests(here) == before
+    assert digests(brief) == before
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_locked_folder_is_refused(here: Path, imutool: Run, name: str) -> None:
+def test_a_locked_folder_is_refused(brief: Path, imutool: Run, name: str) -> None:
     """Not even root makes a file in /proc."""
     words, target = WRITERS[name]
     locked = [f"/proc/{target}" if word == target else word for word in words]
-    before = digests(here)
-    done = imutool(*locked, "-q", cwd=here)
+    before = digests(brief)
+    done = imutool(*locked, "-q", cwd=brief)
     assert done.returncode == CONFIG, done.stderr
     assert f"/proc/{target}" in done.stderr
-    assert digests(here) == before
+    assert digests(brief) == before
 
 
 # ── an input that changes, two runs at once ──
@@ -280,11 +299,11 @@ READERS: dict[str, tuple[Sequence[str], str]] = {
 @pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
 @pytest.mark.parametrize("name", READERS)
 def test_an_input_that_changes_at_a_read(
-    here: Path, imutool: Run, monkeypatch: pytest.MonkeyPatch, name: str, change: str
+    brief: Path, imutool: Run, monkeypatch: pytest.MonkeyPatch, name: str, change: str
 ) -> None:
     """As above for every command, in this process, at one of its first reads."""
     words, target = READERS[name]
-    source, read, reads = here / "in.mcap", Source._read, itertools.count(1)
+    source, read, reads = brief / "in.mcap", Source._read, itertools.count(1)
 
     def changing(self: Source, offset: int, length: int) -> bytes:
         if self.path.name == source.name and next(reads) == CHANGED_AT:
@@ -292,24 +311,25 @@ def test_an_input_that_changes_at_a_read(
         return read(self, offset, length)
 
     monkeypatch.setattr(Source, "_read", changing)
-    done = imutool(*words, cwd=here)
+    done = imutool(*words, cwd=brief)
     assert next(reads) > CHANGED_AT
     assert "Traceback" not in done.stderr
     assert done.returncode in {0, 3, 4, 5}, done.stderr
-    assert partials(here) == []
-    assert (here / target).exists() or (done.returncode and "error: " in done.stderr)
+    assert partials(brief) == []
+    assert (brief / target).exists() or (done.returncode and "error: " in done.stderr)
 
 
 @pytest.mark.parametrize("name", ["convert", "debias", "view", "train", "diagnose", "live"])
-def test_of_two_runs_at_once_to_one_target_one_wins(here: Path, command: str, name: str) -> None:
+def test_of_two_runs_at_once_to_one_target_one_wins(brief: Path, command: str, name: str) -> None:
     words, target = WRITERS[name]
-    runs = [started(command, words, here) for _ in range(2)]
+    words = words if name == "train" else [word.replace("in.mcap", "short.mcap") for word in words]
+    runs = [started(command, words, brief) for _ in range(2)]
     said = [run.communicate(timeout=WAIT_S)[1] for run in runs]
     assert sorted(run.returncode for run in runs) == [0, CONFIG], said
     (loser,) = (text for run, text in zip(runs, said, strict=True) if run.returncode)
     assert re.search("exists. |holds a diagnosis already", loser)
-    assert (here / target).stat().st_size > DISK_BYTES or name == "train" or (here / target / "findings.json").exists()
-    assert partials(here) == []
+    assert (brief / target).stat().st_size > DISK_BYTES or name == "train" or (brief / target / "findings.json").exists()
+    assert partials(brief) == []
 
 
 def commit(target: Target, errors: list[ConfigError]) -> None:

@@ -14,6 +14,7 @@ import pytest
 from support import pool_functions
 from support.processes import below
 
+import imutool as imutool_api
 from imutool import registry
 from imutool.conversion.run import ConvertReport, convert
 from imutool.errors import ConfigError, DataError
@@ -65,6 +66,13 @@ def test_one_sequence_goes_to_the_file_named(source, tmp_path):
 def test_one_sequence_into_a_folder_that_exists_takes_its_name(source, tmp_path):
     (tmp_path / "out").mkdir()
     assert convert(source / "a", tmp_path / "out").written == [tmp_path / "out" / "a.mcap"]
+
+
+def test_one_sequence_to_a_name_with_a_slash_goes_into_a_new_folder(source, tmp_path, imutool):
+    report = imutool_api.convert(source / "a", f"{tmp_path / 'logs'}/")
+    assert report.written == [tmp_path / "logs" / "a.mcap"]
+    assert imutool("convert", "source/b", "logs/", cwd=tmp_path).returncode == 0
+    assert content(tmp_path / "logs").keys() == {"a.mcap", "b.mcap"}
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -13,7 +13,7 @@ from support import planted
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis
-from imutool.diagnosis.to_physics_file import to_physics_file
+from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.errors import DataError, LogError
 from imutool.mcap_io.write import write

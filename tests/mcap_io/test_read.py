@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from imutool.errors import ConfigError, LogError
-from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose, encode_vector3
 from imutool.mcap_io.index import LogIndex
@@ -42,6 +42,20 @@ def poses(make: Make, topic: str, kind: str = schemas.POSE, count: int = 5, **op
     q = np.array([0.5, -0.5, 0.5, 0.5])
     each = [(START_NS + 10_000_000 * i + 3, np.array([i, 2.0, 3.0])) for i in range(count)]
     return [(topic, kind, t, t, i, make(kind, t, p, q, **options)) for i, (t, p) in enumerate(each)]
+
+
+def test_messages_of_many_small_chunks_are_decoded_together(foreign: Foreign, flight: list[Message], layout: str) -> None:
+    with Log(foreign(flight, layout)) as log:
+        one_by_one = [rows for _, rows in log.rows(["/imu/data"])]
+        cut_up = [rows.where(slice(n, n + 1)) for rows in one_by_one for n in range(len(rows.sequence))]
+        together = list(messages.joined(iter(cut_up)))
+    assert len(together) < len(cut_up) == 900
+    assert all(rows.payload.size <= 2 * messages.BATCH_BYTES for rows in together)
+    for column in range(len(messages.Rows._fields) - 1):
+        expected = np.concatenate([rows[column] for rows in one_by_one])
+        assert np.concatenate([rows[column] for rows in together]).tolist() == expected.tolist()
+    payloads = [bytes(payload) for rows in together for payload in rows.payload]
+    assert payloads == [bytes(payload) for rows in one_by_one for payload in rows.payload]
 
 
 def test_every_layout_reads_the_same(foreign: Foreign, flight: list[Message], layout: str) -> None:

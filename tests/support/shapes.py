@@ -11,7 +11,7 @@ import functools
 import inspect
 import sys
 import types
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
 import jaxtyping
@@ -20,8 +20,8 @@ import numpy as np
 LONGEST = 16
 """Longest tuple or list whose elements are all looked at; of a longer one its length and first elements."""
 _CHECK_EACH_CALL: Any = jaxtyping.jaxtyped
-_passed: dict[types.CodeType, set[Hashable]] = {}
-"""By code: arguments, and arguments with a result, that have passed. A function made inside a function shares its code."""
+_passed: dict[types.CodeType, dict[Hashable, set[Hashable]]] = {}
+"""By code and arguments: the results that have passed. A function made inside a function shares its code."""
 
 
 def check_shapes(package: str) -> None:
@@ -43,7 +43,7 @@ def _check_new_combinations(checked: Any = None, *, typechecker: Any) -> Any:
 
 
 def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[..., Any]:
-    passed = _passed.setdefault(function.__code__, set())
+    passed = _passed.setdefault(function.__code__, {})
     check = functools.cache(functools.partial(_CHECK_EACH_CALL, typechecker=typechecker))
     results: list[Any] = []
     give_result = _with_signature(lambda *_, **__: results.pop(), function)
@@ -51,17 +51,19 @@ def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        called = (*map(_combination, args), *kwargs, *map(_combination, kwargs.values()))
-        if called not in passed:
+        called: Hashable = _combinations(args)
+        if kwargs:
+            called = called, *kwargs, _combinations(kwargs.values())
+        returned = passed.get(called)
+        if returned is None:
             result = check(function)(*args, **kwargs)
-            passed.update((called, (called, _combination(result))))
+            passed[called] = {_combination(result)}
             return result
         result = function(*args, **kwargs)
-        returned = (called, _combination(result))
-        if returned not in passed:
+        if (combination := _combination(result)) not in returned:
             results.append(result)
             check(give_result)(*args, **kwargs)
-            passed.add(returned)
+            returned.add(combination)
         return result
 
     return checked
@@ -72,16 +74,38 @@ def _with_signature(function: Any, of: types.FunctionType) -> Any:
     return functools.update_wrapper(types.FunctionType(code, of.__globals__, name, None, closure), of)
 
 
+def _combinations(values: Iterable[Any]) -> Hashable:
+    """As `_combination` of each; this is called millions of times, so the usual types take no call of their own."""
+    return tuple([kind if (look := _looks.get(kind := type(value), _look)) is None else look(value) for value in values])
+
+
 def _combination(value: Any) -> Hashable:
     """All of a value that a check depends on."""
     kind = type(value)
-    if isinstance(value, np.ndarray):
-        return kind, value.dtype, value.shape
-    if kind in (tuple, list):
-        return kind, len(value), *map(_combination, value[:LONGEST])
-    if kind is dict:
-        return kind, len(value), *((_combination(key), _combination(of)) for key, of in list(value.items())[:LONGEST])
-    if kind is str:
-        return value if len(value) < LONGEST else kind  # a Literal is short
+    look = _looks.get(kind, _look)
+    return kind if look is None else look(value)
+
+
+def _look(value: Any) -> Hashable:
+    """As `_combination`, of a type that is met for the first time."""
+    kind = type(value)
     torch = sys.modules.get("torch")
-    return (kind, value.dtype, value.shape) if torch is not None and isinstance(value, torch.Tensor) else kind
+    if not issubclass(kind, np.ndarray) and not (torch is not None and issubclass(kind, torch.Tensor)):
+        _looks[kind] = None
+        return kind
+    _looks[kind] = lambda array: (kind, array.dtype, tuple(array.shape))
+    return _combination(value)
+
+
+_looks: dict[type, Callable[[Any], Hashable] | None] = {
+    np.ndarray: lambda array: (array.dtype, array.shape),
+    tuple: lambda items: (tuple, len(items), _combinations(items[:LONGEST])),
+    list: lambda items: (list, len(items), _combinations(items[:LONGEST])),
+    dict: lambda items: (
+        dict,
+        len(items),
+        *((_combination(key), _combination(of)) for key, of in list(items.items())[:LONGEST]),
+    ),
+    str: lambda text: text if len(text) < LONGEST else str,  # a Literal is short
+}
+"""By type: what a check depends on beside the type; None where that is all."""

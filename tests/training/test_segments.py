@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.recording import Imu, Recording
+from imutool.recording.columns import MOST_GAP_S
 from imutool.sensor.made_up_flight import flight
+from imutool.training.objective import RestBiases
 from imutool.training.segments import HELD_OUT, Pool
 
 RATE_HZ = 200.0
@@ -109,6 +111,22 @@ def test_no_window_crosses_a_hole_in_the_samples(perfect: Make) -> None:
         windows = pool.windows(first, 40, torch.zeros(len(first), 6, dtype=torch.float64))
         assert len(first) > 500
         assert windows.dt.max() < 1.5 / RATE_HZ
+
+
+def test_a_jump_of_the_clock_counts_as_an_hour_at_most(perfect: Make) -> None:
+    recording = perfect(1)
+    t_ns = recording.imu.t_ns
+    set_ns, years_ns = int(t_ns[len(t_ns) // 2]), 50 * 365 * 86400 * 10**9
+    moved = replace(
+        recording,
+        imu=replace(recording.imu, t_ns=np.where(t_ns < set_ns, t_ns - years_ns // 10, t_ns)),
+        truths={
+            k: replace(p, t_ns=np.where(p.t_ns < set_ns, p.t_ns - years_ns // 10, p.t_ns)) for k, p in recording.truths.items()
+        },
+    )
+    pool = Pool.of([moved])
+    assert MOST_GAP_S < float(pool.t[-1]) < MOST_GAP_S + recording.imu.duration_s + 1.0
+    assert len(RestBiases(pool, 10.0).knots) < 2 * MOST_GAP_S / 10.0
 
 
 def test_logs_of_different_rates_are_refused_with_each_rate(perfect: Make) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.bias_start.stretches import measured_recording
+from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import Expected, noise_faults
@@ -51,8 +51,8 @@ def audit(sim: Location, real: Location | None = None, *, noise: str | Path = "n
         ConfigError, LogError: a log or the data sheet cannot be read.
         DataError: the simulation has no poses that can be differentiated.
     """
-    simulated = measured_recording(read(sim, imu=imu), free_fall=True)
-    recording = None if real is None else measured_recording(read(real, imu=imu))
+    simulated = measured_recording(longest_stretch(read(sim, imu=imu)), free_fall=True)
+    recording = None if real is None else measured_recording(longest_stretch(read(real, imu=imu)))
     sheet = datasheet.read(noise)
     faults = simulator_faults(simulated, recording, sheet)
     not_tested = dict(_not_tested(recording, sheet))

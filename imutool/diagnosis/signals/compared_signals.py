@@ -8,7 +8,7 @@ from dataclasses import replace
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.pairing import Pairing, paired
+from imutool.diagnosis.signals.pairing import Pairing, on_one_clock, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError
 from imutool.location import Location
@@ -31,7 +31,7 @@ def with_signals(
     """
     if named:
         for name in named:
-            pair = SignalPair.of_fields(read_field(real, name), read_field(sim, name), name)
+            pair = SignalPair.of_fields(on_one_clock(read_field(real, name)), on_one_clock(read_field(sim, name)), name)
             report(3, 4, name)
             diagnosis = _with_signal(diagnosis, diagnose_signal(pair, others(real, name), settings))
         return diagnosis

@@ -20,6 +20,7 @@ from imutool.location import Location
 from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, TF, TWIST
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
+from imutool.recording.columns import longest_run
 
 MOST_READ, MOST_COMPARED, MOST_DRIVERS = 400, 24, 6
 SAME = 1e-12  # relative difference of two copies
@@ -71,8 +72,14 @@ class _Side:
         found: dict[str, dict[str, Fields]] = {}
         for name, values in others(path, "", MOST_READ).items():
             topic = max((topic for topic in schemas if name.startswith(f"{topic}.")), key=len)
-            found.setdefault(topic, {})[name[len(topic) + 1 :]] = values
+            found.setdefault(topic, {})[name[len(topic) + 1 :]] = on_one_clock(values)
         return cls(schemas, found, joints)
+
+
+def on_one_clock(values: Fields) -> Fields:
+    """Longest stretch without a jump of the clock: the comparison has an even grid of time."""
+    run = longest_run(values.t_ns)
+    return replace(values, t_ns=values.t_ns[run], values=values.values[run])
 
 
 def paired(real: Location, sim: Location) -> Pairing:

@@ -28,16 +28,7 @@ from imutool.diagnosis.signals.noise import lsb_of, rich_residual, whitened
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
-from imutool.sensor.robot_effects import (
-    barometer,
-    gnss,
-    joint_actuator,
-    joint_friction,
-    joint_load,
-    joint_transmission,
-    magnetometer,
-    wheel,
-)
+from imutool.sensor.robot_effects import barometer, gnss, joint_effort, joint_transmission, magnetometer, wheel
 
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
@@ -48,7 +39,12 @@ CERTAIN = 6.0  # deviations from which a constant is a finding
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
-    "efforts": (joint_friction.effects, joint_load.effects, joint_actuator.effects, joint_transmission.effects),
+    "efforts": (
+        joint_effort.friction_effects,
+        joint_effort.load_effects,
+        joint_effort.actuator_effects,
+        joint_transmission.effects,
+    ),
     "positions": (joint_transmission.position_effects,),
     "wheels": (wheel.effects,),
     "magnetic": (magnetometer.effects,),

@@ -6,7 +6,7 @@ A log holds millions of messages, so they go through numpy instead of the classe
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec.records import HEAD
 
 RUN_AFTER = 8  # equal lengths in a row before a whole run is tested at once
+BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
 MESSAGE = np.dtype(
     [
         ("opcode", "u1"),
@@ -199,6 +200,27 @@ def columns(heads: Shaped[np.ndarray, " n"], payload: UInt8[np.ndarray, "n L"]) 
     """
     times = signed(heads["log_time"]), signed(heads["publish_time"])
     return Rows(heads["channel"].copy(), *times, heads["sequence"].copy(), payload)
+
+
+def joined(parts: Iterable[Rows]) -> Iterator[Rows]:
+    """Rows of small chunks as longer stretches of messages of equal size."""
+    waiting: list[Rows] = []
+    waiting_bytes = 0
+    for rows in parts:
+        if waiting and waiting[-1].payload.shape[1] != rows.payload.shape[1]:
+            yield _concatenated(waiting)
+            waiting, waiting_bytes = [], 0
+        waiting.append(rows)
+        waiting_bytes += rows.payload.size
+        if waiting_bytes >= BATCH_BYTES:
+            yield _concatenated(waiting)
+            waiting, waiting_bytes = [], 0
+    if waiting:
+        yield _concatenated(waiting)
+
+
+def _concatenated(parts: list[Rows]) -> Rows:
+    return parts[0] if len(parts) == 1 else Rows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def message_rows(

@@ -168,9 +168,9 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memo
         data: bytes = _unpacker.decompress(packed, max_output_size=size)
         return data
     if compression == "lz4":
-        frame = lz4.frame.LZ4FrameDecompressor()
-        data = bytes(frame.decompress(packed, max_length=size))
-        if not frame.eof and frame.decompress(b"", max_length=1):
+        context = lz4.frame.create_decompression_context()  # `LZ4FrameDecompressor` would copy the packed bytes first
+        data, read, ended = lz4.frame.decompress_chunk(context, packed, max_length=size)
+        if not ended and lz4.frame.decompress_chunk(context, packed[read:], max_length=1)[0]:
             raise ValueError(f"the lz4 frame goes on beyond the chunk's {size} bytes")
         return data
     return packed

@@ -1,4 +1,4 @@
-"""Transforms between frames in types of Foxglove (`FrameTransform`, `FrameTransforms`), as TFMessage in CDR."""
+"""Foxglove's `FrameTransform` and `FrameTransforms` as TFMessage in CDR."""
 
 from __future__ import annotations
 

@@ -21,8 +21,6 @@ from imutool.mcap_io.topics import DERIVED_KEY, REFLECTED, Topic
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageTopic
 
-BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
-
 Translate = Callable[[UInt8[np.ndarray, "..."]], UInt8[np.ndarray, "..."] | list[bytes]]  # from CDR
 
 
@@ -126,7 +124,7 @@ class DerivedStream:
                 self.decode()
             self.undecoded.append(part)
             self.undecoded_bytes += part.payload.size
-        if self.undecoded_bytes >= BATCH_BYTES:
+        if self.undecoded_bytes >= messages.BATCH_BYTES:
             self.decode()
 
     def decode(self) -> None:

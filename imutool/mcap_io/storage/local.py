@@ -31,7 +31,6 @@ from typing import BinaryIO
 from imutool.mcap_io.storage.source import Source, descriptor
 from imutool.mcap_io.storage.system import copy_by_kernel
 
-PAGE_BYTES = 1 << 12  # of a file system
 PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)\.(?P<mark>[0-9a-f]{24})\.partial", re.DOTALL)
 MARK_PART = 6  # hexadecimal digits of each part of a mark
 LONGEST_NAME = 180  # bytes of a name in the temporary one; a file system takes 255
@@ -58,9 +57,9 @@ class LocalFile:
         self.file.write(data)
 
     def copy(self, source: Source, start: int, end: int) -> int:
-        """Copies by the kernel; returns `start` if the kernel cannot, or would split blocks."""
+        """Copies by the kernel; returns `start` if the kernel cannot."""
         theirs, ours = descriptor(source.file), descriptor(self.file)
-        if theirs is None or ours is None or (start - self.file.tell()) % PAGE_BYTES:
+        if theirs is None or ours is None:
             return start
         self.file.flush()
         start = copy_by_kernel(theirs, ours, start, end)

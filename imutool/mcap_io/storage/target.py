@@ -1,8 +1,7 @@
 """Write a file or folder whole or not at all: under a temporary name, then renamed.
 
-What another file holds is copied by the kernel where its blocks stay blocks: a file system that shares them between files
-copies nothing at all. Where they move by part of a block it could only cut each in two, and costs more than reading and
-writing do: 1.05 times in memory, 1.5 times on ext4.
+What another file holds is copied by the kernel: a file system that shares blocks between files copies nothing at all. Where
+the bytes move by part of a block it takes 0.8 times as long as reading and writing in memory, and as long on ext4.
 """
 
 from __future__ import annotations

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.inertial.kinematics import lever_acceleration
-from imutool.sensor.effect import CompiledEffect, Effect, Stage, Theta, Three, each_axis
+from imutool.sensor.effect import CompiledEffect, Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.signals import ALPHA, GYRO, Signals
+from imutool.units import Three
 
 
 def _forward(motion: IdealMotion, r_b: Theta) -> IdealMotion:

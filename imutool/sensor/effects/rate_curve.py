@@ -12,10 +12,10 @@ from bisect import bisect_right
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta, Three
+from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import GYRO, GYRO_SLOW, Signals
-from imutool.units import AXES
+from imutool.units import AXES, Three
 
 POSITIVE_RAD_S = (0.03, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 KNOTS_RAD_S = np.array([*(-k for k in reversed(POSITIVE_RAD_S)), 0.0, *POSITIVE_RAD_S])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from imutool.errors import ConfigError
+from imutool.errors import not_installed
 from imutool.recording.columns import true_ranges
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
@@ -234,9 +234,7 @@ def require_matplotlib() -> Any:
     try:
         import matplotlib
     except ImportError as error:
-        raise ConfigError(
-            f"matplotlib is not installed ({error})", where="report", fix="Install it with: pip install 'imutool[report]'"
-        ) from error
+        raise not_installed("matplotlib", "report", where="report", error=error) from error
     return matplotlib
 
 

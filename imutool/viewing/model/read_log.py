@@ -21,6 +21,7 @@ from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Imu, Recording
+from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.viewing.model.run_data import LogTimes, Run
 
 MIN_SAMPLES = 2  # samples that make a log
@@ -77,6 +78,7 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     if why:
         left = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
         notes.append(f"{topic} cannot be shown as it was recorded ({why}); as by debias --clean, {left}.")
+    notes += [f"{topic}: {warning}." for warning in jump_warnings(clock_jumps(samples.t_ns))]
     if survey.reasons:
         notes.append(f"{topic} cannot be trusted: {'; '.join(survey.reasons)}.")
     model, start = _model_and_start(metadata, topic)

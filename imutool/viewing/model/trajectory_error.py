@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.inertial.metrics import align
 from imutool.inertial.strapdown import drift, window_drift
@@ -19,6 +19,18 @@ Alignment = Literal["none", "origin", "yaw", "se3"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 RESET_S = 10.0
 WINDOWS_S = (1.0, 5.0, 10.0, 30.0)
+
+
+def alignment(name: str) -> Alignment:
+    """Alignment by name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for known in ALIGNMENTS:
+        if known == name:
+            return known
+    raise ConfigError(f"{name!r}", where="align", expected=", ".join(ALIGNMENTS))
 
 
 @dataclass(frozen=True, eq=False)

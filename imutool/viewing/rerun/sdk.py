@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, not_installed
 from imutool.recording import Times
 from imutool.viewing.model.run_data import RunData, Trace
 
@@ -36,9 +36,7 @@ def require_rerun() -> None:
     try:
         import rerun  # noqa: F401
     except ImportError as error:
-        raise ConfigError(
-            f"the viewer is not installed ({error})", where="view", fix="Install it with: pip install 'imutool[view]'"
-        ) from error
+        raise not_installed("the viewer", "view", where="view", error=error) from error
 
 
 def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError, LogError, not_installed
 from imutool.location import to_location
 from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
@@ -132,7 +132,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
 def _rosbridge(name: str, malformed: Malformed) -> Samples:
     """Samples of a topic from a rosbridge server (https://github.com/RobotWebTools/rosbridge_suite)."""
     if find_spec("websockets") is None:
-        raise ConfigError("a rosbridge needs websockets, which is not installed", where=name, fix="pip install 'imutool[live]'")
+        raise not_installed("websockets", "live", where=name, user="a rosbridge")
     from websockets.exceptions import ConnectionClosed, InvalidHandshake
     from websockets.sync.client import connect
 
@@ -165,7 +165,7 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
 def _zenoh(name: str, malformed: Malformed) -> Samples:
     """Samples that are published under a key: JSON, or the CDR of a sensor_msgs/Imu, as rmw_zenoh sends it."""
     if find_spec("zenoh") is None:
-        raise ConfigError("needs eclipse-zenoh, which is not installed", where=name, fix="pip install 'imutool[live]'")
+        raise not_installed("eclipse-zenoh", "live", where=name, user="the source")
     import zenoh
 
     parts, config, arrived = urlsplit(name), zenoh.Config(), Queue[tuple[float, bytes]](MOST_WAITING)

@@ -9,7 +9,7 @@ from scipy.signal import lfilter, welch
 from support import diagnoses
 
 from imutool.diagnosis.result import Traces
-from imutool.diagnosis.to_noise_file import to_noise_file
+from imutool.diagnosis.to_sensor_files import to_noise_file
 
 RATE_HZ, SECONDS, WHITE, SLOW = 200.0, 120, 0.3, 0.95  # share of the noise; pole of the rest
 

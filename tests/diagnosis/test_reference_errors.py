@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from support import planted
 
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.reference.coverage import align
-from imutool.diagnosis.reference.errors import turned_reference
+from imutool.diagnosis.reference_coverage import align
+from imutool.diagnosis.reference_errors import turned_reference
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.recording import Poses

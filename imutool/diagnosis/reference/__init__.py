@@ -1,1 +1,0 @@
-"""Reference of a recording: what it covers, and where it is wrong."""
