@@ -95,7 +95,9 @@ def _is_number(text: str) -> bool:
 
 
 def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS) -> None:
-    """Add the columns of a table of text with `least` numbers in a row; `path` is its address for messages.
+    """Add the columns of a table of text with `least` numbers in a row.
+
+    `path` is its address for messages.
 
     Raises:
         DataError: a line is too long for a table.

@@ -37,9 +37,9 @@ def read_truth(
     topics: Sequence[str] | None = None,
     end_ns: int | None = None,
 ) -> Truth | None:
-    """Poses up to `end_ns` of the first readable topic of the true ones, or of `topics`; None below three.
+    """Poses of the first readable topic of the true ones, or of `topics`; None below three.
 
-    A transform of a topic is named as TOPIC/CHILD_FRAME.
+    They reach to `end_ns`. A transform of a topic is named as TOPIC/CHILD_FRAME.
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
     for topic in log.truth_topics if topics is None else topics:

@@ -1,4 +1,4 @@
-"""Units, axes, and the poses' world, clock, agreement with the gyro, and the time that they cover."""
+"""Units, axes, and the poses' world, clock, coverage and agreement with the gyro."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
 
 
 def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]]]:
-    """Children of the frames that have no parent, as TOPIC/CHILD_FRAME, with the stamps of their transforms."""
+    """Children of frames without a parent, as TOPIC/CHILD_FRAME, with their stamps."""
     found: dict[tuple[str, str], list[Int64[np.ndarray, "..."]]] = {}
     try:
         for batch in log.pose_batches(topic):

@@ -1,4 +1,4 @@
-"""IMU from two sensors: on the gyro's stamps, the accelerometer interpolated; their delay and the gyro's unit.
+"""IMU from two sensors, on the gyro's stamps; their delay, and the gyro's unit.
 
 While the specific force is mostly gravity, a vector that is fixed in the world, da/dt = -omega x a. The delay is the lag at
 which both sides correlate best.
@@ -61,7 +61,7 @@ def unit_by_gravity(
     accel: Float64[np.ndarray, "n 3"],
     units: Mapping[str, float],
 ) -> tuple[str, float] | None:
-    """Unit of the gyro under which it carries gravity along, and the correlation; None where the motion shows none.
+    """Unit of the gyro by which it carries gravity along, and the correlation; else None.
 
     `units` are in rad/s. The scale of the least squares of da/dt = -scale omega x a decides, in the whole and in most parts.
     """

@@ -129,7 +129,9 @@ def encode_transform(
 def encode_transforms(
     stamp_ns: Int64[np.ndarray, "n k"], values: Float64[np.ndarray, "n k 7"], frames: Sequence[tuple[str, str]]
 ) -> UInt8[np.ndarray, "n L"]:
-    """One TFMessage per row with a transform for each parent and child; `values` are position and quaternion wxyz.
+    """One TFMessage per row with a transform for each parent and child.
+
+    `values` are position and quaternion wxyz.
 
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.

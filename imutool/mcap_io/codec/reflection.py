@@ -166,7 +166,7 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
 
 
 def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
-    """Access to messages of a schema; None of an unknown encoding, or where the schema is damaged.
+    """Access to messages of a schema; None of an unknown encoding or a damaged schema.
 
     Raises:
         ImportError: the schema is of protobuf, which is not installed.

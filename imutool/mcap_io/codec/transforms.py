@@ -33,7 +33,7 @@ class Transform(NamedTuple):
 
 @dataclass(frozen=True)
 class Transforms:
-    """Messages of one or several transforms; translates to CDR. A transform that lacks a field is left out."""
+    """Messages of one or several transforms; one that lacks a field is left out."""
 
     format: Format
     several: bool
