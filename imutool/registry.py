@@ -44,50 +44,46 @@ def _listed(list_points: Callable[..., Iterable[EntryPoint]], group: str, path: 
     return {point.name: point for point in list_points(group=group)}
 
 
-def _own(group: str) -> set[str]:
-    """Keys of the files in this package."""
+@cache
+def _own(group: str) -> frozenset[str]:
+    """Keys of the files in this package: its folders are listed once a process."""
     spec = importlib.util.find_spec(GROUPS[group])
     places = list(spec.submodule_search_locations or ()) if spec else []
-    found = {module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_")}
+    found = frozenset(module.name for module in pkgutil.iter_modules(places) if not module.name.startswith("_"))
     return found - NOT_PLUGINS.get(group, frozenset())
 
 
 def load(group: str, name: str) -> ModuleType:
-    """Module of a key.
+    """Module of a key; a file of this package comes first, and then no other package is asked.
 
     Raises:
         ConfigError: no such key; the message names the nearest.
     """
-    known = names(group)
-    if name not in known:
+    if name in _own(group):
+        return importlib.import_module(f"{GROUPS[group]}.{name}")
+    if name not in (points := _outside(group)):
+        known = names(group)
         raise ConfigError(
             f"{name!r} is not known",
             where=group.removeprefix("imutool."),
             expected=f"one of {', '.join(known)}",
             fix=did_you_mean(name, known, "{!r}"),
         )
-    return _loaded(group, name, _outside(group))
-
-
-def every(group: str) -> dict[str, ModuleType]:
-    """Modules of a group by key, sorted."""
-    points = _outside(group)
-    return {name: _loaded(group, name, points) for name in sorted(_own(group) | set(points))}
-
-
-def _loaded(group: str, name: str, points: Mapping[str, EntryPoint]) -> ModuleType:
-    if name not in points:
-        return importlib.import_module(f"{GROUPS[group]}.{name}")
     module = points[name].load()
     assert isinstance(module, ModuleType), f"entry point {group}:{name} must name a module"
     return module
 
 
+def every(group: str) -> dict[str, ModuleType]:
+    """Modules of a group by key, sorted."""
+    return {name: load(group, name) for name in names(group)}
+
+
 def summary(group: str, name: str) -> str:
     """First line of a module's docstring, without an import; empty if there is none."""
-    points = _outside(group)
     try:
-        spec = importlib.util.find_spec(points[name].module if name in points else f"{GROUPS[group]}.{name}")
+        own = name in _own(group)
+        spec = importlib.util.find_spec(f"{GROUPS[group]}.{name}" if own else _outside(group)[name].module)
     except ModuleNotFoundError:
         return ""
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):

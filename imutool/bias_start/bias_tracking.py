@@ -139,8 +139,10 @@ class BiasFilter:
             yield self._pass(*self._waiting.popleft())
 
     def _arrived(self, t: Float64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"]) -> Iterator[FilteredBlock]:
-        dt = np.diff(t)
-        late = dt > GAP_PERIODS * np.median(dt) if len(dt) > 1 else dt > BLOCK_S * 1.5
+        dt = t[1:] - t[:-1]
+        ordered = np.sort(dt)  # `np.median` takes five times as long
+        median = 0.5 * (ordered[(len(dt) - 1) // 2] + ordered[len(dt) // 2])
+        late = dt > GAP_PERIODS * median if len(dt) > 1 else dt > BLOCK_S * 1.5
         block = _Block(t, u, float(dt.max()), float(dt[late].sum()))
         rests = self._rest_detector(u[:-1, :3], u[:-1, 3:], whole=not late.any())
         self._waiting.append((block, rests))

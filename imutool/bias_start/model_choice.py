@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.bias import static
-from imutool.bias.io import check_rate, find_model
+from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
@@ -128,7 +128,7 @@ def choose_model_and_start(
     if untrained and init == "auto" and not smooth:
         batches = ((t_ns, batch.gyro, batch.accel) for batch, t_ns in _imu_batches(log, topic, survey))
         return _estimate(block_statistics(batches, period_s), log.path)
-    model: BiasModel = static.Model() if name is None or untrained else find_model(name, 1.0 / period_s)
+    model: BiasModel = static.Model() if name is None or untrained else shared_model(name, 1.0 / period_s)
     if not untrained:
         check_rate(model, 1.0 / period_s, log.path)
     if smooth:

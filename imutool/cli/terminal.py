@@ -42,7 +42,7 @@ def _width() -> int | None:
     return None if sys.stdout.isatty() or "COLUMNS" in os.environ else LONGEST_ROW
 
 
-out, err = _Console(width=_width()), _Console(stderr=True)
+out, err = _Console(width=_width(), emoji=False), _Console(stderr=True, emoji=False)
 
 
 def plain(text: str) -> str:

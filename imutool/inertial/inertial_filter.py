@@ -30,13 +30,14 @@ from jaxtyping import Float64
 from msgspec import Meta
 
 from imutool.config import Settings
-from imutool.inertial.preintegration import SMALL_RAD2, Increment, Matrix3, Vector3, exp, hat
+from imutool.inertial.preintegration import EYE, SMALL_RAD2, Increment, Matrix3, Vector3, exp, hat
 from imutool.recording import GRAVITY_M_S2
 
 TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 POSE, BIAS, GROUND = slice(0, 9), slice(9, 15), slice(15, 21)
 SIZE = 21
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
+HAT_G, UNCHANGED = hat(G_W), np.eye(SIZE)
 STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
@@ -192,21 +193,20 @@ def _predict(
     """Predicted state after a block."""
     v = x.v_w + G_W * T + x.R_wb @ dv
     p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
-    F = np.eye(SIZE)
-    g, V, X = hat(G_W), hat(v), hat(p)
-    F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * g, 0.5 * T**2 * g, T * np.eye(3)
+    F, V, X = UNCHANGED.copy(), hat(v), hat(p)
+    F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
     turned = R @ by_bias[:3]
     F[POSE, BIAS] = np.concatenate([turned, x.R_wb @ by_bias[3:6] + V @ turned, x.R_wb @ by_bias[6:] + X @ turned])
     if resting:
         F[POSE, GROUND] = F[POSE, BIAS]
     P = F @ x.P @ F.T
-    turn_noise, push_noise = (
-        np.concatenate([np.eye(3), V, X]),
-        np.concatenate([np.zeros((3, 3)), np.eye(3), 0.5 * T * np.eye(3)]),
-    )
+    turn_noise, push_noise = np.zeros((2, 9, 3))
+    turn_noise[TURN], turn_noise[VELOCITY], turn_noise[POSITION] = EYE, V, X
+    push_noise[VELOCITY], push_noise[POSITION] = EYE, 0.5 * T * EYE
     P[POSE, POSE] += noise[0] * turn_noise @ turn_noise.T + noise[1] * push_noise @ push_noise.T
-    P[np.arange(SIZE), np.arange(SIZE)] += LEAST_VARIANCE
-    P[np.arange(9, 15), np.arange(9, 15)] += walk**2 * T
+    variances = P.reshape(-1)[:: SIZE + 1]
+    variances += LEAST_VARIANCE
+    variances[BIAS] += walk**2 * T
     expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T))
     return Step(x, expected, F, expected)
 
@@ -218,7 +218,7 @@ def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"
     """
     PH = x.P @ H.T
     K = np.linalg.solve(H @ PH + np.diag(noise), PH.T).T
-    I_KH = np.eye(SIZE) - K @ H
+    I_KH = UNCHANGED - K @ H
     P = I_KH @ x.P @ I_KH.T + (K * noise) @ K.T
     return x.moved(-K @ z, 0.5 * (P + P.T))
 
@@ -260,7 +260,7 @@ def _left_jacobian(xi: Vector3) -> Matrix3:
     else:
         angle = np.sqrt(square)
         first, second = (1.0 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
-    J: Matrix3 = np.eye(3) + first * X + second * X @ X
+    J: Matrix3 = EYE + first * X + second * X @ X
     return J
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Float64
 Vector3 = Float64[np.ndarray, "3"]
 Matrix3 = Float64[np.ndarray, "3 3"]
 Vectors = Float64[np.ndarray, "n 3"]
+EYE = np.eye(3)
 SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
 
 
@@ -50,30 +51,34 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
     first = np.where(small, 1.0 - square / 6.0, np.sin(angle) / angle)
     second = np.where(small, 0.5 - square / 24.0, 2.0 * (np.sin(0.5 * angle) / angle) ** 2)
     X = hat(xi)
-    R: Float64[np.ndarray, "*batch 3 3"] = np.eye(3) + first * X + second * (X @ X)
+    R: Float64[np.ndarray, "*batch 3 3"] = EYE + first * X + second * (X @ X)
     return R
 
 
 def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Increment:
     """Increment from the first sample to the last; the samples are already minus their bias."""
-    dt = np.diff(t_s)
+    # numpy's functions that join and pad take as long as the sums: the arrays are filled in place
+    n, dt = len(t_s), t_s[1:] - t_s[:-1]
     step = 0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None]
-    R = np.concatenate([np.eye(3)[None], _running_product(exp(step))])  # body at each sample to body at the first
+    R, turned = np.empty((n, 3, 3)), np.zeros((n, 3, 3))  # R: body at each sample to body at the first
+    R[0], R[1:] = EYE, _running_product(exp(step))
     # a constant c added to the bias turns step k by -Jr c dt, transformed by the later steps
-    right_jacobian = (np.eye(3) - 0.5 * hat(step)) * dt[:, None, None]
-    turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(R[1:] @ right_jacobian, axis=0)])
+    right_jacobian = (EYE - 0.5 * hat(step)) * dt[:, None, None]
+    np.cumsum(R[1:] @ right_jacobian, axis=0, out=turned[1:])
     R_by_bias = -R.swapaxes(-1, -2) @ turned
     force = (R @ accel[..., None])[..., 0]
     force_by_gyro_bias = -R @ hat(accel) @ R_by_bias
 
-    to_velocity = 0.5 * (np.append(dt, 0.0) + np.append(0.0, dt))  # trapezoidal weights
-    left = t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:])
-    to_position = 0.5 * (np.append(dt * left, 0.0) + np.append(0.0, dt * left))
+    weights = np.zeros((2, n))  # trapezoidal, to velocity and to position
+    weights[0, :-1], weights[1, :-1] = dt, dt * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:]))
+    weights[:, 1:] += weights[:, :-1].copy()
+    weights *= 0.5
+    to_velocity, to_position = weights
     by_bias = np.zeros((9, 6))
     by_bias[:3, :3] = R_by_bias[-1]
-    for rows, weights in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
-        by_bias[rows, :3] = np.einsum("n,nij->ij", weights, force_by_gyro_bias)
-        by_bias[rows, 3:] = -np.einsum("n,nij->ij", weights, R)
+    for rows, of_sample in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
+        by_bias[rows, :3] = np.einsum("n,nij->ij", of_sample, force_by_gyro_bias)
+        by_bias[rows, 3:] = -np.einsum("n,nij->ij", of_sample, R)
     turned_rad = float(np.sqrt((step * step).sum(axis=1)).sum())
     return Increment(float(t_s[-1] - t_s[0]), R[-1], to_velocity @ force, to_position @ force, by_bias, turned_rad)
 
@@ -82,6 +87,8 @@ def _running_product(R: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 
     """R_0, R_0 R_1, ..., in log2(n) passes."""
     shift = 1
     while shift < len(R):
-        R = np.concatenate([R[:shift], R[:-shift] @ R[shift:]])
+        before, R = R, np.empty_like(R)
+        R[:shift] = before[:shift]
+        np.matmul(before[:-shift], before[shift:], out=R[shift:])
         shift *= 2
     return R

@@ -166,7 +166,8 @@ class OnlineRestDetector:
             self._last, self._resting = None, 0
             return False
         cut = np.concatenate([gyro, accel], axis=1)[: k * self.parts].reshape(self.parts, k, 6)
-        mean, var = cut.mean(axis=1), cut.var(axis=1, ddof=1)
+        mean = cut.sum(axis=1) / k
+        var = ((cut - mean[:, None]) ** 2).sum(axis=1) / (k - 1)  # `np.var` takes the mean again
         before, self._last = self._last, (mean, var, k)
         if before is None:
             return False

@@ -247,7 +247,7 @@ class LogWriter:
     ) -> None:
         """Writes the message indexes of the chunk just written, and enters it in the summary."""
         first, counts = self.target.position, dict[int, int]()
-        for channel in (ids := np.unique(channels).tolist() if len(channels) > 1 else channels.tolist()):
+        for channel in (ids := np.flatnonzero(np.bincount(channels)).tolist() if len(channels) > 1 else channels.tolist()):
             mine = channels == channel if len(ids) > 1 else slice(None)
             index = messages.message_index(channel, times[mine], offsets[mine])
             counts[channel] = (len(index) - messages.SINGLE_INDEX.size) // 16 + 1

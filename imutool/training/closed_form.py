@@ -64,15 +64,17 @@ def sensor_residual(
     windows: Windows,
     W: Float[Tensor, "3 3"] | None = None,
     R_wb: Float[Tensor, "batch n 3 3"] | None = None,
+    motion: Float[Tensor, "batch samples 3"] | None = None,
 ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch n 3 3"]]:
     """Residual of each window's debiased samples, and its Jacobian by each sample.
 
-    `W u` is taken off the sensor's samples on top of what the model takes off. `R_wb` are `carried_attitudes`, where they are
-    known already.
+    `W u` is taken off the sensor's samples on top of what the model takes off. `R_wb` are `carried_attitudes` and `motion` is
+    the model's `motion_bias`, where they are known already.
     """
     segment = windows.segment
     u, _ = segment.of(sensor)
-    true_u = u - model.sensor_bias(sensor, segment)
+    motion = model.motion_bias(sensor, segment) if motion is None else motion
+    true_u = u - model.rest_bias(sensor, segment) - motion
     if W is not None:
         true_u = true_u - u @ W.mT
     if sensor == "gyro":
@@ -110,6 +112,7 @@ def solve(
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
     carried: dict[int, Float[Tensor, "m n 3 3"]] = {}  # by window length: the gyro does not change here
+    motion: dict[int, Float[Tensor, "m n 3"]] = {}  # nor does what the samples alone add
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
         own[:, :3] = rest[:, columns]
         now = torch.cat([W.flatten()[:known], own.flatten()])
@@ -120,7 +123,9 @@ def solve(
             windows = pool.windows(first, n, rest[pool.log[first]])
             if sensor == "accel" and n not in carried:
                 carried[n] = carried_attitudes(model, windows)
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None, carried.get(n))
+            if n not in motion:
+                motion[n] = model.motion_bias(sensor, windows.segment)
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None, carried.get(n), motion[n])
             rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
             by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
             apart = own.clone()

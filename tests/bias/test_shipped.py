@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from imutool.bias.io import find_model, header_of, library, load, shipped_for
+from imutool.bias.io import find_model, header_of, library, load, shared_model, shipped_for
 from imutool.conversion.run import convert
 from imutool.debiasing import debias
+from imutool.errors import ModelError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.log import Log
 
@@ -23,6 +24,18 @@ PUBLISHED_FETCH_DEG = 1.96
 def test_every_sensor_has_its_models() -> None:
     methods = {(header_of(path)["dataset"], header_of(path)["method"]) for path in MODELS}
     assert methods >= {(data_set, method) for data_set in SENSORS for method in ("linear", "neural_ode", "hybrid")}
+
+
+def test_a_worker_reads_a_model_once_and_again_when_its_file_has_changed(tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    path.write_bytes(library().joinpath("euroc-adis16448-linear.safetensors").read_bytes())
+    first = shared_model(path, 200.0)
+    assert shared_model(path, 200.0) is first
+    path.write_bytes(library().joinpath("euroc-adis16448-hybrid.safetensors").read_bytes())
+    assert (first.method, shared_model(path, 200.0).method) == ("linear", "hybrid")
+    path.unlink()
+    with pytest.raises(ModelError, match="No such file"):
+        shared_model(path, 200.0)
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)

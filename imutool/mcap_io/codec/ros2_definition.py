@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from imutool.errors import LogError
+from imutool.mcap_io.codec.flatbuffer import MOST_FIELDS
 
 NUMBERS = {
     **dict.fromkeys(("bool", "byte", "char", "uint8"), "u1"),
@@ -211,15 +212,18 @@ class DescribedCdr:
 
     def tree(self, depth: int) -> dict[str, Any]:
         """Tree of the fields, as `reflection` has it."""
-        return self._tree(self._definition[""][0].kind, depth)
+        return self._tree(self._definition[""][0].kind, depth, [MOST_FIELDS])
 
-    def _tree(self, kind: str, depth: int) -> dict[str, Any]:
+    def _tree(self, kind: str, depth: int, left: list[int]) -> dict[str, Any]:
         fields: dict[str, Any] = {}
         for field in self._definition[kind]:
+            left[0] -= 1
+            if left[0] < 0:
+                break
             if field.kind in NUMBERS:
                 fields[field.name] = {None: "number", 3: "vector"}.get(field.length, "")
             elif field.kind in self._definition and field.length is None and depth:
-                fields[field.name] = self._tree(field.kind, depth - 1)
+                fields[field.name] = self._tree(field.kind, depth - 1, left)
         return fields
 
     def parse(self, raw: bytes) -> Message:

@@ -12,9 +12,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
 
 CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 KILLED = (-signal.SIGKILL, -signal.SIGTERM) if sys.platform != "win32" else (1, 1)  # exit codes of a process that was killed
@@ -93,6 +95,8 @@ def opened(handle: int) -> Connection:
         from multiprocessing.connection import PipeConnection
 
         return PipeConnection(handle)
+    from multiprocessing.connection import Connection
+
     return Connection(handle)
 
 
