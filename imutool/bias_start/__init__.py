@@ -34,8 +34,9 @@ class Fitness(Section, frozen=True):
             raise ModelError(
                 f"the model {name!r} does not fit this log: {reasons}",
                 where=where,
-                expected="a model of this very sensor",
-                fix="Give `model=static` or a model trained on logs of this sensor, or use it all the same with `force`",
+                expected="a model of this very sensor, and samples in rad/s and m/s²",
+                fix="Correct wrong units with imutool convert LOG OUT --fix; else give `model=static` or one trained on logs "
+                "of this sensor, or use it all the same with `force`",
             )
         if self.verdict != "fits":
             logger.warning("%s: %s", where, self.sentence(f"the model {name}"))
