@@ -239,10 +239,10 @@ class Log:
                     stamps.check_imu(batch)
                     yield batch
 
-    def pose_batches(self, topic: str) -> Iterator[PoseBatch]:
+    def pose_batches(self, topic: str, end_ns: int | None = None) -> Iterator[PoseBatch]:
         """The poses of a topic in file order; of a TFMessage one batch per transform in it; LogError as `imu_batches`."""
         described = self.topic(topic, (*MESSAGE_POSES, schemas.TF))
-        for _, rows in self.rows([topic]):
+        for _, rows in self.rows([topic], end_ns=end_ns):
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
