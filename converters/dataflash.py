@@ -78,6 +78,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     timed = {name: c for name, c in columns.items() if "TimeUS" in (c.dtype.names or ())}
     if not timed:
         raise DataError("holds no messages with a time", where=sequence.path, expected="a log of ArduPilot")
+    if untimed := sorted(columns.keys() - timed.keys() - {"PARM"}):
+        remarks.losses.append(f"messages without a time are left out: {', '.join(untimed)}")
     poses = _poses(timed, remarks)
     return MessageLog(
         sequence.name,

@@ -28,6 +28,7 @@ from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, along_truth, drift
+from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 
@@ -68,8 +69,8 @@ def evaluate(
     recording = replace(recording, imu=measured_imu(recording.imu, f"{log} {recording.imu_topic}"))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    results = []
-    about = recording.metadata.get("imutool", {})
+    warn_of_recordings([recording])
+    results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
         found = _corrected(recording.imu, model, start)
         fit = judge(model, start, [relative_samples(recording.imu)], about) if model and start else None

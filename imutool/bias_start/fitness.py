@@ -58,8 +58,9 @@ class Fitness(Section, frozen=True):
             raise ModelError(
                 f"the model {name!r} does not fit this log: {reasons}",
                 where=where,
-                expected="a model of this very sensor",
-                fix="Give `model=static` or a model trained on logs of this sensor, or use it all the same with `force`",
+                expected="a model of this very sensor, and samples in rad/s and m/s²",
+                fix="Correct wrong units with imutool convert LOG OUT --fix; else give `model=static` or one trained on logs "
+                "of this sensor, or use it all the same with `force`",
             )
         if self.verdict != "fits":
             logger.warning("%s: %s", where, self.sentence(f"the model {name}"))
@@ -101,14 +102,15 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
 
     `about` is what the log says of its origin: `sensor`, `dataset`.
     """
+    samples = _head(batches)
+    wrong = _wrong_gravity(samples) if len(samples[0]) else ""
+    if wrong:
+        return Fitness("unfit", (wrong,))
     if model.method == static.Model.method:
         units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
         return Fitness("fits", (f"it is a constant bias of this log, not a trained one; models ship for {', '.join(units)}",))
-    samples = _head(batches)
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
-    if wrong := _wrong_gravity(samples):
-        return Fitness("unfit", (wrong,))
     prior = _prior(model)
     found = _evidence(model, samples, prior)
     none = None

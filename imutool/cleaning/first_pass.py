@@ -184,7 +184,8 @@ def look(log: Log, topic: str, settings: CleaningSettings | None = None) -> Surv
         ConfigError: a rule is not known.
         LogError: no such IMU topic, or damage.
     """
-    return examine(lambda: raw_batches(log, topic), read_truth(log), settings, where=str(log.path), topic=topic)
+    name = log.topic(topic, (schemas.IMU,)).name  # of two joined topics that of their IMU
+    return examine(lambda: raw_batches(log, name), read_truth(log), settings, where=str(log.path), topic=name)
 
 
 def examine(

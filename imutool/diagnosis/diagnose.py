@@ -44,6 +44,7 @@ from imutool.diagnosis.signals.compared_signals import with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
+from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -83,6 +84,7 @@ def diagnose(
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
     logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
+    warn_of_recordings(recordings)
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):

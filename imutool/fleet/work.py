@@ -146,6 +146,7 @@ def _debias(job: _Job) -> dict[str, Any]:
     s = job.settings
     rules = CleaningSettings() if s.clean else None
     options: dict[str, Any] = {"init": s.init, "smooth": s.smooth, "force": s.force, "clean": rules, "check": s.check}
+    options["imus"] = () if s.imu is None else (s.imu,)
     report = debias(job.source, job.target, model=s.model, **options, overwrite=True)
     imus = tuple(
         Imu(topic, report.models[topic], start.how, tuple(start.rest[:3].tolist()), tuple(start.rest[3:].tolist()))

@@ -73,6 +73,13 @@ def test_a_model_of_another_sensor_is_refused_or_warned_of(logs: Path, tmp_path:
     assert any("the model is unfit" in warning for warning in forced.warnings)
 
 
+def test_the_imu_is_the_one_that_is_named(logs: Path, tmp_path: Path, settings: Settings) -> None:
+    named = msgspec.structs.replace(settings, imu="gyro=/imu0,accel=/imu1")
+    refused = work(task(logs / "flight_1.mcap", tmp_path / "out", named))
+    assert refused.status == "failed"
+    assert "there is no topic /imu1" in refused.error
+
+
 def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:
     """Nothing in it tells of the time, the machine or the place."""
     moved = tmp_path / "elsewhere" / "flight_1.mcap"

@@ -25,7 +25,7 @@ assert SPEC.loader is not None
 bench: Any = importlib.util.module_from_spec(SPEC)
 sys.modules["audit_bench"] = bench
 SPEC.loader.exec_module(bench)
-DURATION_S = 24.0
+DURATION_S = 16.0
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
