@@ -223,7 +223,7 @@ class Log:
                     table = np.concatenate(entries)
                     yield messages.signed(table[np.argsort(table[:, 1], kind="stable"), 0])
                 elif (found := self.index.unpack_or_lose(block)) is not None:
-                    times = found.times()[np.isin(found.heads["channel"], list(channels))]
+                    times = found.times()[found.of_channels(channels)]
                     yield from [times] if len(times) else []
 
     def imu_batches(self, topic: str) -> Iterator[ImuBatch]:
@@ -287,6 +287,5 @@ class Log:
         times = found.times()
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():
-            mask = inside & np.isin(found.heads["channel"], list(channels))
-            for heads, payload in self.topics[topic].cut(found, mask):
+            for heads, payload in self.topics[topic].cut(found, inside & found.of_channels(channels)):
                 yield topic, messages.columns(heads, payload)
