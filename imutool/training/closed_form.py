@@ -104,7 +104,7 @@ def solve(
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = _window_sets(pool, window_s, part)
+    sets = [(first, n) for first, n in _window_sets(pool, window_s, part) if len(first)]
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
     own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
@@ -117,8 +117,6 @@ def solve(
         now = torch.cat([W.flatten()[:known], own.flatten()])
         H, g = torch.diag(prior), prior * now
         for first, n in sets:
-            if not len(first):
-                continue
             windows = pool.windows(first, n, rest[pool.log[first]])
             if n not in fixed:
                 carried = carried_attitudes(model, windows) if sensor == "accel" else None
