@@ -90,6 +90,7 @@ def clean(
                 smooth=smooth,
                 overwrite=overwrite,
                 clean=rules,
+                force=force,
                 max_chunk=max_chunk,
                 progress=lambda done, total: tell(done, total, ""),
             )
