@@ -73,6 +73,11 @@ def _load_parquet(path: Path, columns: Columns) -> None:
         if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(field.type))
     ]
     _check_size(path, file.metadata.num_rows * len(numbers) * 8)
+    columns.remarks.losses.extend(
+        f"{field.name} is left out: it is of type {field.type}, no number"
+        for field in file.schema_arrow
+        if field.name not in numbers
+    )
     table = file.read(columns=numbers)  # a text of a few bytes may unpack to gigabytes
     for name in table.column_names:
         column = table.column(name)

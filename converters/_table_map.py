@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from imutool.errors import ConfigError
+from imutool.recording.joined_imu import in_order, unit_by_gravity
 from imutool.recording.message_log import KINDS
 
 from ._table_text import Columns
@@ -23,12 +24,14 @@ GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
 PLAUSIBLE_HZ = 5.0, 10_000.0
+NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
 WORDS = {
     "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
     r"|dreh(rate|geschwindigkeit)",
-    "accel": r"accel(eration|erometer)?|acce?|ac|a|linear_?acceleration|specific_?force|(linear)?beschleunigung|a_rs_s",
+    "accel": r"accel(eration|erometer)?|acce?|ac|a|linear_?acceleration|specific_?force|sp_?force|(linear)?beschleunigung"
+    r"|a_rs_s",
 }
 ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
 TIME_WORDS = (
@@ -145,6 +148,8 @@ def propose(columns: Columns) -> Proposal:
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
+    if "gyro_unit" in proposal.open and not {"gyro", "accel", "accel_unit", "time", "time_unit"} & {*proposal.open}:
+        _propose_gyro_unit(proposal, columns)
     return proposal
 
 
@@ -174,9 +179,9 @@ def _propose_sensor(
     """Columns of the three axes, and their unit."""
     groups: dict[str, dict[str, str]] = {}
     for column, (name, _) in names.items():
-        axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?([xyz012])", name)
+        axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?(?P<axis>[xyz012])(_(raw|adc|counts?))?", name)
         if axis:
-            groups.setdefault(axis[1], {})[axis[axis.lastindex or 0].translate(str.maketrans("012", "xyz"))] = column
+            groups.setdefault(axis[1], {})[axis["axis"].translate(str.maketrans("012", "xyz"))] = column
     whole = [group for group in groups.values() if set(group) == set("xyz")]
     if len(whole) != 1:
         proposal.open += [sensor, f"{sensor}_unit"]
@@ -193,8 +198,26 @@ def _propose_sensor(
         _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
 
 
+def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
+    """Unit of the gyro from how gravity turns in the accelerometer."""
+    t, gyro, accel = (
+        np.stack([columns.values[c].astype(float) for c in np.atleast_1d(proposal.entries[name])], axis=1)
+        for name in ("time", "gyro", "accel")
+    )
+    t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
+    if len(gyro) != len(accel):
+        return
+    kept = in_order(t_ns, np.concatenate([gyro, accel], axis=1), "")
+    found = unit_by_gravity(kept.t_ns, kept.values[:, :3], kept.values[:, 3:], GYRO_SI) if len(kept.t_ns) else None
+    if found is not None:
+        proposal.open.remove("gyro_unit")
+        proposal.reasons.remove(NO_UNIT.format("gyro"))
+        proposal.entries["gyro_unit"] = found[0]
+        proposal.reasons.append(f"gravity turns in the accelerometer as a gyro in {found[0]} says (correlation {found[1]:.2f})")
+
+
 def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
-    """Unit from the magnitude: gravity shows that of an accelerometer; nothing shows that of a gyro."""
+    """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
         level = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         for unit, size in ACCEL_SI.items():
@@ -203,7 +226,7 @@ def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
                 proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {unit}")
                 return
     proposal.open.append(f"{sensor}_unit")
-    proposal.reasons.append(f"the names of the columns state no unit of the {sensor}, and its values show none")
+    proposal.reasons.append(NO_UNIT.format(sensor))
 
 
 def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns) -> None:

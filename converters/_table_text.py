@@ -19,7 +19,7 @@ from imutool.recording.message_log import Remarks
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
-DELIMITERS = (",", ";", "\t")
+LEAST_NUMBERS = 4  # in a row: a time and a vector
 COMMENTS = "#", "%", "//"
 DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123
     r"(?:(\d{4})-(\d\d)-(\d\d)|(\d\d?)\.(\d\d?)\.(\d{4}))[T ]+(\d\d?:\d\d:\d\d)(?:[.,](\d{1,9})\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)?"
@@ -76,14 +76,14 @@ def is_text_table(head: bytes) -> bool:
     lines = text_of(head).splitlines()
     rows = [line for line in lines[:-1] or lines if line.strip()]
     delimiter = _delimiter(rows)
-    return any(sum(map(_is_number, row.split(delimiter))) >= 4 for row in rows[:50])
+    return any(sum(map(_is_number, row.split(delimiter))) >= LEAST_NUMBERS for row in rows[:50])
 
 
-def _delimiter(rows: list[str]) -> str | None:
-    """What separates the fields; None for white space."""
+def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
+    """What separates the fields, of which there are `least`; None for white space."""
     plain = [row for row in rows[:50] if not row.startswith(COMMENTS)]
     counts = {mark: min((row.count(mark) for row in plain[1:20]), default=0) for mark in (";", "\t", ",")}
-    return next((mark for mark, count in counts.items() if count >= 3), None)
+    return next((mark for mark, count in counts.items() if count >= least - 1), None)
 
 
 def _is_number(text: str) -> bool:
@@ -94,8 +94,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def read_csv(text: str, columns: Columns, path: Path) -> None:
-    """Add the columns of a table of text; `path` is its address for messages.
+def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS) -> None:
+    """Add the columns of a table of text with `least` numbers in a row.
+
+    `path` is its address for messages.
 
     Raises:
         DataError: a line is too long for a table.
@@ -103,8 +105,8 @@ def read_csv(text: str, columns: Columns, path: Path) -> None:
     lines = [line for line in text.splitlines() if line.strip()]
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
-    delimiter = _delimiter(lines)
-    first = next((n for n, line in enumerate(lines) if sum(map(_is_number, line.split(delimiter))) >= 4), len(lines))
+    delimiter = _delimiter(lines, least)
+    first = next((n for n, line in enumerate(lines) if sum(map(_is_number, line.split(delimiter))) >= least), len(lines))
     rows = _fields(lines[first:], delimiter)
     width = max(map(len, rows), default=0)
     names, units = _header(lines[:first], delimiter, width)
@@ -123,6 +125,10 @@ def read_csv(text: str, columns: Columns, path: Path) -> None:
             columns.values[name], columns.units[name] = t_ns, "ns"
             if not texts[0].endswith(("Z", "UTC")) and not re.search(r":\d\d[.,\d]*[+-]", texts[0]):
                 columns.remarks.notes.append(f"{name}: its times name no zone and count as UTC")
+        elif len(set(texts)) == 1:
+            columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
+        else:
+            columns.remarks.losses.append(f"{name} is left out: its fields, as {texts[0][:40]!r}, are no numbers")
     if commas:
         columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
 

@@ -18,8 +18,8 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
+from imutool.recording.joined_imu import in_order
 from imutool.recording.message_log import MessageLog, Remarks, Table
-from imutool.recording.two_sensors import in_order
 
 from . import Sequence
 from ._archive import refusing
@@ -78,6 +78,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     timed = {name: c for name, c in columns.items() if "TimeUS" in (c.dtype.names or ())}
     if not timed:
         raise DataError("holds no messages with a time", where=sequence.path, expected="a log of ArduPilot")
+    if untimed := sorted(columns.keys() - timed.keys() - {"PARM"}):
+        remarks.losses.append(f"messages without a time are left out: {', '.join(untimed)}")
     poses = _poses(timed, remarks)
     return MessageLog(
         sequence.name,

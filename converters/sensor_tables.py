@@ -20,8 +20,8 @@ from jaxtyping import Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars
+from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
-from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._archive import is_zip, list_members, read_bounded, refusing
@@ -185,8 +185,10 @@ def _columns(
     files: _Files, path: str, clock: list[tuple[float, int]], where: Path, remarks: Remarks
 ) -> tuple[Int64[np.ndarray, " n"], dict[str, tuple[Float64[np.ndarray, " n"], str]]]:
     """Times of a table, and its other columns with their units, by plain names."""
-    columns = Columns(remarks=remarks)
-    read_csv(files.text(path), columns, Path(f"{where}/{path}"))
+    columns = Columns()
+    read_csv(files.text(path), columns, Path(f"{where}/{path}"), least=2)
+    remarks.notes.extend(columns.remarks.notes)
+    remarks.losses.extend(f"{path}: {loss}" for loss in columns.remarks.losses)
     named = {split_name(column): column for column in columns.values}
     times = next((key for key in named if key[0] == "time"), None)
     if times is None:
@@ -217,13 +219,14 @@ def _vector(
 
 
 def _others(files: _Files, path: str, clock: list[tuple[float, int]], where: Path, remarks: Remarks) -> dict[str, Scalars]:
-    """Columns of a further sensor; a table without numbers or time is a loss."""
+    """Columns of a further sensor; text and a table without time are a loss, a table without rows is none."""
     folder = re.sub(r"[^A-Za-z0-9_]+", "_", Path(path).stem).strip("_")
+    if folder.lower() == "metadata" or len(files.text(path).split("\n", 1)[-1].strip()) == 0:
+        return {}
     try:
-        t_ns, columns = _columns(files, path, clock, where, Remarks())
+        t_ns, columns = _columns(files, path, clock, where, remarks)
     except DataError as error:
-        if folder.lower() != "metadata":
-            remarks.losses.append(f"{path} is left out: it {error.what}")
+        remarks.losses.append(f"{path} is left out: it {error.what}")
         return {}
     scalars = {}
     for key, (values, unit) in columns.items():

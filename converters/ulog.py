@@ -22,8 +22,8 @@ from jaxtyping import Float64, Int64
 from imutool.errors import DataError, not_installed
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
+from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
-from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._files import find_files, head
@@ -217,7 +217,7 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
         return None
     t_ns, q_ned_frd = q.t_ns, quaternion.unit(q.values)
     p_wb, v_w = np.zeros((len(t_ns), 3)), None
-    if position is not None:
+    if position is not None and {*"xyz", "vx", "vy", "vz"} <= position.keys():
         moves = in_order(_sample_ns(position), _vectors(position, "y x z vy vx vz"), f"vehicle_local_position{ending}")
         if len(moves.t_ns) > 1:
             inside = (t_ns >= moves.t_ns[0]) & (t_ns <= moves.t_ns[-1])

@@ -1,7 +1,4 @@
-"""Evaluate pure integration, raw and with each model.
-
-The paper's error metrics for a log with true poses.
-"""
+"""Evaluate pure integration by the true poses of a log, raw and with each model."""
 
 from __future__ import annotations
 
@@ -28,6 +25,7 @@ from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, along_truth, drift
+from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 
@@ -68,8 +66,8 @@ def evaluate(
     recording = replace(recording, imu=measured_imu(recording.imu, f"{log} {recording.imu_topic}"))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    results = []
-    about = recording.metadata.get("imutool", {})
+    warn_of_recordings([recording])
+    results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
         found = _corrected(recording.imu, model, start)
         fit = judge(model, start, [relative_samples(recording.imu)], about) if model and start else None
@@ -127,18 +125,11 @@ def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> 
 
 
 def runs(
-    recording: Recording,
-    models: Sequence[str | Path],
-    init: str,
-    where: str | Path,
-    *,
-    smooth: bool = False,
-    refused: Refused | None = None,
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
-    check_smooth(init, smooth)
     yield RAW, _corrected(recording.imu, None, None), None
-    for name, model, start in started(recording, models, init, where, smooth=smooth, refused=refused):
+    for name, model, start in started(recording, models, init, where):
         yield name, apply(model, start, recording.imu), start
 
 

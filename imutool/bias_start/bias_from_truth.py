@@ -136,8 +136,8 @@ def _slope(error: Rows, by: Float64[np.ndarray, "n 3 3"], valid: Bool[np.ndarray
     X = np.concatenate([by[valid], np.broadcast_to(np.eye(3), (len(y), 3, 3))], axis=2)
     weight = np.ones(len(y))
     for _ in range(ITERATIONS):
-        root = np.sqrt(weight)
-        solution = np.linalg.lstsq((X * root[:, None, None]).reshape(-1, 6), (y * root[:, None]).ravel(), rcond=None)[0]
+        weighted = (X * weight[:, None, None]).reshape(-1, 6).T
+        solution = np.linalg.lstsq(weighted @ X.reshape(-1, 6), weighted @ y.ravel(), rcond=None)[0]
         size = quaternion.length(y - X @ solution)
         middle = (len(size) - 1) // 2
         limit = max(HUBER_MEDIANS * float(np.partition(size, middle)[middle]), 1e-9)

@@ -16,10 +16,11 @@ from jaxtyping import Float64, Int64
 from imutool.bias import static
 from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.fitness import Fitness, judge
+from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import (
     InitialBias,
     NoRestError,
@@ -31,9 +32,11 @@ from imutool.bias_start.initial_bias import (
 from imutool.bias_start.stretches import Sieve, measured
 from imutool.cleaning import Survey, cleaned
 from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.location import Location
+from imutool.log_info.conventions import warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
@@ -119,6 +122,8 @@ def choose_model_and_start(
 ) -> tuple[BiasModel, InitialBias]:
     """Bias model and initial bias for one IMU of a log."""
     untrained = name is None or str(name) == static.Model.method
+    if survey is None:
+        _warn_of_conventions(log, topic)
     first_minute = _first_minute(log, topic, init, survey)
     period_s = first_minute.imu.period_s
     if untrained and init == "auto" and not smooth:
@@ -132,6 +137,18 @@ def choose_model_and_start(
     else:
         start = find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
+
+
+def _warn_of_conventions(log: Log, topic: str) -> None:
+    """Warn of units, axes and frames that the start of a log shows to be other than those assumed."""
+    end_ns = _after(log, topic, CHECKED_S)
+    warn_of_conventions(_samples(log, topic, None, end_ns), read_truth(log, end_ns=end_ns), f"{log.path} {topic}")
+
+
+def _after(log: Log, topic: str, length_s: float) -> int | None:
+    """Log time so much after the first message of a topic; None without any."""
+    first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
+    return None if first is None else first + nanoseconds(length_s)
 
 
 def fitness_in_log(log: Log, topic: str, model: BiasModel, start: InitialBias, survey: Survey | None) -> Fitness:
@@ -186,8 +203,7 @@ class _Batches:
 
 def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:
     """First minute of a log, with truth only where `init` asks for it."""
-    first = next((int(times.min()) for times in log.stamps(topic) if len(times)), None)
-    end_ns = None if first is None else first + nanoseconds(HEAD_S)
+    end_ns = _after(log, topic, HEAD_S)
     samples = _samples(log, topic, survey, end_ns if survey is None else survey.start_ns + nanoseconds(HEAD_S))
     if init.partition(":")[0] == "truth":
         return read_recording(log, imu=topic, end_ns=end_ns, samples=samples)

@@ -184,7 +184,8 @@ def look(log: Log, topic: str, settings: CleaningSettings | None = None) -> Surv
         ConfigError: a rule is not known.
         LogError: no such IMU topic, or damage.
     """
-    return examine(lambda: raw_batches(log, topic), read_truth(log), settings, where=str(log.path), topic=topic)
+    name = log.topic(topic, (schemas.IMU,)).name  # of two joined topics that of their IMU
+    return examine(lambda: raw_batches(log, name), read_truth(log), settings, where=str(log.path), topic=name)
 
 
 def examine(
@@ -258,14 +259,14 @@ class _Counter:
             yield samples
 
 
-def raw_batches(log: Log, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[ImuBatch]:
+def raw_batches(log: Log, topic: str, end_ns: int | None = None) -> Iterator[ImuBatch]:
     """Messages of an IMU as recorded, in file order, with unchecked values.
 
     Raises:
         LogError: no such IMU topic, another encoding, or damage.
     """
     described = log.topic(topic, (schemas.IMU,))
-    for rows in messages.joined(rows for _, rows in log.rows([described.name], start_ns, end_ns)):
+    for rows in messages.joined(rows for _, rows in log.rows([described.name], end_ns=end_ns)):
         with log.named(described.name):
             yield from described.decode_imu(rows)
 

@@ -10,11 +10,15 @@ from jaxtyping import Float64, Int64
 
 from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
+from imutool.mcap_io.codec.schemas import TF
 from imutool.mcap_io.log import Log
-from imutool.recording import Poses, seconds
+from imutool.recording import Poses, Recording, seconds
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
+
+
+FEWEST = 3  # poses that show an acceleration
 
 
 class Truth(NamedTuple):
@@ -28,17 +32,24 @@ class Truth(NamedTuple):
 
 
 def read_truth(
-    log: Log, refused: Callable[[str, LogError], None] | None = None, topics: Sequence[str] | None = None
+    log: Log,
+    refused: Callable[[str, LogError], None] | None = None,
+    topics: Sequence[str] | None = None,
+    end_ns: int | None = None,
 ) -> Truth | None:
     """Poses of the first readable topic of the true ones, or of `topics`; None below three.
 
+    They reach to `end_ns`. A transform of a topic is named as TOPIC/CHILD_FRAME.
     `refused` is called with each topic before it that cannot be read, and with the error.
     """
     for topic in log.truth_topics if topics is None else topics:
         times, places, turns = [], [], []
         last = -(2**62)
+        named = topic if topic in log.topics else next(t.name for t in log.with_schema((TF,)) if topic.startswith(f"{t.name}/"))
         try:
-            for batch in log.pose_batches(topic):
+            for batch in log.pose_batches(named, end_ns=end_ns):
+                if topic not in (named, f"{named}/{batch.child_frame_id.lstrip('/')}"):
+                    continue
                 keep = _thinned(batch.stamp_ns, last)
                 if len(keep):
                     last = int(batch.stamp_ns[keep[-1]])
@@ -49,21 +60,26 @@ def read_truth(
             if refused is not None:
                 refused(topic, error)
             continue
-        if sum(map(len, times)) >= 3:
-            q_wxyz = np.concatenate(turns)
-            norm = np.linalg.norm(q_wxyz, axis=1)
-            good = norm > 0.5
+        q_wxyz = np.concatenate([np.zeros((0, 4)), *turns])
+        norm = np.linalg.norm(q_wxyz, axis=1)
+        good = norm > 0.5
+        if good.sum() >= FEWEST:
             columns = np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None]
-            return Truth(topic, *columns, log.topics[topic].pose_kind)
+            return Truth(topic, *columns, log.topics[named].pose_kind)
     return None
 
 
-def of_poses(topic: str, poses: Poses) -> Truth | None:
-    """True poses at 10 Hz of poses in memory; None with fewer than three."""
-    if len(poses) < 3:
-        return None
+def of_poses(topic: str, poses: Poses, kind: str = "truth") -> Truth | None:
+    """Poses in memory at 10 Hz; None with fewer than three."""
     keep = _thinned(poses.t_ns, -(2**62))
-    return Truth(topic, poses.t_ns[keep], poses.p_wb[keep], poses.q_wb_wxyz[keep])
+    if len(keep) < FEWEST:
+        return None
+    return Truth(topic, poses.t_ns[keep], poses.p_wb[keep], poses.q_wb_wxyz[keep], kind)
+
+
+def truth_of(recording: Recording) -> Truth | None:
+    """First poses of a recording at 10 Hz; None without any."""
+    return next((of_poses(topic, poses, recording.kind_of(topic)) for topic, poses in recording.truths.items()), None)
 
 
 def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarray, " m"]:

@@ -88,6 +88,7 @@ def debias(
     clean: Annotated[bool, typer.Option(help="Also clean the IMU; skip logs that cannot be trusted.")] = True,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
+    imu: Imu = None,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
     from imutool.bias_start.model_choice import check_smooth
@@ -101,7 +102,7 @@ def debias(
 
         require_matplotlib()
     start = {"init": init, "smooth": smooth, "force": force}
-    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages)  # type: ignore[arg-type]
+    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imu=imu)  # type: ignore[arg-type]
     return with_model_hash(settings)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
-from imutool.diagnosis.audit.audit import simulator_remarks
+from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
@@ -44,6 +44,7 @@ from imutool.diagnosis.signals.compared_signals import with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
+from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -83,6 +84,7 @@ def diagnose(
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
     logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
+    warn_of_recordings(recordings)
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
@@ -206,7 +208,6 @@ def effect_sizes(
     imu: str | None = None,
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
-    settings: DiagnoseSettings | None = None,
 ) -> EffectSizes:
     """Fit effects of the catalogue to a recording, significant or not.
 
@@ -215,8 +216,7 @@ def effect_sizes(
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
-    simulated = None if sim is None else read_log(sim, imu=imu)
-    settings = settings or DiagnoseSettings()
+    simulated, settings = None if sim is None else read_log(sim, imu=imu), DiagnoseSettings()
     aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)

@@ -84,7 +84,7 @@ def hat(v: Vectors) -> Rotations:
 def exp(xi: Vectors) -> Rotations:
     """Rotation Exp(xi) = I + sin(a)/a [xi]x + (1 - cos a)/a² [xi]x², a = |xi| (Rodrigues)."""
     s = _squared(xi)
-    return _quadratic(xi, s, _sinc(s), _versine(s))
+    return _quadratic(xi, _sinc(s), _versine(s))
 
 
 def log(R: Rotations) -> Vectors:
@@ -105,7 +105,7 @@ def right_jacobian_inverse(xi: Vectors) -> Rotations:
     It is defined for |xi| < 2 pi and grows as 2 pi / (2 pi - |xi|) towards this limit; `ode.integrate` checks it.
     """
     s = _squared(xi)
-    return _quadratic(xi, s, torch.full_like(s, 0.5), _half_cot(s))
+    return _quadratic(xi, torch.full_like(s, 0.5), _half_cot(s))
 
 
 def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
@@ -141,11 +141,14 @@ def matrix_from_quaternion_wxyz(q_wxyz: Quaternions) -> Rotations:
     return torch.eye(3, dtype=q.dtype, device=q.device) + 2.0 * w * skew + 2.0 * (skew @ skew)
 
 
-def _quadratic(xi: Vectors, s: Angles2, linear: Angles2, square: Angles2) -> Rotations:
-    """I + linear [xi]x + square [xi]x², with [xi]x² = xi xi^T - s I."""
-    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
-    outer = xi.unsqueeze(-1) * xi.unsqueeze(-2)
-    return (1.0 - square * s)[..., None, None] * eye + linear[..., None, None] * hat(xi) + square[..., None, None] * outer
+def _quadratic(xi: Vectors, linear: Angles2, square: Angles2) -> Rotations:
+    """I + linear [xi]x + square [xi]x², with [xi]x² = xi xi^T - s I; by entries, at half the cost of matrices."""
+    x, y, z = xi.unbind(-1)
+    a, b, c = (linear.unsqueeze(-1) * xi).unbind(-1)
+    u, v, w = (square.unsqueeze(-1) * xi).unbind(-1)
+    xx, yy, zz, xy, xz, yz = u * x, v * y, w * z, u * y, u * z, v * z
+    flat = [1.0 - yy - zz, xy - c, xz + b, xy + c, 1.0 - xx - zz, yz - a, xz - b, yz + a, 1.0 - xx - yy]
+    return torch.stack(flat, dim=-1).reshape(*xi.shape[:-1], 3, 3)
 
 
 def _squared(v: Float[Tensor, "*batch n"]) -> Angles2:

@@ -28,15 +28,17 @@ def step_means(u: Samples) -> Float[Tensor, "batch n-1 3"]:
 
 
 def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch n 3 3"]:
-    """Products `increments[0] @ ... @ increments[k]` for every k, in log2(n) passes.
+    """Products `increments[0] @ ... @ increments[k]` for every k, two for each.
 
-    Hillis and Steele's scan.
+    Blelloch's scan.
     """
-    shift = 1
-    while shift < increments.shape[1]:
-        increments = torch.cat([increments[:, :shift], increments[:, :-shift] @ increments[:, shift:]], dim=1)
-        shift *= 2
-    return increments
+    if increments.shape[1] < 2:
+        return increments
+    products = torch.empty_like(increments)
+    products[:, 1::2] = odd = running_product(increments[:, :-1:2] @ increments[:, 1::2])
+    products[:, :1], later = increments[:, :1], increments[:, 2::2]
+    products[:, 2::2] = odd[:, : later.shape[1]] @ later
+    return products
 
 
 def whole_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch 3 3"]:

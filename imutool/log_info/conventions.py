@@ -1,11 +1,13 @@
-"""Units, axes, and the poses' world, clock and agreement with the gyro, by the motion."""
+"""Units, axes, and the poses' world, clock, coverage and agreement with the gyro."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int64
 
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
@@ -13,10 +15,14 @@ from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import Motion, Samples
-from imutool.cleaning.truth import Truth, turning
+from imutool.cleaning.truth import Truth, truth_of, turning
 from imutool.cleaning.unit_evidence import accel_reading
-from imutool.log_info.report import Convention
-from imutool.recording import Imu, seconds
+from imutool.errors import LogError
+from imutool.log_info.report import Convention, TruthInfo
+from imutool.mcap_io.log import Log
+from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds, seconds
+
+logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
 NO_TURN = "the motion turns too little, or about one axis only"
@@ -35,6 +41,18 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
     findings = [*Units().findings(whole), *Axes().findings(whole)]
     fix = "; imutool convert LOG OUT --fix corrects it"
     return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
+
+
+def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
+    """Log the warnings about units, axes and frames for whoever uses the samples as they are."""
+    for warning in convention_warnings(convention_summary(imu, truth)) if len(imu) else []:
+        logger.warning("%s: %s", where, warning)
+
+
+def warn_of_recordings(recordings: Iterable[Recording]) -> None:
+    """Log those warnings for recordings in memory."""
+    for recording in recordings:
+        warn_of_conventions(recording.imu, truth_of(recording), f"{recording.name} {recording.imu_topic}")
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:
@@ -113,3 +131,41 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
     rms = float(np.sqrt(((gyro - omega @ turn.T) ** 2).sum(axis=1).mean()))
     return Agreement(rms, max(0.0, 1.0 - (rms / motion) ** 2))
+
+
+def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]]]:
+    """Children of frames without a parent, as TOPIC/CHILD_FRAME, with their stamps."""
+    found: dict[tuple[str, str], list[Int64[np.ndarray, "..."]]] = {}
+    try:
+        for batch in log.pose_batches(topic):
+            found.setdefault((batch.frame_id.lstrip("/"), batch.child_frame_id.lstrip("/")), []).append(batch.stamp_ns)
+    except LogError as error:
+        logger.warning("%s %s: %s", log.path, topic, error.what)
+    children = {child for _, child in found}
+    return [(f"{topic}/{child}", np.concatenate(stamps)) for (parent, child), stamps in found.items() if parent not in children]
+
+
+def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
+    """Truth coverage: share of the IMU's time between neighbouring true poses."""
+    knots = np.unique(truth_ns)
+    if len(knots) < 2 or not len(imu_ns):
+        return TruthInfo(topic, len(truth_ns), kind)
+    start, end = int(imu_ns.min()), int(imu_ns.max())
+    steps = np.diff(knots)
+    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
+    gap = (steps > limit) & (knots[1:] > start) & (knots[:-1] < end)
+    after = np.searchsorted(knots, imu_ns, side="left")
+    inside = (imu_ns >= knots[0]) & (imu_ns <= knots[-1])
+    known = inside & (
+        (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
+    )
+    return TruthInfo(
+        topic,
+        len(truth_ns),
+        kind,
+        coverage=float(known.mean()),
+        gaps=int(gap.sum()),
+        longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
+        starts_after_s=float(knots[0] - start) * 1e-9,
+        ends_before_s=float(end - knots[-1]) * 1e-9,
+    )

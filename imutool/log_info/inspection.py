@@ -21,13 +21,20 @@ from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
-from imutool.log_info.conventions import agreement, convention_summary, convention_warnings, conventions
+from imutool.log_info.conventions import (
+    agreement,
+    convention_summary,
+    convention_warnings,
+    conventions,
+    coverage,
+    transforms,
+)
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
-from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, nanoseconds
+from imutool.recording import Imu
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.report import UNSET
 from imutool.units import SENSORS
@@ -65,7 +72,13 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     imus = [_imu(log, topic, true_poses) for topic in log.topics.values() if topic.schema_name == schemas.IMU]
     own = [imu for imu in imus if imu.derived_from is UNSET]
     imu_ns = clocks[own[0].topic] if own else np.empty(0, np.int64)
-    truths = [_coverage(log.topics[name], clocks[name], imu_ns) for name in log.pose_topics]
+    truths = [
+        coverage(pose, topic.pose_kind, stamp_ns, imu_ns)
+        for topic in map(log.topics.__getitem__, log.pose_topics)
+        for pose, stamp_ns in (
+            transforms(log, topic.name) if topic.schema_name == schemas.TF else [(topic.name, clocks[topic.name])]
+        )
+    ]
     if check and own and truths and log.topics[own[0].topic].is_read:
         samples = _sound(*_columns(log, own[0].topic))
         truths = [_against_gyro(log, truth, samples) for truth in truths]
@@ -240,36 +253,8 @@ def _imu_warnings(
     return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 
-def _coverage(topic: Topic, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
-    """Truth coverage: share of the IMU's time between neighbouring true poses."""
-    knots = np.unique(truth_ns)
-    if len(knots) < 2 or not len(imu_ns):
-        return TruthInfo(topic.name, len(truth_ns), topic.pose_kind)
-    start, end = int(imu_ns.min()), int(imu_ns.max())
-    steps = np.diff(knots)
-    limit = max(GAP_FACTOR * float(np.median(steps)), nanoseconds(MIN_GAP_S))  # 4 median periods, 60 ms
-    gap = (steps > limit) & (knots[1:] > start) & (knots[:-1] < end)
-    after = np.searchsorted(knots, imu_ns, side="left")
-    inside = (imu_ns >= knots[0]) & (imu_ns <= knots[-1])
-    known = inside & (
-        (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
-    )
-    return TruthInfo(
-        topic.name,
-        len(truth_ns),
-        topic.pose_kind,
-        coverage=float(known.mean()),
-        gaps=int(gap.sum()),
-        longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
-        starts_after_s=float(knots[0] - start) * 1e-9,
-        ends_before_s=float(end - knots[-1]) * 1e-9,
-    )
-
-
 def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
-    """Report on poses with their agreement with the gyro, where both show motion; /tf holds poses of several frames."""
-    if log.topics[truth.topic].schema_name == schemas.TF:
-        return truth
+    """Report on poses with their agreement with the gyro, where both show motion."""
     poses = read_truth(log, topics=[truth.topic])
     found = None if poses is None else agreement(poses, imu)
     return (

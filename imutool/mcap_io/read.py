@@ -96,7 +96,9 @@ def read_recording(
         metadata=metadata,
         imu_topic=imu_topic,
         source=own.get("source", ""),
-        other_poses={t: k for t in log.pose_topics if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths},
+        other_poses={
+            t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths
+        },
     )
 
 
@@ -202,10 +204,8 @@ class _Columns:
     def truths(self, wanted: str | None) -> dict[str, Poses]:
         names: list[str] = []
         for topic in (name for name in self.truth_topics if name not in self.left_out):
-            if self.log.topics[topic].schema_name == schemas.TF:
-                names += [name for name in self.kept if name.startswith(f"{topic}/")]
-            else:
-                names.append(topic)
+            tree = self.log.topics[topic].schema_name == schemas.TF
+            names += [name for name in self.kept if name.startswith(f"{topic}/")] if tree else [topic]
         if wanted is not None and wanted not in self.log.topics:
             if wanted not in names:
                 raise LogError(

@@ -24,10 +24,11 @@ from imutool.mcap_io.codec.decode import (
 )
 from imutool.mcap_io.codec.joined_imu import JoinedImu, Vectors, whole_of
 from imutool.mcap_io.codec.messages import Messages, Rows
-from imutool.mcap_io.codec.reflection import Reflected, reflect, reflect_cdr
+from imutool.mcap_io.codec.reflection import Reflected, format_of, reflect, reflect_cdr
+from imutool.mcap_io.codec.transforms import TYPE, Transforms
 from imutool.mcap_io.index import LogIndex
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
-from imutool.recording.two_sensors import joined
 
 ENCODINGS = ("cdr", "ros1")
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses
@@ -53,7 +54,7 @@ class Topic:
     message_encoding: str
     count: int
     metadata: Mapping[str, str]
-    reflected: Reflected | JoinedImu | None = None
+    reflected: Reflected | JoinedImu | Transforms | None = None
     own_schema: str = ""  # name in the log of the type of a reflected IMU or pose
     gyro_topic: str = ""  # of an IMU joined of two topics, whose messages stand for its own
 
@@ -236,9 +237,15 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
         if topic.message_encoding not in REFLECTED or RECORDED_KEY in topic.metadata:
             continue
         definition = definitions[name]
+        schema = definition.data if definition else b""
         try:
+            if (several := TYPE.fullmatch(topic.schema_name)) and (
+                form := format_of(topic.message_encoding, topic.schema_name, schema)
+            ):
+                found[name] = _as_ros(topic, Transforms(form, bool(several[1])))
+                continue
             raw = first(name) if topic.message_encoding == "json" else None
-            message = reflect(topic.message_encoding, name, topic.schema_name, definition.data if definition else b"", raw)
+            message = reflect(topic.message_encoding, name, topic.schema_name, schema, raw)
         except ImportError:
             continue
         if message is not None:
@@ -253,7 +260,7 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
     return found
 
 
-def _as_ros(topic: Topic, message: Reflected) -> Topic:
+def _as_ros(topic: Topic, message: Reflected | Transforms) -> Topic:
     return replace(topic, schema_name=message.schema_name, reflected=message, own_schema=topic.schema_name)
 
 

@@ -188,10 +188,15 @@ class Recording:
             raise self.no_truth("no true poses")
         return next(iter(self.truths.values()))
 
+    def kind_of(self, topic: str) -> str:
+        """What poses are worth; those of a transform, TOPIC/CHILD_FRAME, what their topic is."""
+        others = self.other_poses.items()
+        return next((kind for other, kind in others if topic == other or topic.startswith(f"{other}/")), "truth")
+
     @property
     def truth_caveat(self) -> str:
         """Caveat on poses that were asked for and are no truth; else empty."""
-        chosen = [f"{topic} ({self.other_poses[topic]})" for topic in self.truths if topic in self.other_poses]
+        chosen = [f"{topic} ({kind})" for topic in self.truths if (kind := self.kind_of(topic)) != "truth"]
         return f"{', '.join(chosen)} is no truth: poses made with this IMU hide errors of it" if chosen else ""
 
     def no_truth(self, what: str, expected: str = "a pose topic in the log") -> DataError:

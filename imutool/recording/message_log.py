@@ -24,6 +24,8 @@ KIND_WORDS = {  # in the names of topics
     "odometry": "odom|odometry|wheel|wheels|encoder|encoders",
 }
 
+ESTIMATED = r"PoseWithCovarianceStamped$|TFMessage$|FrameTransforms?$"  # a filter states its covariance, or moves the frames
+
 
 @dataclass(frozen=True)
 class MessageTopic:
@@ -78,7 +80,7 @@ def named_kind(topic: str, schema_name: str) -> str:
             return kind
     if re.search(r"[/.]Odometry$", f"/{schema_name}"):
         return "odometry"
-    return "estimate" if schema_name.endswith("PoseWithCovarianceStamped") else "unknown"  # a filter states its covariance
+    return "estimate" if re.search(ESTIMATED, schema_name) else "unknown"
 
 
 def no_messages() -> Iterator[Message]:

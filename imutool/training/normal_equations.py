@@ -175,11 +175,14 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, len(width))
+    terms = torch.from_numpy(_terms(seen.signals, effects)).to(seen.pool.t)
+    pattern = torch.from_numpy(patterns(effects)).to(seen.pool.t)
     for step in range(len(sets) + 2):
         fit = judged = Equations.none(prior, logs, len(prior) + len(width))
         size = prior.new_zeros(logs)
+        error = terms @ torch.einsum("iqp,p->qi", pattern, theta)
         for windows in sets[: step + 1]:
-            equations, size = _equations(seen, effects, theta, own, windows, size)
+            equations, size = _equations(seen, terms, pattern, error, own, windows, size)
             fit = fit + equations
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
@@ -219,16 +222,15 @@ def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
 
 def _equations(
     seen: Seen,
-    effects: Sequence[LinearForm],
-    theta: Float[Tensor, " p"],
+    terms: Float[Tensor, "n q"],
+    pattern: Float[Tensor, "3 q p"],
+    error: Float[Tensor, "n 3"],
     own: Float[Tensor, "logs o"],
     windows: WindowSet,
     shorter: Float[Tensor, " logs"],
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
     """Normal equations of the windows of one length, and their usual residual; `shorter` is that of shorter windows."""
     pool, n = seen.pool, windows.n
-    error = _error(seen.signals, effects, theta.cpu().numpy()).to(pool.t)
-    pattern = torch.from_numpy(patterns(effects)).to(pool.t)
     residuals, slopes = [], []
     for some in torch.split(windows.first, max(1, CHUNK // n)):
         index = some[:, None] + torch.arange(n + 1, device=some.device)
@@ -236,9 +238,9 @@ def _equations(
         u = pool.gyro if seen.sensor == "gyro" else pool.accel
         true_u = u[index] - error[index] - own[cut.log, None, :3]
         e, A, by_nuisance = _residual(seen, cut, true_u, index, own)
-        terms = torch.from_numpy(_terms(seen.signals, effects, index.cpu().numpy())).to(pool.t)
-        terms = 0.5 * (terms[:, :-1] + terms[:, 1:]) if seen.sensor == "gyro" else terms  # rates hold between samples
-        S = A.permute(0, 2, 3, 1).flatten(1, 2) @ terms
+        each = terms[index]
+        each = 0.5 * (each[:, :-1] + each[:, 1:]) if seen.sensor == "gyro" else each  # rates hold between samples
+        S = A.permute(0, 2, 3, 1).flatten(1, 2) @ each
         by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
         residuals.append(e)
         slopes.append(torch.cat([by_theta, A.sum(1), by_nuisance], dim=2))
@@ -280,18 +282,10 @@ def _summed(
     return Equations(H, g, c), usual
 
 
-def _terms(
-    signals: Signals, effects: Sequence[LinearForm], index: Int[np.ndarray, "*shape"]
-) -> Float64[np.ndarray, "*shape q"]:
-    """Terms of the effects at some samples."""
-    rows = signals.rows(index.ravel())
-    parts = [np.zeros((index.size, 0)), *(effect.terms(rows) for effect in effects)]
-    return np.concatenate(parts, axis=1).reshape(*index.shape, -1)
-
-
-def _error(signals: Signals, effects: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> Float[Tensor, "n 3"]:
-    """Error of every sample, a chunk at a time."""
-    matrix = np.einsum("iqp,p->qi", patterns(effects), theta)
-    rows = np.arange(len(signals.t_s))
-    starts = range(0, len(rows), CHUNK)
-    return torch.from_numpy(np.concatenate([_terms(signals, effects, rows[k : k + CHUNK]) @ matrix for k in starts]))
+def _terms(signals: Signals, effects: Sequence[LinearForm]) -> Float64[np.ndarray, "n q"]:
+    """Terms of the effects at all samples, a chunk at a time."""
+    out = np.empty((len(signals.t_s), sum(effect.pattern.shape[1] for effect in effects)))
+    for rows in (slice(k, k + CHUNK) for k in range(0, len(out), CHUNK)):
+        some = signals.rows(rows)
+        np.concatenate([np.zeros((len(some.t_s), 0)), *(effect.terms(some) for effect in effects)], axis=1, out=out[rows])
+    return out

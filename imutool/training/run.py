@@ -20,6 +20,7 @@ from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import rotation_residual
+from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
@@ -84,9 +85,9 @@ def train(
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
     recordings = [measured_recording(read(log, imu=imu, truth=truth)) for log in logs]
-    for recording in recordings:
-        if recording.truth_caveat:
-            logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
+    warn_of_recordings(recordings)
+    for recording in (recording for recording in recordings if recording.truth_caveat):
+        logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
     say = progress or (lambda epoch: None)
     descent = _Descent(kept, resume, device, say)
@@ -213,7 +214,7 @@ def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording],
 
 def _kind(recording: Recording) -> str:
     """What the poses that a model was trained on are worth."""
-    return recording.other_poses.get(next(iter(recording.truths), ""), "truth")
+    return recording.kind_of(next(iter(recording.truths), ""))
 
 
 def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:

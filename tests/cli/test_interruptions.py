@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.processes import soon
 
 from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
@@ -125,7 +126,7 @@ MOMENTS = [
     *((name, signal.SIGINT) for name in ("export", "save")),
     *((name, signal.SIGTERM) for name in ("convert", "debias", "save")),
     *((name, signal.SIGKILL) for name in ("convert", "debias", "export", "view")),
-]  # fleets: tests/fleet/test_fleet.py; Ctrl-C in convert, debias and train: tests/test_bad_input.py
+]  # Ctrl-C in convert, debias and train: tests/test_bad_input.py
 
 
 @pytest.mark.parametrize(("name", "number"), MOMENTS, ids=lambda value: getattr(value, "name", value))
@@ -138,7 +139,7 @@ def test_a_signal_in_the_middle(here: Path, command: str, imutool: Run, name: st
             break
         shutil.rmtree(here / target) if (here / target).is_dir() else (here / target).unlink()
     assert "Traceback" not in stderr
-    assert code == {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED, signal.SIGKILL: KILLED}[number], stderr
+    assert code == CODES[number], stderr
     assert seconds < SOON_S + SLACK_S
     left = partials(here)
     if number != signal.SIGKILL:
@@ -178,6 +179,47 @@ def test_no_child_is_left_soon_after_sigterm(tmp_path: Path, command: str) -> No
     assert "Traceback" not in process.communicate(timeout=WAIT_S)[1]
     assert process.returncode == TERMINATED
     assert all(path.suffix == ".mcap" for path in (tmp_path / "out").rglob("*"))
+
+
+AT_WORK: dict[str, Sequence[str]] = {
+    **{name: WRITERS[name][0] for name in ("train", "diagnose", "live")},
+    "audit": ["audit", "in.mcap", "--json", "out.json"],
+    "view --web": ["view", "in.mcap", "--web"],
+}  # fleets: tests/fleet/test_fleet.py
+CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED, signal.SIGKILL: KILLED}
+READING_FOR_EVER = """
+import pathlib, sys, time
+from imutool.cli import main
+from imutool.mcap_io.storage.source import Source
+def read(source, offset, length):
+    pathlib.Path("reading").touch()
+    time.sleep(600)
+Source._read = read
+main()
+"""
+
+
+@pytest.mark.parametrize("name", AT_WORK)
+def test_a_signal_while_the_input_is_read(here: Path, name: str) -> None:
+    """Three runs at once, each with a signal of its own: the exit code is the signal's, and nothing is left."""
+    runs = {}
+    for number in CODES:
+        (folder := here / number.name).mkdir()
+        shutil.copy(here / "in.mcap", folder)
+        words = [sys.executable, "-c", READING_FOR_EVER, *AT_WORK[name], "-q"]
+        runs[number] = subprocess.Popen(words, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    before = digests(here)
+    for number, run in runs.items():
+        soon((here / number.name / "reading").exists)
+        run.send_signal(number)
+        began = time.monotonic()
+        _, stderr = run.communicate(timeout=WAIT_S)
+        assert time.monotonic() - began < SOON_S + SLACK_S
+        assert run.returncode == CODES[number], stderr
+        assert "Traceback" not in stderr
+        assert session(run.pid) == []
+        (here / number.name / "reading").unlink()
+    assert {path: digest for path, digest in digests(here).items() if ".partial" not in path} == before
 
 
 IMPORTED_FIRST = ("imutool.cli.parameters", "typer.core", "rich.console", "imutool.cli.app", "imutool.report")

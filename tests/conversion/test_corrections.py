@@ -24,7 +24,7 @@ NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 @pytest.fixture(scope="module")
 def made() -> Recording:
-    return flight(3, duration_s=40.0)
+    return flight(3, duration_s=20.0, rate_hz=100.0, truth_rate_hz=50.0)
 
 
 def in_ned(poses: Poses) -> Poses:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from base64 import b64decode
 from pathlib import Path
@@ -31,6 +32,7 @@ def as_json(n: int, t_ns: int) -> bytes:
     return json.dumps({"timestamp": stamp, "frame_id": "imu", "angularVelocity": xyz[0], "linearAcceleration": xyz[1]}).encode()
 
 
+@functools.cache
 def protobuf_type() -> tuple[bytes, Any]:
     """A made-up robot's own IMU message, as a descriptor set and a class."""
     file = descriptor_pb2.FileDescriptorProto(name="robot.proto", package="robot", syntax="proto3")
@@ -60,11 +62,16 @@ def as_protobuf(n: int, t_ns: int) -> bytes:
     return message.SerializeToString()
 
 
+@functools.cache
+def flatbuffer() -> FlatBuffer:
+    return FlatBuffer.of("acme.ImuSample", BFBS)
+
+
 def as_flatbuffer(n: int, t_ns: int) -> bytes:
     stamp = zip((("header", "stamp", "sec"), ("header", "stamp", "nsec")), divmod(t_ns, 10**9), strict=True)
     vectors = (("angular_velocity", GYRO), ("linear_acceleration", ACCEL))
     values = [((name, axis), row[n, k]) for name, row in vectors for k, axis in enumerate("xyz")]
-    return FlatBuffer.of("acme.ImuSample", BFBS).new([*stamp, *values])
+    return flatbuffer().new([*stamp, *values])
 
 
 def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:

@@ -23,7 +23,7 @@ GRAVITY = np.tile([0.0, 0.0, 9.80665], (COUNT, 1))
 def sensor_logger(values: np.ndarray) -> str:
     """Table of Sensor Logger: z before y before x."""
     rows = [
-        f"{t},{(t - T_NS[0]) * 1e-9!r},{z!r},{y!r},{x!r}" for t, (x, y, z) in zip(T_NS.tolist(), values.tolist(), strict=True)
+        f"{t},{(t - T_NS[0]) * 1e-9:.9f},{z!r},{y!r},{x!r}" for t, (x, y, z) in zip(T_NS.tolist(), values.tolist(), strict=True)
     ]
     return "\n".join(["time,seconds_elapsed,z,y,x", *rows]) + "\n"
 
@@ -87,6 +87,21 @@ def test_a_phones_zip_becomes_an_imu_in_si_units(convert, tmp_path, phone):
     np.testing.assert_allclose(recording.imu.accel, GRAVITY + MOTION, rtol=1e-9, atol=1e-12)
     assert ("sign was turned" in done.stderr) == ("ios" in phone)
     assert ("/Magnetometer/x" in recording.scalars) == ("android" in phone)
+
+
+def test_narrow_tables_are_kept_empty_ones_are_no_loss_and_texts_are_named(convert, tmp_path):
+    more = {
+        "Light.csv": "time,seconds_elapsed,lux\n1600000000100000000,0.1,120\n1600000000200000000,0.2,121\n",
+        "Annotation.csv": "time,seconds_elapsed,text,millisecond_press_duration\n",
+    }
+    path = pack(tmp_path / "walk.zip", PHONES["sensor logger, android"] | more)
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert read(tmp_path / "out.mcap").scalars["/Light/lux"].values[:, 0].tolist() == [120.0, 121.0]
+    more["Annotation.csv"] += "1600000000100000000,0.1,start,20\n1600000000300000000,0.3,end,20\n"
+    done = convert(pack(path, PHONES["sensor logger, android"] | more), tmp_path / "text.mcap")
+    assert done.returncode == 3
+    assert "Annotation.csv: text is left out: its fields, as 'start', are no numbers" in done.stderr
 
 
 def test_an_unpacked_folder_reads_as_its_zip_and_other_zips_are_none(convert, tmp_path):

@@ -6,11 +6,13 @@ import datetime
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from fuzz import kinds, run_case
+from fuzz import kinds
+from fuzz.logs import Damage, Original, exchange, join, judged, length, overlap, overwrite, pair, record, remove
 
 TOTAL_S = float(os.environ.get("IMUTOOL_FUZZ_SECONDS", "60" if os.environ.get("CI") else "15"))  # over all kinds
 SEED = os.environ.get("IMUTOOL_FUZZ_SEED", datetime.datetime.now(datetime.UTC).date().isoformat())
@@ -26,19 +28,80 @@ def test_no_input_breaks_a_promise(kind: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-# inputs that broke a promise once: what they are, with the draw that makes them
-FOUND = {
-    "a chunk of another log before all definitions": ("logs", "2026-11-21", 522),
-    "a definition of a damaged chunk whose topic got another name": ("logs", "2026-11-24", 217),
-    "a channel and its schema of two logs": ("logs", "2026-11-24", 76),
-    "the same summary twice, the first one cut off": ("logs", "2026-11-24", 230),
-    "another log behind a gap, whose first channel the log does not have": ("logs", "2026-11-25", 65),
-    "a schema that was cut off by a chunk": ("logs", "2026-11-25", 412),
-    "another log behind a gap, of which a channel is not defined": ("logs", "2026-11-26", 99),
-    "bytes of a damaged chunk that look like a schema": ("logs", "harm-29", 20),
+# ── inputs that broke a promise once: of two whole logs `a` and `b`, as bytes ──
+
+Craft = Callable[[Original, Original], bytes]
+
+
+def over(raw: bytes, at: int, new: bytes) -> bytes:
+    """The bytes with a stretch overwritten."""
+    return raw[:at] + new + raw[at + len(new) :]
+
+
+def exchanged(raw: bytes, first: tuple[int, int], second: tuple[int, int]) -> bytes:
+    """The bytes with two stretches in each other's place."""
+    (a, b), (c, d) = first, second
+    return raw[:a] + raw[c:d] + raw[b:c] + raw[a:b] + raw[d:]
+
+
+def flipped(raw: bytes, bits: dict[int, int]) -> bytes:
+    """The bytes with some bits flipped, by place."""
+    return bytes(byte ^ bits.get(at, 0) for at, byte in enumerate(raw))
+
+
+def with_summary(raw: bytes, a: Original, b: Original) -> bytes:
+    """The bytes with the summary of `b` where that of `a` was."""
+    return raw[: len(raw) - len(a.summary)] + b.summary
+
+
+FOUND: dict[str, tuple[int, tuple[Damage, ...], Craft]] = {
+    "a chunk of another log before all definitions": (
+        19,
+        (record,),
+        lambda a, b: a.raw[:46] + b.raw[1818:2326] + a.raw[46:],
+    ),
+    "a definition of a damaged chunk whose topic got another name": (
+        19,
+        (join,),
+        lambda a, b: over(flipped(a.raw, {820: 2, 2311: 4}), 5369, bytes(60)) + b.raw,
+    ),
+    "a channel and its schema of two logs": (
+        6,
+        (overlap,),
+        lambda a, b: over(a.raw[:1030] + b.raw[1030:], 3000, b.raw[155:3155]),
+    ),
+    "the same summary twice, the first one cut off": (
+        7,
+        (overlap,),
+        lambda a, b: with_summary(over(a.raw[:5586] + b.raw[5586:], 1231, (5).to_bytes(8, "little")), a, b),
+    ),
+    "another log behind a gap, whose first channel the log does not have": (
+        11,
+        (overwrite,),
+        lambda a, b: over(over(a.raw[:46] + a.raw[1112:], 5055, b.raw[:4755]), 9341, b.raw[:469]),
+    ),
+    "a schema that was cut off by a chunk": (
+        4,
+        (remove, exchange),
+        lambda a, b: exchanged(a.raw[:3915] + a.raw[4275:], (46, 530), (3915, 4275)),
+    ),
+    "another log behind a gap, of which a channel is not defined": (
+        23,
+        (overwrite,),
+        lambda a, b: over(a.raw, 8352, b.raw[464:3464]),
+    ),
+    "bytes of a damaged chunk that look like a schema": (
+        14,
+        (remove, exchange, length),
+        lambda a, b: over(
+            exchanged(a.raw[:1466] + a.raw[2571:], (46, 1262), (2793, 4134)), 4024, (2**62).to_bytes(8, "little")
+        ),
+    ),
 }
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_what_was_found_stays_mended(name: str) -> None:
-    assert run_case(*FOUND[name]) == []
+def test_what_was_found_stays_mended(tmp_path: Path, name: str) -> None:
+    number, damages, craft = FOUND[name]
+    (tmp_path / "log.mcap").write_bytes(craft(*pair(number)))
+    assert list(judged(tmp_path / "log.mcap", tmp_path / "out.mcap", pair(number), damages)) == []

@@ -254,7 +254,8 @@ LINE = b"\n" + b"=" * 80 + b"\nMSG: "
 NESTED = (
     b"a/B0 b\nfloat64 x\n" + b"".join(LINE + b"a/B%d\na/B%d c\n" % (i, i + 1) for i in range(60)) + LINE + b"a/B60\nint8 z\n"
 )
-WIDE = b"".join(b"".join(b"a/B%d f%d\n" % (i, j) for j in range(20)) + LINE + b"a/B%d\n" % i for i in range(20))  # 20^20 fields
+LEVEL = [b"".join(b"a/B%d f%d\n" % (i, j) for j in range(100)) + LINE + b"a/B%d\n" % i for i in range(20)]
+WIDE = b"".join(LEVEL)  # 100^20 fields
 
 
 @pytest.mark.parametrize(
@@ -278,6 +279,7 @@ WIDE = b"".join(b"".join(b"a/B%d f%d\n" % (i, j) for j in range(20)) + LINE + b"
         (b"\xff\xfe\0", CDR + bytes(8), "has the line"),
         (b"float64 x\n" * 200_000, CDR + bytes(8), "bytes"),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_hostile_definitions_and_messages_are_refused_in_bounded_work(
     tmp_path: Path, definition: bytes, payload: bytes, says: str

@@ -25,7 +25,9 @@ from imutool.mcap_io.topics import KIND_KEY, Topic
         ("/robot/pose", schemas.POSE_COVARIANCE, "estimate"),
         ("/vicon/pose", schemas.POSE_COVARIANCE, "truth"),
         ("/weight/pose", schemas.POSE, "unknown"),
-        ("/tf", schemas.TF, "unknown"),
+        ("/tf", schemas.TF, "estimate"),
+        ("/vicon/tf", schemas.TF, "truth"),
+        ("/tf", "foxglove.FrameTransforms", "estimate"),
     ],
 )
 def test_a_kind_follows_from_name_and_type(name, schema, kind):

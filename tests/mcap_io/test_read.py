@@ -76,7 +76,6 @@ def test_every_layout_reads_the_same(foreign: Foreign, flight: list[Message], la
         expected = np.concatenate([decode_imu(np.frombuffer(m[5], np.uint8)[None]).gyro for m in mine])
         assert np.concatenate([b.gyro for b in batches]).tobytes() == expected.tobytes()
         assert sum(len(b.stamp_ns) for b in log.pose_batches("/mocap")) == 100
-        assert sum(len(b.stamp_ns) for b in log.scalar_batches("/height")) == 180
     recording = read(path)
     assert (recording.name, recording.imu_topic, recording.source) == ("foreign", "/imu/data", "")
     assert recording.imu.gyro.tobytes() == expected.tobytes()
@@ -113,12 +112,14 @@ def tree(make: Make, children: list[str], count: int = 4) -> list[Message]:
     ]
 
 
-def test_transforms_are_truths_by_child_frame_only_without_a_pose_topic(foreign: Foreign, make: Make) -> None:
+def test_transforms_are_an_estimate_that_is_named_by_its_child_frame(foreign: Foreign, make: Make) -> None:
     several = foreign(imu_messages(make) + tree(make, ["base", "/arm"]), name="several")
-    recording = read(several)
-    assert list(recording.truths) == ["/tf/base", "/tf/arm"]
+    unnamed = read(several)
+    assert (dict(unnamed.truths), dict(unnamed.other_poses)) == ({}, {"/tf": "estimate"})
+    recording = read(several, truth="/tf/arm")
+    assert list(recording.truths) == ["/tf/arm"]
     assert recording.truths["/tf/arm"].p_wb[:, 0].tolist() == [1, 1, 1, 1]
-    assert list(read(several, truth="/tf/arm").truths) == ["/tf/arm"]
+    assert "/tf/arm (estimate) is no truth" in recording.truth_caveat
     with pytest.raises(LogError, match=r"/tf has 2 child frames.*/tf/base, /tf/arm"):
         read(several, truth="/tf")
     with pytest.raises(LogError, match=r"no poses on /tf/leg.*/tf/base, /tf/arm"):

@@ -153,12 +153,11 @@ class Network(BiasNetwork):
         """Rest biases minus N(0), which only inference subtracts from the network."""
         return rest - self._net(sensor).at_rest().detach()
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias rest + W u - N at each sample."""
-        u, rest = segment.of(sensor)
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """W u - N at each sample."""
         W: Tensor = self.W[sensor]
         correction: Tensor = self._net(sensor)(torch.cat([segment.gyro, segment.accel], dim=-1))
-        return rest[:, None] + u @ W.mT - correction
+        return segment.of(sensor)[0] @ W.mT - correction
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Set the matrix W; with `start="identity"` do nothing."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import msgspec
@@ -13,7 +14,6 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from imutool.bias.hybrid import Config, Model
-from imutool.bias.model import COLUMNS
 from imutool.bias.networks import neural_ode
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.config import Settings
@@ -75,14 +75,16 @@ class Network(BiasNetwork):
         theta: Tensor = getattr(self, f"theta_{sensor}")
         return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())(signals)
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias of the effects plus the neural ODE; filters start at the first sample."""
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Error of the effects plus the curve of the neural ODE; filters start at the first sample."""
         error = self._on(sensor, segment)
-        if self.ode is None:
-            return segment.rest[:, None, COLUMNS[sensor]] + error
-        corrected = {"gyro": segment.gyro, "accel": segment.accel}
-        corrected[sensor] = corrected[sensor] - error
-        return error + self.ode.sensor_bias(sensor, Segment(segment.t, corrected["gyro"], corrected["accel"], segment.rest))
+        return error if self.ode is None else error + self.ode.motion_bias(sensor, _less(segment, sensor, error))
+
+    def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Rest bias, drifting as the neural ODE says of the corrected samples."""
+        if self.ode is None or sensor not in self.config.ode.drift:
+            return super().rest_bias(sensor, segment)
+        return self.ode.rest_bias(sensor, _less(segment, sensor, self._on(sensor, segment)))
 
     def _on(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         rows = []
@@ -99,3 +101,9 @@ class Network(BiasNetwork):
         self.register_buffer(f"covariance_{sensor}", like.new_zeros(size, size))
         looks_back = any(self.effects.values())
         self.context = math.ceil(SETTLING * POWER_S * self.rate_hz) if looks_back else 0
+
+
+def _less(segment: Segment, sensor: Sensor, error: Float[Tensor, "batch n 3"]) -> Segment:
+    """Segment with an error taken off one sensor's samples."""
+    corrected = segment.of(sensor)[0] - error
+    return replace(segment, gyro=corrected) if sensor == "gyro" else replace(segment, accel=corrected)

@@ -24,11 +24,10 @@ class Network(BiasNetwork):
         super().__init__(config or Config(), rate_hz)
         self.W = nn.ParameterDict({sensor: nn.Parameter(torch.zeros(3, 3)) for sensor in SENSORS})
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias rest + W u at every sample."""
-        u, rest = segment.of(sensor)
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """W u at every sample."""
         W: Tensor = self.W[sensor]
-        return rest[:, None] + u @ W.mT
+        return segment.of(sensor)[0] @ W.mT
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Set the matrix W: the closed form is the whole model."""

@@ -72,11 +72,20 @@ class BiasNetwork(nn.Module, ABC):
         return rest
 
     @abstractmethod
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Part of a sensor's bias that follows from the samples alone, whatever the rest bias. Differentiable."""
+
+    def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Rest bias of one sensor at each sample: constant unless a model lets it drift. Differentiable."""
+        u, rest = segment.of(sensor)
+        return rest[:, None].expand_as(u)
+
     def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """Bias of one sensor at each sample; row k depends on samples up to k. Differentiable.
 
         The sensors are separate because the training is: first the gyro, then the accelerometer with the trained gyro.
         """
+        return self.rest_bias(sensor, segment) + self.motion_bias(sensor, segment)
 
     def forward(self, segment: Segment) -> Float[Tensor, "batch n 6"]:
         """Bias at each sample: gyro (rad/s), then accel (m/s²)."""

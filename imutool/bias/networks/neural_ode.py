@@ -112,16 +112,22 @@ class Network(BiasNetwork):
         field, start = self._joint_start(segment)
         return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Bias beta + C(u) at each sample; beta is linear between the steps of the drift."""
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """C(u) at each sample; the joint scheme tells no such part from the gyro's bias."""
+        u, _ = segment.of(sensor)
+        if self.config.joint and sensor == "gyro":
+            return torch.zeros_like(u)
+        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
+        return motion
+
+    def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """beta at each sample, linear between the steps of the drift; in the joint scheme the gyro's whole bias."""
         if self.config.joint and sensor == "gyro":
             field, start = self._joint_start(segment)
             return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
-        u, rest = segment.of(sensor)
-        motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
         if sensor not in self.config.drift:
-            return rest[:, None] + motion
-        return self._rest_path(segment.t, u, rest, self.drift[sensor]) + motion
+            return super().rest_bias(sensor, segment)
+        return self._rest_path(segment.t, *segment.of(sensor), self.drift[sensor])
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Set the linear part of the curve, or of the joint field."""
@@ -139,10 +145,12 @@ class Network(BiasNetwork):
         steps = math.ceil((n - 1) / stride)
         whole = (n - 1) // stride
         knots = self._filtered(u, DRIFT_FILTER_S)[:, : whole * stride + 1 : stride][:, :steps]
-        path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
         step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
-
-        beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
+        if self.config.solver == "euler":
+            beta = _euler(drift, knots, step_s, rest)
+        else:
+            path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
+            beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
         index = torch.arange(n, device=u.device) / stride
         j = index.long().clamp(max=steps - 1)
         return torch.lerp(beta[j], beta[j + 1], (index - j)[:, None, None].to(u)).transpose(0, 1)
@@ -169,6 +177,17 @@ class _OnGrid(nn.Module):
         u, du = self.path.value(index), self.path.derivative(index) / self.step_s
         rate: Tensor = self.drift(beta, u, du)
         return self.step_s * rate
+
+
+def _euler(
+    drift: nn.Module, knots: Float[Tensor, "b steps 3"], step_s: Float[Tensor, "b 1"], rest: Float[Tensor, "b 3"]
+) -> Float[Tensor, "m b 3"]:
+    """Euler's steps, which see the path at its knots alone: there it is the sample, and its slope that to the one before."""
+    slopes = torch.diff(knots, dim=1, prepend=knots[:, :1]) / step_s[:, None]
+    beta = [rest]
+    for u, du in zip(knots.unbind(1), slopes.unbind(1), strict=True):
+        beta.append(beta[-1] + step_s * drift(beta[-1], u, du))
+    return torch.stack(beta)
 
 
 def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:

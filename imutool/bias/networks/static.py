@@ -25,10 +25,9 @@ class Network(BiasNetwork):
         for name, value in UNTRAINED.items():
             getattr(self, name).copy_(torch.from_numpy(value))
 
-    def sensor_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """Rest bias at every sample."""
-        u, rest = segment.of(sensor)
-        return rest[:, None].expand_as(u)
+    def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
+        """Zero."""
+        return torch.zeros_like(segment.of(sensor)[0])
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Ignore the calibration: this network has no matrix."""

@@ -197,6 +197,8 @@ class _Search:
         if not arms or not lever:
             return now
         others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
+        if len(size_effect.parameters) < 9:  # a part is implausible: these are not three equal arms
+            return now
         without = fit(self.logs, others, near=now)
         simple = fit(self.logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
         share = self.settings.common_arm_share

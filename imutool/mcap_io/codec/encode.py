@@ -5,6 +5,8 @@ Quaternions are wxyz in memory and xyzw in messages; here they change.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
@@ -42,20 +44,20 @@ def _blank(count: int, layout: Layout) -> UInt8[np.ndarray, "n L"]:
     return np.repeat(message[None, :], count, axis=0)
 
 
-def _put_stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, stamp_ns: Int64[np.ndarray, " n"]) -> None:
+def _put_stamp(rows: UInt8[np.ndarray, "n L"], layout: Layout, stamp_ns: Int64[np.ndarray, " n"], which: int = 0) -> None:
     if len(stamp_ns) and not -(2**31) <= stamp_ns.min() // NS_PER_S <= stamp_ns.max() // NS_PER_S < 2**31:
         raise DataError(
             f"stamps run from {stamp_ns.min()} to {stamp_ns.max()} ns",
             expected="seconds that fit 32 bits, as ROS 2 stores them",
         )
-    at = layout.stamps[0]
+    at = layout.stamps[which]
     seconds = stamp_ns // NS_PER_S
     rows[:, at : at + 4].view("<i4")[:, 0] = seconds
     rows[:, at + 4 : at + 8].view("<u4")[:, 0] = stamp_ns - seconds * NS_PER_S
 
 
-def _numbers_of(rows: UInt8[np.ndarray, "n L"], layout: Layout) -> Float64[np.ndarray, "n k"]:
-    at, count = layout.numbers[0]
+def _numbers_of(rows: UInt8[np.ndarray, "n L"], layout: Layout, which: int = 0) -> Float64[np.ndarray, "n k"]:
+    at, count = layout.numbers[which]
     return rows[:, at : at + 8 * count].view("<f8")
 
 
@@ -89,19 +91,6 @@ def encode_imu(
     return rows
 
 
-def _encode_pose(
-    layout: Layout,
-    stamp_ns: Int64[np.ndarray, " n"],
-    p_wb: Float64[np.ndarray, "n 3"],
-    q_wb_wxyz: Float64[np.ndarray, "n 4"],
-) -> UInt8[np.ndarray, "n L"]:
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
-    numbers[:, POSITION], numbers[:, XYZW] = p_wb, q_wb_wxyz[:, _XYZW_FROM_WXYZ]
-    return rows
-
-
 def encode_pose(
     stamp_ns: Int64[np.ndarray, " n"],
     p_wb: Float64[np.ndarray, "n 3"],
@@ -113,7 +102,12 @@ def encode_pose(
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
     """
-    return _encode_pose(layout_of(POSE, "cdr", texts=[frame_id]), stamp_ns, p_wb, q_wb_wxyz)
+    layout = layout_of(POSE, "cdr", texts=[frame_id])
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    numbers = _numbers_of(rows, layout)
+    numbers[:, POSITION], numbers[:, XYZW] = p_wb, q_wb_wxyz[:, _XYZW_FROM_WXYZ]
+    return rows
 
 
 def encode_transform(
@@ -128,7 +122,27 @@ def encode_transform(
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
     """
-    return _encode_pose(layout_of(TF, "cdr", texts=[frame_id, child_frame_id]), stamp_ns, p_wb, q_wb_wxyz)
+    values = np.concatenate([p_wb, q_wb_wxyz], axis=1)
+    return encode_transforms(stamp_ns[:, None], values[:, None], [(frame_id, child_frame_id)])
+
+
+def encode_transforms(
+    stamp_ns: Int64[np.ndarray, "n k"], values: Float64[np.ndarray, "n k 7"], frames: Sequence[tuple[str, str]]
+) -> UInt8[np.ndarray, "n L"]:
+    """One TFMessage per row with a transform for each parent and child.
+
+    `values` are position and quaternion wxyz.
+
+    Raises:
+        DataError: a stamp beyond the 32-bit seconds of ROS 2.
+    """
+    layout = layout_of(TF, "cdr", texts=[name for pair in frames for name in pair])
+    rows = _blank(len(stamp_ns), layout)
+    for which in range(len(frames)):
+        _put_stamp(rows, layout, stamp_ns[:, which], which)
+        numbers = _numbers_of(rows, layout, which)
+        numbers[:, POSITION], numbers[:, XYZW] = values[:, which, :3], values[:, which, 3:][:, _XYZW_FROM_WXYZ]
+    return rows
 
 
 def encode_vector3(

@@ -9,7 +9,7 @@ from typing import Any
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
-MOST_FIELDS = 5000  # of a schema that are searched: one can nest without end
+from imutool.mcap_io.codec.flatbuffer import MOST_FIELDS
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from jaxtyping import Bool, Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
-from imutool.mcap_io.codec.described_cdr import DescribedCdr
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.flatbuffer import FlatBuffer, nested
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
@@ -34,7 +33,8 @@ POSITION = r"position|pos|translation|p"
 ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
 POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
 STAMP = r"timestamp|stamp|time|sensor_?time"
-COUNTED = {r"(time|timestamp|stamp|t)_?ns(ec)?": 1, r"(time|timestamp|stamp|t)_?us(ec)?|utime": 1000}  # stamps of one number
+CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|timestamp|stamp|t|ts)"
+COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
 FRAME = r"frame_?id|frame"
 SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
 DEPTH = 4  # messages within messages that are searched
@@ -153,21 +153,11 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     Raises:
         ImportError: the schema is of protobuf, which is not installed.
     """
-    form: Format | None = None
-    tree: Any = None
-    if encoding == "json" and first is not None:
-        try:
-            tree, form = _tree_of(json.loads(first), DEPTH), _Json()
-        except (ValueError, RecursionError):
-            return None
-    elif encoding == "protobuf":
-        from imutool.mcap_io.codec.protobuf import Protobuf
-
-        form = Protobuf.of(schema_name, schema)
-        tree = form and form.tree(DEPTH)
-    elif encoding == "flatbuffer":
-        form = FlatBuffer.of(schema_name, schema)
-        tree = form and form.tree(DEPTH)
+    form = format_of(encoding, schema_name, schema)
+    try:
+        tree = form if form is None else form.tree(DEPTH) if encoding != "json" else _tree_of(json.loads(first or b""), DEPTH)
+    except (ValueError, RecursionError):
+        return None
     if form is None or not isinstance(tree, Mapping):
         return None
     if (imu := _found(tree, form)) is not None:
@@ -175,10 +165,27 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     return _pose(tree, form) if re.search(POSE_TYPES, f"{topic} {schema_name}".lower()) else None
 
 
+def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
+    """Access to messages of a schema; None of an unknown encoding or a damaged schema.
+
+    Raises:
+        ImportError: the schema is of protobuf, which is not installed.
+    """
+    if encoding == "json":
+        return _Json()
+    if encoding == "flatbuffer":
+        return FlatBuffer.of(schema_name, schema)
+    if encoding != "protobuf":
+        return None
+    from imutool.mcap_io.codec.protobuf import Protobuf
+
+    return Protobuf.of(schema_name, schema)
+
+
 def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
     """Fields of an IMU in a `ros2msg` definition; None of any other message."""
     try:
-        form = DescribedCdr(ros2_definition.parse(schema_name, schema))
+        form = ros2_definition.DescribedCdr(ros2_definition.parse(schema_name, schema))
     except LogError:
         return None
     return _found(form.tree(DEPTH), form)
@@ -229,15 +236,15 @@ def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path
     """Paths of three numbers: an object with x, y and z, a list, or three fields."""
     for path, name, node in fields:
         if re.fullmatch(pattern, name):
-            if isinstance(node, Mapping) and all(node.get(axis) == NUMBER for axis in "xyz"):
-                return (*path, "x"), (*path, "y"), (*path, "z")
+            for axes in ("xyz", "XYZ") if isinstance(node, Mapping) else ():
+                if all(node.get(axis) == NUMBER for axis in axes):
+                    return (*path, axes[0]), (*path, axes[1]), (*path, axes[2])
             if node == VECTOR:
                 return (*path, 0), (*path, 1), (*path, 2)
-    axes = [
+    x, y, z = (
         next((path for path, name, node in fields if node == NUMBER and re.fullmatch(rf"{pattern}_?{axis}", name)), None)
         for axis in "xyz"
-    ]
-    x, y, z = axes
+    )
     return None if x is None or y is None or z is None else (x, y, z)
 
 

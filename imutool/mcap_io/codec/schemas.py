@@ -191,7 +191,7 @@ def layout_of(
     numbers: list[tuple[int, int]] = []
     data: tuple[int, int] | None = None
     if shape[0] == "count":
-        shape, count = shape[1:], walk.word(1)
+        shape, count = shape[1:], walk.word(len(texts) // 2)
     for _ in range(count):
         for part in shape:
             if part == "header":

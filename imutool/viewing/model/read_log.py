@@ -10,7 +10,7 @@ import numpy as np
 
 from imutool.cleaning import Cleaner, CleaningSettings, Survey
 from imutool.cleaning.first_pass import examine
-from imutool.cleaning.truth import Truth, of_poses
+from imutool.cleaning.truth import truth_of
 from imutool.errors import DataError, LogError
 from imutool.location import Location
 from imutool.mcap_io.codec import schemas
@@ -73,7 +73,7 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         contents = _read(RecoveredLog(path), imu, truth, notes)
     topic, derived, batches, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
-    survey = examine(lambda: batches[topic], _true(rest), CleaningSettings(), where=str(path), topic=topic)
+    survey = examine(lambda: batches[topic], truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
     samples, logged, why = _sound_samples(batches[topic], survey, where)
     if why:
         left = f"{survey.messages - survey.valid} of {survey.messages} messages are left out"
@@ -123,10 +123,6 @@ def _messages(
             else:
                 biases_by_topic[topic] += log.topics[topic].decode_twist(rows)
     return samples, biases_by_topic
-
-
-def _true(recording: Recording) -> Truth | None:
-    return next((of_poses(topic, poses) for topic, poses in recording.truths.items()), None)
 
 
 def _sound_samples(batches: Sequence[ImuBatch], survey: Survey, where: str) -> tuple[Imu, LogTimes, str]:

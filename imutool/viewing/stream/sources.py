@@ -37,6 +37,13 @@ def open_source(name: str, malformed: Malformed, *, imu: str | None = None, spee
         ConfigError: no such source, or it cannot be opened.
         LogError: a log without an IMU, or with several.
     """
+    samples = _source(name, malformed, imu, speed)
+    next(samples)  # it is open: whoever drops the iterator closes it
+    return samples
+
+
+def _source(name: str, malformed: Malformed, imu: str | None, speed: float) -> Samples:
+    """Open source; its first item is None."""
     parts = urlsplit(name)
     if name in {"-", "stdin"}:
         return _lines(malformed)
@@ -63,6 +70,7 @@ def _replay(name: str, imu: str | None, speed: float) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with log:
+            yield None
             began, first_ns = time.perf_counter(), None
             for batch in log.imu_batches(imu or topics[0]):
                 for stamp_ns, gyro, accel in zip(
@@ -83,6 +91,7 @@ def _lines(malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         rest = b""
+        yield None
         while True:
             if os.name == "posix" and not select.select([descriptor], [], [], WAIT_S)[0]:
                 yield None
@@ -116,6 +125,7 @@ def _udp(host: str, port: int, malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with line:
+            yield None
             while True:
                 try:
                     datagram = line.recv(MAX_BYTES)
@@ -151,6 +161,7 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with connection, contextlib.suppress(ConnectionClosed):
+            yield None
             while True:
                 try:
                     text = line.recv(timeout=WAIT_S)
@@ -191,6 +202,7 @@ def _zenoh(name: str, malformed: Malformed) -> Samples:
 
     def samples() -> Generator[Sample | None]:
         with session:
+            yield None
             while True:
                 try:
                     arrival_s, payload = arrived.get(timeout=WAIT_S)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from support.report_schema import assert_valid
 
-from imutool.diagnosis.audit.audit import simulator_faults, simulator_remarks
+from imutool.diagnosis.audit import simulator_faults, simulator_remarks
 from imutool.diagnosis.audit.faults import FAULTS
 from imutool.mcap_io.write import write
 
@@ -25,7 +25,7 @@ assert SPEC.loader is not None
 bench: Any = importlib.util.module_from_spec(SPEC)
 sys.modules["audit_bench"] = bench
 SPEC.loader.exec_module(bench)
-DURATION_S = 24.0
+DURATION_S = 16.0
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 

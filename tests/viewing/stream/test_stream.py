@@ -136,6 +136,15 @@ def test_a_wrong_source_is_refused_at_once(name: str) -> None:
         open_source(name, Malformed())
 
 
+def test_a_source_that_nobody_reads_is_closed(logs: Path) -> None:
+    """As when the output of the command is refused."""
+    source = open_source(str(logs / "flight_1.mcap"), Malformed())
+    opened = [entry.readlink() for entry in Path("/proc/self/fd").iterdir() if entry.is_symlink()]
+    assert opened.count(logs / "flight_1.mcap") == 1
+    del source
+    assert not any(entry.readlink() == logs / "flight_1.mcap" for entry in Path("/proc/self/fd").iterdir() if entry.exists())
+
+
 def test_datagrams_are_samples(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sources, "WAIT_S", 0.01)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

@@ -1,4 +1,4 @@
-"""IMU from two sensors: on the gyro's stamps, the accelerometer interpolated; their delay.
+"""IMU from two sensors, on the gyro's stamps; their delay, and the gyro's unit.
 
 While the specific force is mostly gravity, a vector that is fixed in the world, da/dt = -omega x a. The delay is the lag at
 which both sides correlate best.
@@ -6,6 +6,7 @@ which both sides correlate best.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ LONGEST_S = 0.15
 MOST_S = 300.0  # of a longer log, the stretch that turns most
 PARTS = 8  # stretches whose own lags show how sure the delay is
 LEAST_CORRELATION, LEAST_PARTS = 0.6, 4
+MOST_OFF = 1.3  # ratio of the scale that the motion shows to that of a unit
 
 
 class SensorDelay(NamedTuple):
@@ -38,11 +40,56 @@ def sensor_delay(
     accel: Float64[np.ndarray, "m 3"],
 ) -> SensorDelay | None:
     """Delay of the accelerometer; None where the motion does not show it."""
+    both = _together(gyro_ns, gyro, accel_ns, accel)
+    if both is None:
+        return None
+    most = round(LONGEST_S / STEP_S)
+    lags = np.arange(-most, most + 1)
+    products = np.stack([_products(*both, int(lag), most) for lag in lags])
+    whole = _peak(products.sum(axis=1), lags)
+    if whole is None:
+        return None
+    parts = [peak for part in range(PARTS) if (peak := _peak(products[:, part], lags)) is not None]
+    if len(parts) < LEAST_PARTS:
+        return None
+    return SensorDelay(whole * STEP_S, float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5)
+
+
+def unit_by_gravity(
+    t_ns: Int64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+    units: Mapping[str, float],
+) -> tuple[str, float] | None:
+    """Unit of the gyro by which it carries gravity along, and the correlation; else None.
+
+    `units` are in rad/s. The scale of the least squares of da/dt = -scale omega x a decides, in the whole and in most parts.
+    """
+    both = _together(t_ns, gyro, t_ns, accel)
+    if both is None:
+        return None
+    parts = _products(*both, 0, round(LONGEST_S / STEP_S))
+    together, measured, predicted = np.concatenate([parts.sum(axis=0)[None], parts]).T
+    correlation = together / np.sqrt(np.maximum(measured * predicted, 1e-300))
+    scale = np.where(correlation >= LEAST_CORRELATION, together, 0.0) / np.maximum(predicted, 1e-300)
+    for unit, size in units.items():
+        close = (scale / size < MOST_OFF) & (scale / size > 1.0 / MOST_OFF)
+        if close[0] and close[1:].sum() >= LEAST_PARTS:
+            return unit, float(correlation[0])
+    return None
+
+
+def _together(
+    gyro_ns: Int64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel_ns: Int64[np.ndarray, " m"],
+    accel: Float64[np.ndarray, "m 3"],
+) -> tuple[Float64[np.ndarray, "c 3"], Float64[np.ndarray, "c 3"]] | None:
+    """Rates and specific forces on one grid, of a long log the stretch that turns most; None of too short a log."""
     on_one_clock = gyro_ns[longest_run(gyro_ns)]
     start = max(int(on_one_clock[0]), int(accel_ns[0]))
     count = int((min(int(on_one_clock[-1]), int(accel_ns[-1])) - start) * 1e-9 / STEP_S)
-    most = round(LONGEST_S / STEP_S)
-    if count < PARTS * 10 * most:
+    if count < PARTS * 10 * round(LONGEST_S / STEP_S):
         return None
     rate = _resampled(gyro_ns, gyro, start, count)
     force = _resampled(accel_ns, accel, start, count)
@@ -51,15 +98,7 @@ def sensor_delay(
         turned = np.concatenate([[0.0], np.cumsum((rate**2).sum(axis=1))])
         first = int(np.argmax(turned[window:] - turned[:-window]))
         rate, force = rate[first : first + window], force[first : first + window]
-    lags = np.arange(-most, most + 1)
-    products = np.stack([_products(rate, force, int(lag), most) for lag in lags])
-    whole = _peak(products.sum(axis=1), lags)
-    if whole is None:
-        return None
-    parts = [peak for part in range(PARTS) if (peak := _peak(products[:, part], lags)) is not None]
-    if len(parts) < LEAST_PARTS:
-        return None
-    return SensorDelay(whole * STEP_S, float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5)
+    return rate, force
 
 
 def _resampled(
@@ -94,6 +133,7 @@ def _peak(products: Float64[np.ndarray, "k 3"], lags: Int64[np.ndarray, " k"]) -
     return float(lags[best] + 0.5 * (before - after) / (before - 2.0 * at + after))
 
 
+SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
 
@@ -160,6 +200,8 @@ def _delay_sentence(rates: Cleaned, forces: Cleaned) -> str:
     delay = sensor_delay(rates.t_ns, rates.values, forces.t_ns, forces.values)
     if delay is None:
         return "the motion does not show the delay between them"
+    if abs(delay.seconds) < SHOWN_STDS * delay.std_s:
+        return f"the motion shows no delay between them ({1e3 * delay.seconds:+.1f} ± {1e3 * delay.std_s:.1f} ms)"
     side = "later" if delay.seconds > 0 else "earlier"
     size = f"{abs(delay.seconds) * 1e3:.1f} ms {side} than the gyro's (standard deviation {delay.std_s * 1e3:.1f} ms)"
     return f"by the motion the accelerometer's stamps are {size}, which is not corrected"

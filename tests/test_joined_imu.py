@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.recording.two_sensors import sensor_delay
+from imutool.recording.joined_imu import sensor_delay, unit_by_gravity
 
 RNG = np.random.default_rng(11)
 DURATION_S = 60.0
+UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 WITHIN_S = 0.001  # the delays of interest are those of several milliseconds
 
 
@@ -40,6 +41,19 @@ def test_a_planted_delay_is_found(delay_s):
     assert found is not None
     assert abs(found.seconds - delay_s) < WITHIN_S
     assert found.std_s < WITHIN_S
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_unit_of_the_gyro_shows_where_gravity_turns(unit):
+    gyro_ns, gyro, _, accel = measured(0.0, (400.0, 400.0))
+    found = unit_by_gravity(gyro_ns, gyro / UNITS[unit], accel, UNITS)
+    assert found is not None
+    assert found[0] == unit
+    assert found[1] > 0.6
+    assert unit_by_gravity(gyro_ns, gyro / 0.1, accel, UNITS) is None  # in neither of the two
+    assert unit_by_gravity(gyro_ns, gyro / UNITS[unit], accel[:, [1, 2, 0]], UNITS) is None  # axes that do not belong together
+    still = np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.05, accel.shape)
+    assert unit_by_gravity(gyro_ns, gyro / UNITS[unit], still, UNITS) is None  # the thrust of a drone
 
 
 def test_a_log_at_rest_or_of_vibration_shows_none():

@@ -1,0 +1,113 @@
+"""Whoever uses the samples of a log in other units, axes or frames is warned in one sentence that names the correction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.debiasing import debias
+from imutool.diagnosis.diagnose import diagnose
+from imutool.errors import ImutoolError, ModelError
+from imutool.evaluation import evaluate
+from imutool.mcap_io.write import write
+from imutool.recording import Imu, Recording
+from imutool.sensor.made_up_flight import flight
+from imutool.training.run import train
+
+NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def with_samples(
+    gyro: Callable[[np.ndarray], np.ndarray], accel: Callable[[np.ndarray], np.ndarray]
+) -> Callable[..., Recording]:
+    def changed(made: Recording) -> Recording:
+        return replace(made, imu=Imu(made.imu.t_ns, gyro(made.imu.gyro), accel(made.imu.accel)))
+
+    return changed
+
+
+def in_ned(made: Recording) -> Recording:
+    q_wb = (Rotation.from_matrix(NED) * Rotation.from_quat(made.truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
+    return replace(
+        made, truths={"/ground_truth/pose": replace(made.truth, p_wb=made.truth.p_wb @ NED.T, q_wb_wxyz=q_wb, v_w=None)}
+    )
+
+
+CHANGES = {
+    "accel looks like g": with_samples(lambda gyro: gyro, lambda accel: accel / 9.80665),
+    "gyro looks like deg/s": with_samples(np.rad2deg, lambda accel: accel),
+    "gyro contradicts": with_samples(lambda gyro: gyro[:, [1, 2, 0]], lambda accel: accel),
+    "accel contradicts": with_samples(lambda gyro: gyro, lambda accel: -accel),
+    "-z up (as in NED)": in_ned,
+}
+
+
+class StopError(Exception):
+    """The search after the warnings is not awaited."""
+
+
+def stop(done: int, total: int, text: str) -> None:
+    if done:
+        raise StopError
+
+
+def trained(log: Path) -> None:
+    train([log], log.with_suffix(".safetensors"), method="linear", overwrite=True)
+
+
+USES: dict[str, Callable[[Path], object]] = {
+    "debias": lambda log: debias(log, log.with_suffix(".out.mcap"), init="0,0,0,0,0,0", force=True, overwrite=True),
+    "evaluate": evaluate,
+    "diagnose": lambda log: diagnose([log], tell=stop),
+    "train": trained,
+}
+
+
+@pytest.fixture(scope="module")
+def made() -> Recording:
+    return flight(3, duration_s=40.0)
+
+
+def warned(told: str, name: str, made: Recording, log: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(CHANGES[told](made), log)
+    with suppress(ImutoolError, StopError):
+        USES[name](log)
+    found = [line.getMessage() for line in caplog.records if told in line.getMessage()]
+    assert len(found) == 1
+    assert "imutool convert LOG OUT --fix" in found[0]
+
+
+@pytest.mark.parametrize("told", CHANGES)
+def test_wrong_units_axes_and_frames_are_warned_of(
+    told: str, made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    warned(told, "evaluate", made, tmp_path / "log.mcap", caplog)
+
+
+@pytest.mark.parametrize("name", ["debias", "diagnose", "train"])
+def test_every_use_of_wrong_samples_is_warned_of(
+    name: str, made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    warned("accel looks like g", name, made, tmp_path / "log.mcap", caplog)
+
+
+def test_a_log_as_it_should_be_brings_no_warning(made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    log = tmp_path / "log.mcap"
+    write(made, log)
+    evaluate(log)
+    debias(log, tmp_path / "out.mcap", init="0,0,0,0,0,0")
+    assert "--fix" not in caplog.text
+
+
+def test_a_log_in_g_is_not_debiased_as_metres_a_second_squared(made: Recording, tmp_path: Path) -> None:
+    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
+    write(CHANGES["accel looks like g"](made), log)
+    with pytest.raises(ModelError, match=r"specific force has a median of .*--fix"):
+        debias(log, out, init="0,0,0,0,0,0")
+    assert not out.exists()

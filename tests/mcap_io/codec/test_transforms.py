@@ -1,0 +1,65 @@
+"""Foxglove's transforms are poses of child frames, an estimate unless they are named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from imutool.log_info.inspection import inspect
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
+
+COUNT, STEP_NS, START_NS = 40, 10_000_000, 1_700_000_000_000_000_000
+T_NS = START_NS + STEP_NS * np.arange(COUNT)
+
+
+def transform(parent: str, child: str, t_ns: int, x: float) -> dict[str, object]:
+    stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
+    frames = {"parent_frame_id": parent, "child_frame_id": child}
+    return {"timestamp": stamp, **frames, "translation": {"x": x, "y": 1, "z": 2}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+
+
+def imu(n: int) -> dict[str, object]:
+    return {"angular_velocity": {"x": 0.1, "y": 0.0, "z": 0.0}, "linear_acceleration": {"x": 0.0, "y": 0.0, "z": 9.81}}
+
+
+def write(path: Path, several: bool) -> Path:
+    """Log of a body and of a camera on it, in one topic."""
+    name = "foxglove.FrameTransforms" if several else "foxglove.FrameTransform"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = [
+            writer.register_channel(topic, "json", writer.register_schema(schema, "jsonschema", b"{}"))
+            for topic, schema in (("/imu", "Imu"), ("/tf", name))
+        ]
+        for n, t in enumerate(T_NS.tolist()):
+            each = [transform("world", "body", t, float(n)), transform("body", "camera", t, 0.5)]
+            messages = [imu(n), *([{"transforms": each}] if several else each)]
+            for channel, message in zip([channels[0]] + [channels[1]] * 2, messages, strict=False):
+                writer.add_message(channel, t, json.dumps(message).encode(), t)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_transform_is_a_pose_of_its_child_and_an_estimate_unless_it_is_named(tmp_path: Path, several: bool) -> None:
+    path = write(tmp_path / "log.mcap", several)
+    with Log(path) as log:
+        assert (log.topics["/tf"].schema_name, log.topics["/tf"].pose_kind) == (schemas.TF, "estimate")
+    assert not read(path).truths
+    recording = read(path, truth="/tf/body")
+    assert np.array_equal(recording.truth.t_ns, T_NS)
+    assert recording.truth.p_wb.tolist() == [[float(n), 1.0, 2.0] for n in range(COUNT)]
+    assert (recording.truth.q_wb_wxyz == [1.0, 0.0, 0.0, 0.0]).all()
+    assert "/tf/body (estimate) is no truth" in recording.truth_caveat
+
+
+def test_info_names_the_bodies_that_are_seen_in_a_world(tmp_path: Path) -> None:
+    (pose,) = inspect(write(tmp_path / "log.mcap", True)).truth
+    assert (pose.topic, pose.poses, pose.kind) == ("/tf/body", COUNT, "estimate")
