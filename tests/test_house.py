@@ -361,7 +361,18 @@ def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-WITHOUT_TORCH = "import sys; sys.modules.update(torch=None, torchdiffeq=None); sys.argv[0] = 'imutool'\n"
+WITHOUT_TORCH = """
+import importlib.machinery
+import sys
+
+class Finder(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name in {"torch", "torchdiffeq"} else super().find_spec(name, path, target)
+
+sys.meta_path = [Finder if each is importlib.machinery.PathFinder else each for each in sys.meta_path]
+sys.argv[0] = "imutool"
+"""
 
 
 def test_without_torch_training_says_what_to_install_and_debias_works(tmp_path: Path, logs: Path) -> None:

@@ -70,13 +70,12 @@ def clean(
     given["--overwrite"] = overwrite and report_to is None and json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
-    added: dict[str, int] = {}
     if target is None:
         from imutool.api.cleaning import survey_imus
 
         with progress("Looking through", verbose, quiet) as tell:
             found = survey_imus(source, imu or (), rules, max_chunk, tell)
-        surveys, losses = list(found.surveys), found.losses
+        surveys, added, losses = list(found.surveys), found.added, found.losses
     else:
         from imutool.debiasing import debias
 
@@ -90,6 +89,7 @@ def clean(
                 smooth=smooth,
                 overwrite=overwrite,
                 clean=rules,
+                force=force,
                 max_chunk=max_chunk,
                 progress=lambda done, total: tell(done, total, ""),
             )
