@@ -200,7 +200,7 @@ class PhysicsFirst:
             DataError: no truth, too little of it, or different rates.
             ConfigError: unknown settings, or an effect that is not known.
         """
-        pool = Pool.of(recordings, device=device)
+        pool = Pool.of(recordings, device=device, floors=settings.pose_floors)
         torch.manual_seed(settings.seed)
         model = hybrid.Network(config_of(settings), pool.rate_hz).double()
         signals, fits = _online_signals(recordings, pool), {}
