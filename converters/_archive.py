@@ -73,7 +73,7 @@ def _list_zip(path: Path) -> Listing:
         total, most = 0, MAX_RATIO * path.stat().st_size + RATIO_FREE
         for number, info in enumerate(archive.infolist()):
             name = _checked_name(path, info.filename, number)
-            if not name.isprintable():  # such as a Mac's "Icon\r": nothing that is read has such a name
+            if not info.filename or not name.isprintable():  # such as a Mac's "Icon\r": nothing that is read has such a name
                 continue
             mode = info.external_attr >> 16
             if stat.S_ISLNK(mode):

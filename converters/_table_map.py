@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from imutool.errors import ConfigError
+from imutool.recording.joined_imu import in_order, unit_by_gravity
 from imutool.recording.message_log import KINDS
-from imutool.recording.two_sensors import in_order, unit_by_gravity
 
 from ._table_text import Columns
 

@@ -18,8 +18,8 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
+from imutool.recording.joined_imu import in_order
 from imutool.recording.message_log import MessageLog, Remarks, Table
-from imutool.recording.two_sensors import in_order
 
 from . import Sequence
 from ._archive import refusing

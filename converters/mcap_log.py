@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
@@ -21,6 +21,7 @@ from ._files import head, name
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
+CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
 
@@ -51,14 +52,26 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
                 schema = summary.schemas.get(channel.schema_id)
                 if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
-    own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
-    return MessageLog(
+        own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
+        unchecked = _without_crc(file, [] if summary is None else summary.chunk_indexes)
+    log = MessageLog(
         sequence.name,
         sequence.path.name,
         messages=partial(_messages, sequence.path, images),
         counts=counts,
         metadata={"imutool": own, **metadata},
     )
+    log.remarks.notes += [f"{unchecked} chunks state no CRC: their messages are not checked"] if unchecked else []
+    return log
+
+
+def _without_crc(file: BinaryIO, chunks: Iterable[Any]) -> int:
+    """Number of chunks that state no CRC."""
+    count = 0
+    for chunk in chunks:
+        file.seek(chunk.chunk_start_offset + CRC_AT)
+        count += file.read(4) == bytes(4)
+    return count
 
 
 def read(source: Path) -> Iterator[MessageLog]:

@@ -20,8 +20,8 @@ from jaxtyping import Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars
+from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
-from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._archive import is_zip, list_members, read_bounded, refusing

@@ -17,8 +17,8 @@ from jaxtyping import Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.recording import Poses, Scalars, unit_quaternions
+from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
-from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._files import head, name

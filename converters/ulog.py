@@ -22,8 +22,8 @@ from jaxtyping import Float64, Int64
 from imutool.errors import DataError, not_installed
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
+from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
-from imutool.recording.two_sensors import in_order, joined
 
 from . import Sequence
 from ._files import find_files, head

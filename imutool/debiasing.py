@@ -20,8 +20,8 @@ from imutool import __version__
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.fitness import Fitness
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log
 from imutool.bias_start.stretches import Sieve

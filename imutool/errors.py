@@ -129,7 +129,7 @@ def redact(text: str) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str], shown: str = "{}") -> str:
-    """Question that names the known word nearest to a wrong one, shown in a format; empty if none is near."""
+    """Question that names the known word nearest to a wrong one; empty if none is near."""
     import difflib
 
     near = difflib.get_close_matches(word, known, n=1)

@@ -1,7 +1,4 @@
-"""Evaluate pure integration, raw and with each model.
-
-The paper's error metrics for a log with true poses.
-"""
+"""Evaluate pure integration by the true poses of a log, raw and with each model."""
 
 from __future__ import annotations
 
@@ -128,18 +125,11 @@ def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> 
 
 
 def runs(
-    recording: Recording,
-    models: Sequence[str | Path],
-    init: str,
-    where: str | Path,
-    *,
-    smooth: bool = False,
-    refused: Refused | None = None,
+    recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
-    check_smooth(init, smooth)
     yield RAW, _corrected(recording.imu, None, None), None
-    for name, model, start in started(recording, models, init, where, smooth=smooth, refused=refused):
+    for name, model, start in started(recording, models, init, where):
         yield name, apply(model, start, recording.imu), start
 
 

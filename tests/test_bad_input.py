@@ -242,6 +242,16 @@ def test_samples_of_no_sensor_are_left_out_or_refused(tmp_path: Path, imutool: R
         assert "error: " in done.stderr or done.returncode == 3
 
 
+@pytest.mark.parametrize("name", ["debias", "repair", "clean", "convert"])
+def test_a_log_without_crcs_is_said_to_be_unchecked(tmp_path: Path, imutool: Run, name: str) -> None:
+    """Fleets: tests/fleet/test_work.py."""
+    recording = flight(1, duration_s=4.0)
+    put_log(tmp_path / "in.mcap", recording.imu.t_ns, recording.imu.gyro, recording.imu.accel, None, crcs=False)
+    done = imutool(name, "in.mcap", "out.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert re.search("no CRC.*not checked|no CRC covers", " ".join((done.stdout + done.stderr).split()))
+
+
 CLOCK_S = 8.0
 JUMPING: tuple[tuple[str, ...], ...] = (
     ("info", "in.mcap"),

@@ -90,6 +90,7 @@ def clean(
         init=init,
         smooth=smooth,
         clean=wanted,
+        force=force,
         overwrite=overwrite,
         progress=progress,
     )

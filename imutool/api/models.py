@@ -16,9 +16,10 @@ from imutool.api.logs import Progress
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
-from imutool.bias_start.fitness import Fitness, judge
+from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport

@@ -93,7 +93,7 @@ class Model(BiasModel):
                 where="model.channels",
                 expected="one of each per layer",
             )
-        shapes = super().shapes(config) | matrices("W")
+        shapes = super().shapes(config) | matrices()
         for sensor in SENSORS:
             net = f"net.{sensor}"
             shapes |= {f"{net}.out": (3, config.channels[-1]), f"{net}.centre": (6,), f"{net}.scale": (6,)}

@@ -40,7 +40,7 @@ class Model(BiasModel):
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
         """Shapes of the statistics and of W for each sensor."""
-        return super().shapes(config) | matrices("W")
+        return super().shapes(config) | matrices()
 
     def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Bias rest + W u at every sample."""

@@ -215,6 +215,6 @@ class _Stretches:
         self._one = getattr(self._stream, "one", None)
 
 
-def matrices(names: str) -> Shapes:
-    """Shapes of one matrix for each sensor: `names` with its name."""
-    return {f"{names}.{sensor}": (3, 3) for sensor in SENSORS}
+def matrices() -> Shapes:
+    """Shapes of the matrix W of each sensor."""
+    return {f"W.{sensor}": (3, 3) for sensor in SENSORS}

@@ -58,7 +58,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     if (wide > before.std).any():
         before = replace(before, std=wide)
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
-        again = itertools.islice(filter_blocks(model, [relative_samples(imu)], before, ahead=True), len(rest_blocks))
+        again = itertools.islice(filter_blocks(model, [relative_samples(imu)], before), len(rest_blocks))
         rest_blocks = _first_stop(model, stop, before) or list(again)
     state = rest_blocks[-1].step.after
     std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
@@ -72,7 +72,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
 
 def _first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:
     """Filtered blocks of the stop at the beginning of some samples; none if they begin in motion."""
-    return list(itertools.takewhile(lambda b: b.resting, filter_blocks(model, [relative_samples(imu)], before, ahead=True)))
+    return list(itertools.takewhile(lambda b: b.resting, filter_blocks(model, [relative_samples(imu)], before)))
 
 
 def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:

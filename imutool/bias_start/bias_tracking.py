@@ -233,12 +233,10 @@ class TrajectoryBiasStream:
         return BiasEstimate(self(t_s, gyro, accel), covariance)
 
 
-def filter_blocks(
-    model: BiasModel, batches: Iterable[Samples], prior: BiasPrior, *, ahead: bool = False
-) -> Iterator[FilteredBlock]:
+def filter_blocks(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> Iterator[FilteredBlock]:
     """Filtered blocks of samples, minus the model's motion-dependent bias."""
     motion = model.stream(prior.mean)
-    filter_ = BiasFilter(prior, ahead=ahead)
+    filter_ = BiasFilter(prior, ahead=True)
     for t_s, gyro, accel in batches:
         bias = motion(t_s, gyro, accel) - prior.mean
         yield from filter_.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:])

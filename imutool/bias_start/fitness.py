@@ -13,59 +13,21 @@ The thresholds come from `tests/bench/fit.py`: pieces of the training logs of th
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from imutool.bias import static
 from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.errors import ModelError
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
-from imutool.report import Section
-
-Verdict = Literal["fits", "doubtful", "unfit"]
-
-logger = logging.getLogger(__name__)
-
-
-class Fitness(Section, frozen=True):
-    """Verdict on a model for a log, and the reasons."""
-
-    verdict: Verdict
-    reasons: tuple[str, ...]
-
-    def sentence(self, model: str) -> str:
-        """Verdict on a model and the reasons, in words."""
-        return f"{model} {'fits' if self.verdict == 'fits' else f'is {self.verdict}'}: {'; '.join(self.reasons)}."
-
-    def report(self, name: str, where: str, *, force: bool) -> Fitness:
-        """Warn of a doubtful model, refuse an unfit one.
-
-        Raises:
-            ModelError: it is unfit, and `force` is not given.
-        """
-        reasons = "; ".join(self.reasons)
-        if self.verdict == "unfit" and not force:
-            raise ModelError(
-                f"the model {name!r} does not fit this log: {reasons}",
-                where=where,
-                expected="a model of this very sensor, and samples in rad/s and m/s²",
-                fix="Correct wrong units with imutool convert LOG OUT --fix; else give `model=static` or one trained on logs "
-                "of this sensor, or use it all the same with `force`",
-            )
-        if self.verdict != "fits":
-            logger.warning("%s: %s", where, self.sentence(f"the model {name}"))
-        return self
-
 
 CHECKED_S = 120.0  # of a log that the check reads
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
@@ -155,7 +117,7 @@ def _wrong_gravity(samples: Samples) -> str:
 
 def _evidence(model: BiasModel, samples: Samples, prior: BiasPrior) -> _Evidence:
     """Evidence of samples, minus the model's motion-dependent bias, about a prior of a constant bias."""
-    blocks = list(filter_blocks(model, [samples], replace(prior, walk=np.zeros(6)), ahead=True))
+    blocks = list(filter_blocks(model, [samples], replace(prior, walk=np.zeros(6))))
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
     innovations = np.array([_innovation(block) for block in blocks])
@@ -170,9 +132,9 @@ def _evidence(model: BiasModel, samples: Samples, prior: BiasPrior) -> _Evidence
     return _Evidence(float(innovations[:, 1].sum()), surprising, difference, variance)
 
 
-def _innovation(block: FilteredBlock, settings: FilterSettings | None = None) -> tuple[float, float]:
+def _innovation(block: FilteredBlock) -> tuple[float, float]:
     """Chi-square of a block's velocity, and its log-likelihood under Student's distribution."""
-    s, expected = settings or FilterSettings(), block.step.expected
+    s, expected = FilterSettings(), block.step.expected
     length_s = block.end_s - block.start_s
     noise = s.rest_m_s**2 if block.resting else 2.0 * s.speed_m_s**2 * s.speed_correlation_s / length_s
     S = expected.P[VELOCITY, VELOCITY] + noise * np.eye(3)

@@ -268,7 +268,7 @@ def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) 
     The trajectory is empty for a log shorter than a block.
     """
     rows, rested_s, first = [], 0.0, None
-    for block, state in smooth_blocks(filter_blocks(model, batches, prior, ahead=True)):
+    for block, state in smooth_blocks(filter_blocks(model, batches, prior)):
         first = state if first is None else first
         std = np.sqrt(np.diag(state.covariance(block.resting)))
         rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))

@@ -16,10 +16,11 @@ from jaxtyping import Float64, Int64
 from imutool.bias import static
 from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
-from imutool.bias_start.fitness import CHECKED_S, Fitness, judge
+from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import (
     InitialBias,
     NoRestError,

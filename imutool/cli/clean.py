@@ -1,18 +1,34 @@
-"""`imutool clean`."""
+"""Defects of a log: `imutool clean` of its IMU, `imutool repair` of its bytes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import HTML, LOG, LOST, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app, listing
+from imutool.cli.app import (
+    HTML,
+    LOG,
+    LOST,
+    Imus,
+    Init,
+    Json,
+    MaxChunk,
+    Overwrite,
+    Quiet,
+    Smooth,
+    Verbose,
+    Written,
+    app,
+    listing,
+)
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
 from imutool.location import to_location
-from imutool.report import UNSET
+from imutool.report import UNSET, Report, UnsetType
 
 if TYPE_CHECKING:
     from imutool.cleaning import Survey
@@ -54,13 +70,12 @@ def clean(
     given["--overwrite"] = overwrite and report_to is None and json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
-    added: dict[str, int] = {}
     if target is None:
         from imutool.api.cleaning import survey_imus
 
         with progress("Looking through", verbose, quiet) as tell:
             found = survey_imus(source, imu or (), rules, max_chunk, tell)
-        surveys, losses = list(found.surveys), found.losses
+        surveys, added, losses = list(found.surveys), found.added, found.losses
     else:
         from imutool.debiasing import debias
 
@@ -74,6 +89,7 @@ def clean(
                 smooth=smooth,
                 overwrite=overwrite,
                 clean=rules,
+                force=force,
                 max_chunk=max_chunk,
                 progress=lambda done, total: tell(done, total, ""),
             )
@@ -140,3 +156,72 @@ def finding_rows(survey: Survey) -> list[tuple[str, ...]]:
 def _span(first_ns: int, last_ns: int) -> str:
     first, last = f"{first_ns * 1e-9:.3f}", f"{last_ns * 1e-9:.3f}"
     return first if first == last else f"{first}–{last}"
+
+
+REPAIRED = Written((".mcap", ".bag"))
+
+
+class Damaged(StrEnum):
+    """Treatment of damaged bytes."""
+
+    drop = "drop"
+    keep = "keep"
+
+
+class Repair(Report, frozen=True, kw_only=True, tag="imutool.repair/1"):
+    """Report of `imutool repair`; `kept` counts damaged stretches kept as attachments (MCAP)."""
+
+    output: str
+    whole: bool
+    messages: dict[str, int]
+    chunks: int
+    kept: int | UnsetType = UNSET
+    losses: dict[str, Any]
+
+
+@app.command(
+    epilog="Example: [bold]imutool repair crashed.mcap saved.mcap[/]. Exit code 0: the log was intact; 3: data are lost."
+)
+def repair(
+    source: Annotated[str, typer.Argument(metavar="IN", help="A damaged MCAP log or ROS 1 bag: a file or a URL.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="New log with all intact messages."), REPAIRED],
+    damaged: Annotated[
+        Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
+    ] = Damaged.drop,
+    max_chunk: MaxChunk = None,
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Save the intact messages of a damaged log or ROS 1 bag, and report the losses.
+
+    The log may be cut short, overwritten, unfinished, or joined from parts.
+    """
+    from imutool.api.cleaning import repair as run
+    from imutool.bag.repair import BagReport
+
+    with progress("Repairing", verbose, quiet) as tell:
+        repaired = run(
+            source,
+            target,
+            damaged=damaged.value,
+            max_chunk=max_chunk,
+            overwrite=overwrite,
+            progress=lambda done, total: tell(done, total, ""),
+        )
+    report = Repair(
+        output=target,
+        whole=repaired.whole,
+        messages=dict(repaired.messages),
+        chunks=repaired.chunks,
+        kept=UNSET if isinstance(repaired, BagReport) else repaired.kept,
+        losses=repaired.plain() if isinstance(repaired, BagReport) else repaired.losses.plain(),
+    )
+    if not write_json(report, json_to, overwrite=overwrite):
+        tell_losses(report.losses)
+        counts = ", ".join(f"{count} on {topic}" for topic, count in report.messages.items()) or "no message"
+        state = "the log was whole" if report.whole else "saved"
+        say(f"{target}: {state}, {counts}")
+    if report.losses["stretches"]:
+        raise typer.Exit(LOST)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.bias_start.fitness import Fitness
+from imutool.bias_start import Fitness
 from imutool.cli.app import HTML, LOG, LOST, RRD, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError

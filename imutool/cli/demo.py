@@ -1,4 +1,4 @@
-"""Demo on a made-up recording: raw files, logs, a model, a debiased log and its figures."""
+"""`imutool demo` on a made-up recording: logs, a model, a debiased log and its figures."""
 
 from __future__ import annotations
 
@@ -6,33 +6,29 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-import numpy as np
+import typer
 
-from imutool.conversion.run import convert
-from imutool.debiasing import debias
+from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written, app
+from imutool.cli.evaluate import Score
+from imutool.cli.terminal import epoch_line, err, figures, plain, progress, say, write_json
 from imutool.errors import ConfigError, not_installed
-from imutool.evaluation import evaluate
-from imutool.recording import Recording
-from imutool.sensor.made_up_flight import ACCEL, GYRO, FlightSettings, flight
-from imutool.training.fit import Epoch, TrainSettings
-from imutool.training.run import train
-from imutool.viewing.html import report
-from imutool.viewing.model.runs import load
-from imutool.viewing.rerun import scene
+from imutool.report import Report
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imutool.recording import Recording
+    from imutool.training.fit import Epoch
+    from imutool.training.settings import TrainSettings
+
+FOLDER = Written(files=("*",), keeps=True)
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5
 STEPS = 60  # of each stage; some twenty seconds in all on two cores
-
-# A consumer's sensor: a factor of two per cent and a degree of misalignment outweigh what its bias drifts in a minute.
-SENSOR = FlightSettings(
-    gyro=msgspec.structs.replace(GYRO, scale=0.02, misalignment_rad=0.015, warm_up=0.001),
-    accel=msgspec.structs.replace(ACCEL, scale=0.02, misalignment_rad=0.015, warm_up=0.005),
-)
-
 IMU_HEADER = "#timestamp [ns]," + ",".join(
     [f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz"] + [f"a_RS_S_{axis} [m s^-2]" for axis in "xyz"]
 )
@@ -41,6 +37,44 @@ TRUTH_HEADER = "#timestamp," + ",".join(
     + [f" q_RS_{axis} []" for axis in "wxyz"]
     + [f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"]
 )
+
+
+class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
+    """Report of `imutool demo`: scores of `imutool evaluate`, and the files written."""
+
+    results: list[Score]
+    log: str
+    debiased: str
+    model: str
+    rrd: str
+    png: str
+    report: str
+
+
+@app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
+def demo(
+    folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder."), FOLDER] = Path("demo-out"),
+    overwrite: Overwrite = False,
+    json_to: Json = None,
+    verbose: Verbose = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a demo without download: convert, train, debias, evaluate, view.
+
+    The recording is made up.
+    """
+
+    def announce(line: str) -> None:
+        if not quiet:
+            err.print(plain(line), highlight=False, soft_wrap=True)
+
+    with progress("Training", verbose, quiet) as tell:
+        done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
+    files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
+    if not write_json(DemoReport(results=msgspec.convert(done.results, list[Score]), **files), json_to, overwrite=overwrite):
+        say("Pure integration of a flight the model has not seen, from its true start:")
+        figures(done.results)
+        say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")
 
 
 @dataclass(frozen=True)
@@ -72,6 +106,15 @@ def run(
     Raises:
         ConfigError: the folder holds an earlier demo, or the extras view and report are not installed.
     """
+    from imutool.conversion.run import convert
+    from imutool.debiasing import debias
+    from imutool.evaluation import evaluate
+    from imutool.training.run import train
+    from imutool.training.settings import TrainSettings
+    from imutool.viewing.html import report
+    from imutool.viewing.model.runs import load
+    from imutool.viewing.rerun import scene
+
     _check(out, overwrite)
     raw, logs = out / "raw", out / "logs"
     names = [f"flight_{number}" for number in (*TRAINING_SEEDS, seed)]
@@ -100,7 +143,14 @@ def run(
 
 def made_up(seed: int) -> Recording:
     """Made-up flight of one minute; `seed` sets motion, turn-on bias and drift."""
-    return flight(seed, SENSOR)
+    from imutool.sensor.made_up_flight import ACCEL, GYRO, FlightSettings, flight
+
+    # A consumer's sensor: a factor of two per cent and a degree of misalignment outweigh what its bias drifts in a minute.
+    sensor = FlightSettings(
+        gyro=msgspec.structs.replace(GYRO, scale=0.02, misalignment_rad=0.015, warm_up=0.001),
+        accel=msgspec.structs.replace(ACCEL, scale=0.02, misalignment_rad=0.015, warm_up=0.005),
+    )
+    return flight(seed, sensor)
 
 
 def _check(out: Path, overwrite: bool) -> None:
@@ -128,5 +178,7 @@ def write_asl(recording: Recording, folder: Path) -> None:
 
 def _write_csv(path: Path, header: str, t_ns: np.ndarray, *columns: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    import numpy as np
+
     rows = zip(t_ns.tolist(), np.concatenate(columns, axis=1).tolist(), strict=True)
     path.write_text("\n".join([header, *(f"{t},{','.join(map(repr, row))}" for t, row in rows)]) + "\n", encoding="ascii")

@@ -162,8 +162,8 @@ def audit(
     Gravity, frame, axes, transport term, point, timing, noise, digits and limits, each with its equation and the report of a
     simulator that had it.
     """
-    from imutool.diagnosis.audit.audit import audit as run
-    from imutool.diagnosis.audit.audit import lines
+    from imutool.diagnosis.audit import audit as run
+    from imutool.diagnosis.audit import lines
 
     with progress("Auditing", verbose, quiet) as tell:
         tell(0, 1, "reading")

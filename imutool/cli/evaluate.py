@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 from msgspec import convert
 
-from imutool.bias_start.fitness import Fitness
+from imutool.bias_start import Fitness
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.errors import ImutoolError

@@ -15,7 +15,7 @@ from imutool.cli.terminal import err, log_to_stderr, plain, say, tell_warning, w
 from imutool.errors import ConfigError
 from imutool.report import Report
 from imutool.viewing import Output
-from imutool.viewing.stream.session import StreamStatistics
+from imutool.viewing.stream import StreamStatistics
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,7 +10,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "export": ("convert", "Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."),
     "new-converter": ("convert", "Write a template of a converter, with a test, as a package of its own."),
     "info": ("info", "Report the topics, quality and damage of a log; with --noise, also its IMU noise."),
-    "repair": ("repair", "Save the intact messages of a damaged log or ROS 1 bag, and report the losses."),
+    "repair": ("clean", "Save the intact messages of a damaged log or ROS 1 bag, and report the losses."),
     "train": ("train", "Train a bias model on logs of one sensor with true poses."),
     "debias": ("debias", "Write a log with a debiased IMU topic; all other messages stay unchanged."),
     "clean": ("clean", "Find the defects of a log's IMU, and say whether the log can be trusted."),
@@ -22,9 +22,9 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
     "audit": ("diagnose", "Find what a simulator's IMU does wrong by itself."),
-    "models": ("shipped", "List the models that ship, their sensor and their card."),
-    "schema": ("shipped", "Print the JSON Schema of a report, or list the reports."),
-    "demo": ("shipped", "Run a demo without download: convert, train, debias, evaluate, view."),
+    "models": ("models", "List the models that ship, their sensor and their card."),
+    "schema": ("models", "Print the JSON Schema of a report, or list the reports."),
+    "demo": ("demo", "Run a demo without download: convert, train, debias, evaluate, view."),
     "fleet": ("fleet_view", "Process many logs on all cores of this machine, or on a Ray cluster."),
 }
 MODULES = tuple(dict.fromkeys(module for module, _ in COMMANDS.values()))

@@ -125,7 +125,7 @@ def conceal(
         return
     if findings is not None or json_to is not None:
         raise ConfigError("--findings and --json need --open", where="conceal", fix="Add --open")
-    from imutool.blind_cases.cases import conceal as run
+    from imutool.blind_cases import conceal as run
 
     run(places[0], places[1], seed=seed, kind=kind, size=size, noise=noise, longest_s=longest, truth=truth)
     say(f"{places[1]}: sim.mcap, real.mcap, envelope.json and its key")
@@ -136,7 +136,7 @@ def conceal(
 def _open(folder: Path, findings: Path | None, json_to: str | None, overwrite: bool) -> None:
     import msgspec
 
-    from imutool.blind_cases.cases import open_case
+    from imutool.blind_cases import open_case
 
     result: dict[str, Any] = msgspec.to_builtins(open_case(folder, findings))
     if write_json(result, json_to, overwrite=overwrite):

@@ -78,7 +78,7 @@ def convert(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
-    """Convert one sequence to the file `out`, or several sequences to the folder `out`; `logs/` is a folder for one too.
+    """Convert one sequence to the file `out`, or several (one too, to `logs/`) to the folder.
 
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
     are worth. `mapping` is a file that states what the columns of a table mean.

@@ -13,8 +13,8 @@ from imutool.errors import DataError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.recording import Imu
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, MessageTopic, Remarks
-from imutool.recording.two_sensors import joined
 
 SENSOR_WORDS = (r"gyro(scope)?", r"accel(erometer)?")
 

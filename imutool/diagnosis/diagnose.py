@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
-from imutool.diagnosis.audit.audit import simulator_remarks
+from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
@@ -208,7 +208,6 @@ def effect_sizes(
     imu: str | None = None,
     truth: str | None = None,
     effects: Sequence[str] = EVERY_UNIT,
-    settings: DiagnoseSettings | None = None,
 ) -> EffectSizes:
     """Fit effects of the catalogue to a recording, significant or not.
 
@@ -217,8 +216,7 @@ def effect_sizes(
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
-    simulated = None if sim is None else read_log(sim, imu=imu)
-    settings = settings or DiagnoseSettings()
+    simulated, settings = None if sim is None else read_log(sim, imu=imu), DiagnoseSettings()
     aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)

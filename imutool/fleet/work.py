@@ -19,6 +19,7 @@ from imutool.fleet.sources import partial_files, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.recovery.losses import unchecked
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.storage.system import peak_bytes, user
 from imutool.mcap_io.storage.target import Target
@@ -224,7 +225,8 @@ def _lost(losses: Mapping[str, Any] | None) -> dict[str, Any]:
         lines.append(f"byte {stretch['offset']}, {stretch['bytes']} bytes: {stretch['reason']} ({count} messages lost)")
     more = len(stretches) - len(lines) + losses["stretches_not_listed"]
     status = {"status": "lost", "exit_code": LOST} if stretches else {}
-    return {**status, "losses": (*lines, *([f"{more} more stretches"] if more else ())), "warnings": tuple(losses["mended"])}
+    warnings = (*losses["mended"], *unchecked(losses))
+    return {**status, "losses": (*lines, *([f"{more} more stretches"] if more else ())), "warnings": warnings}
 
 
 def _diagnose(job: _Job) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def step_means(u: Samples) -> Float[Tensor, "batch n-1 3"]:
 
 
 def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch n 3 3"]:
-    """Products `increments[0] @ ... @ increments[k]` for every k, from those of pairs: two products for each.
+    """Products `increments[0] @ ... @ increments[k]` for every k, two for each.
 
     Blelloch's scan.
     """

@@ -27,8 +27,8 @@ from imutool.mcap_io.codec.messages import Messages, Rows
 from imutool.mcap_io.codec.reflection import Reflected, format_of, reflect, reflect_cdr
 from imutool.mcap_io.codec.transforms import TYPE, Transforms
 from imutool.mcap_io.index import LogIndex
+from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import named_kind
-from imutool.recording.two_sensors import joined
 
 ENCODINGS = ("cdr", "ros1")
 REFLECTED = ("protobuf", "json", "flatbuffer")  # encodings whose messages are searched for those of an IMU and for poses

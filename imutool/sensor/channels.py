@@ -21,7 +21,7 @@ from imutool.recording import Recording, Scalars, seconds
 MOST_READ, MOST_TRIED = 200, 6  # fields of a log that are read, and those that become channels
 LEAST_MESSAGES = 5
 LEAST_COVERAGE = 0.5  # of the IMU's time
-MOST_STATES = 16  # distinct whole numbers of an enumeration; two are a switch, which may drive
+MOST_STATES = 16  # distinct whole numbers of an enumeration
 CLOCK_CORRELATION = 0.9999  # with time, of a rising number that only counts
 COPY_CORRELATION = 0.9999  # with another channel
 LISTED = 12
@@ -85,8 +85,13 @@ def _may_drive(field: Fields, recording: Recording) -> bool:
     covered = min(field.t_ns[-1], imu.t_ns[-1]) - max(field.t_ns[0], imu.t_ns[0])
     if len(field) < LEAST_MESSAGES or covered < LEAST_COVERAGE * (imu.t_ns[-1] - imu.t_ns[0]):
         return False
-    whole = bool((values == np.rint(values)).all())
-    if whole and 2 < len(np.unique(values)) <= MOST_STATES:
+    return len(np.unique(values)) == 2 or is_quantity(field)  # two values are a switch, which may drive
+
+
+def is_quantity(field: Fields) -> bool:
+    """Whether a number is a quantity: no enumeration, counter or clock."""
+    values = field.values
+    if bool((values == np.rint(values)).all()) and len(np.unique(values)) <= MOST_STATES:
         return False
     rising = bool((np.diff(values) >= 0.0).all())
     return not (rising and _correlation(seconds(field.t_ns, int(field.t_ns[0])), values) > CLOCK_CORRELATION)

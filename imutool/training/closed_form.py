@@ -103,28 +103,24 @@ def solve(
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = _window_sets(pool, window_s, part)
+    sets = [(first, n) for first, n in _window_sets(pool, window_s, part) if len(first)]
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
     own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
     turns = ROTATION[sensor] if nuisances else slice(0, 0)
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
-    carried: dict[int, Float[Tensor, "m n 3 3"]] = {}  # by window length: the gyro does not change here
-    motion: dict[int, Float[Tensor, "m n 3"]] = {}  # nor does what the samples alone add
+    fixed: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
         own[:, :3] = rest[:, columns]
         now = torch.cat([W.flatten()[:known], own.flatten()])
         H, g = torch.diag(prior), prior * now
         for first, n in sets:
-            if not len(first):
-                continue
             windows = pool.windows(first, n, rest[pool.log[first]])
-            if sensor == "accel" and n not in carried:
-                carried[n] = carried_attitudes(model, windows)
-            if n not in motion:
-                motion[n] = model.motion_bias(sensor, windows.segment)
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None, carried.get(n), motion[n])
+            if n not in fixed:
+                carried = carried_attitudes(model, windows) if sensor == "accel" else None
+                fixed[n] = carried, model.motion_bias(sensor, windows.segment)
+            e, A = sensor_residual(model, sensor, windows, W if matrix else None, *fixed[n])
             rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
             by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
             apart = own.clone()

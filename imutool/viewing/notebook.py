@@ -29,7 +29,7 @@ INLINE = "inline"  # the installed package: works without a network and with a r
 HEIGHT_PX = 720
 
 
-def show(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX, source: bool = True) -> Viewer:
+def show(logs: Sequence[RunData], *, source: bool = True) -> Viewer:
     """Viewer widget with all logs, as wide as its cell; nothing comes from the network.
 
     The first widget of a session takes some seconds. RERUN_NOTEBOOK_ASSET, set before, selects another source of its program.
@@ -50,7 +50,7 @@ def show(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX, source: bool = 
     os.environ.setdefault(ASSET, INLINE)  # read when the next line first runs
     from rerun.notebook import Viewer
 
-    viewer = Viewer(width="auto", height=height_px, recording=recording)
+    viewer = Viewer(width="auto", height=HEIGHT_PX, recording=recording)
     scene.send(logs, recording, source=source)
     recording.flush(timeout_sec=FLUSH_S)  # the widget has everything now
     return viewer
@@ -61,17 +61,16 @@ class Page:
     """HTML page that a notebook shows in a sandboxed frame."""
 
     content: str
-    height_px: int = HEIGHT_PX
 
     def _repr_html_(self) -> str:
-        style = f"width: 100%; height: {self.height_px}px; border: 0"
+        style = f"width: 100%; height: {HEIGHT_PX}px; border: 0"
         return f'<iframe sandbox="" style="{style}" srcdoc="{html.escape(self.content)}"></iframe>'
 
 
-def page(logs: Sequence[RunData], *, height_px: int = HEIGHT_PX) -> Page:
+def page(logs: Sequence[RunData]) -> Page:
     """HTML report of all logs, which also shows in a saved notebook.
 
     Raises:
         ConfigError: no log, or matplotlib is not installed.
     """
-    return Page(report.page(logs), height_px)
+    return Page(report.page(logs))

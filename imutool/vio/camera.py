@@ -123,7 +123,6 @@ def observe(
     *,
     features: int,
     pixel_noise: float,
-    rig: StereoRig = EUROC,
     longest: int = LONGEST_TRACK,
 ) -> tuple[list[Frame], Int64[np.ndarray, " tracks"]]:
     """The frames at some true poses, and which landmark each track is.
@@ -140,7 +139,7 @@ def observe(
             live = []
             frames.append(Frame(np.zeros(0, np.int64), np.zeros((0, 3))))
             continue
-        pixels, visible = _look(landmarks_w, R_wb[k], poses.p_wb[k], rig)
+        pixels, visible = _look(landmarks_w, R_wb[k], poses.p_wb[k])
         live = [(track, age + 1) for track, age in live if age < longest and visible[landmark_of[track]]]
         free = visible.copy()
         free[[landmark_of[track] for track, _ in live]] = False
@@ -163,12 +162,12 @@ def blackouts(t_s: Float64[np.ndarray, " n"], length_s: float, every_s: float) -
 
 
 def _look(
-    landmarks_w: Landmarks, R_wb: Float64[np.ndarray, "3 3"], p_wb: Float64[np.ndarray, "3"], rig: StereoRig
+    landmarks_w: Landmarks, R_wb: Float64[np.ndarray, "3 3"], p_wb: Float64[np.ndarray, "3"]
 ) -> tuple[Landmarks, Bool[np.ndarray, " m"]]:
     """Pixels of every landmark from one body pose (NaN behind the camera), and which are visible."""
-    p_c = ((landmarks_w - p_wb) @ R_wb - rig.p_bc) @ rig.R_bc
-    pixels = rig.project(p_c)
-    return pixels, rig.in_view(pixels) & (p_c[:, 2] >= NEAR_M) & (p_c[:, 2] <= FAR_M)
+    p_c = ((landmarks_w - p_wb) @ R_wb - EUROC.p_bc) @ EUROC.R_bc
+    pixels = EUROC.project(p_c)
+    return pixels, EUROC.in_view(pixels) & (p_c[:, 2] >= NEAR_M) & (p_c[:, 2] <= FAR_M)
 
 
 def _head_start(rng: Generator, longest: int, *, first: bool) -> int:

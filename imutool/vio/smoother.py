@@ -24,7 +24,7 @@ from imutool import config
 from imutool.errors import NumericsError, not_installed
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
-from imutool.vio.camera import EUROC, Frame, StereoRig
+from imutool.vio.camera import EUROC, Frame
 
 Vectors = Float64[np.ndarray, "n 3"]
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -90,7 +90,6 @@ def estimate(
     *,
     pixel_std: float,
     bias_states: bool,
-    rig: StereoRig = EUROC,
     progress: Callable[[int, int], None] | None = None,
 ) -> Estimate:
     """The trajectory at some samples of the IMU (`keyframes`, their rows).
@@ -104,7 +103,7 @@ def estimate(
         ConfigError: GTSAM is not installed.
         NumericsError: the estimate diverged; the message says when, and how.
     """
-    run = _Run(load(), settings, rig, pixel_std, bias_states=bias_states)
+    run = _Run(load(), settings, pixel_std, bias_states=bias_states)
     t_s = seconds(imu.t_ns[keyframes], int(imu.t_ns[keyframes[0]]))
     rows = []
     for k, frame in enumerate(frames):
@@ -149,15 +148,15 @@ def _diverged(t_s: float, reason: str) -> NumericsError:
 class _Run:
     """The smoother and what is to be added to it at the next keyframe."""
 
-    def __init__(self, gtsam: Any, settings: SmootherSettings, rig: StereoRig, pixel_std: float, *, bias_states: bool) -> None:
-        self._gtsam, self._settings, self._rig, self._bias_states = gtsam, settings, rig, bias_states
+    def __init__(self, gtsam: Any, settings: SmootherSettings, pixel_std: float, *, bias_states: bool) -> None:
+        self._gtsam, self._settings, self._bias_states = gtsam, settings, bias_states
         self._smoother = gtsam.BatchFixedLagSmoother(settings.lag_s)
         self._params = _preintegration(gtsam, settings, bias_states=bias_states)
         self._pixel_noise = gtsam.noiseModel.Isotropic.Sigma(3, pixel_std)
         self._landmark_noise = gtsam.noiseModel.Isotropic.Sigma(3, LANDMARK_STD_M)
         self._fixed_bias = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_BIAS_STD)
-        self._calibration = gtsam.Cal3_S2Stereo(rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline_m)
-        self._body_from_camera = gtsam.Pose3(gtsam.Rot3(rig.R_bc), rig.p_bc)
+        self._calibration = gtsam.Cal3_S2Stereo(EUROC.fx, EUROC.fy, 0.0, EUROC.cx, EUROC.cy, EUROC.baseline_m)
+        self._body_from_camera = gtsam.Pose3(gtsam.Rot3(EUROC.R_bc), EUROC.p_bc)
         self._k, self._known = 0, set[int]()
         self._state = gtsam.NavState()
         self._bias = gtsam.imuBias.ConstantBias()
@@ -219,7 +218,7 @@ class _Run:
         camera = self._state.pose().compose(self._body_from_camera)
         nearest = frame.pixels.copy()
         nearest[:, 1] = np.minimum(nearest[:, 1], nearest[:, 0] - LEAST_DISPARITY_PX)
-        places_c = self._rig.back_project(nearest)
+        places_c = EUROC.back_project(nearest)
         for track, pixels, place_c in zip(frame.tracks.tolist(), frame.pixels, places_c, strict=True):
             key = gtsam.symbol("l", track)
             if track not in self._known:

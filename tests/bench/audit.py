@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from imutool.config import build
-from imutool.diagnosis.audit.audit import simulator_faults
+from imutool.diagnosis.audit import simulator_faults
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses, Recording
 

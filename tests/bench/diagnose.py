@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from imutool.blind_cases.cases import OPENED, conceal, open_case
+from imutool.blind_cases import OPENED, conceal, open_case
 from imutool.blind_cases.catalogue import CATALOGUE, FORMS
 from imutool.blind_cases.draw import SIZES
 from imutool.blind_cases.envelope import to_truth

@@ -21,8 +21,7 @@ from jaxtyping import Float64
 from numpy.random import Generator, default_rng
 from scipy.interpolate import make_interp_spline
 
-from imutool.blind_cases import catalogue
-from imutool.blind_cases.cases import case_log, write_case
+from imutool.blind_cases import case_log, catalogue, write_case
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter
 from imutool.blind_cases.information import achievable_rms, location
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, stamps_ns

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.blind_cases import draw
-from imutool.blind_cases.cases import LONGEST_S, POSE_NOISE, plan
+from imutool.blind_cases import LONGEST_S, POSE_NOISE, draw, plan
 from imutool.blind_cases.effects import Six, Stage
 from imutool.blind_cases.envelope import ConcealedTruth
 from imutool.blind_cases.information import DECIMATION, Detectability, with_catalogue

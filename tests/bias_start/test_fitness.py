@@ -12,8 +12,9 @@ import imutool
 from imutool.bias import linear, static
 from imutool.bias.io import save
 from imutool.bias.model import BiasModel
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import auto
-from imutool.bias_start.fitness import Fitness, judge
+from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.errors import ModelError
 from imutool.recording import Imu, Recording

@@ -20,8 +20,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from support.report_schema import assert_valid
 
-from imutool.blind_cases import catalogue, draw
-from imutool.blind_cases.cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, conceal, open_case
+from imutool.blind_cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, catalogue, conceal, draw, open_case
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT
 from imutool.blind_cases.draw import draw_parameters
 from imutool.blind_cases.effects import ACCEL, EARTH_RAD_S, GYRO, Reading, first_order, spring_mount

@@ -225,6 +225,17 @@ def test_damage_inside_a_zip_member_is_found_by_its_checksum(make):
     refused(source, "mav0/imu0/data.csv: cannot be read")
 
 
+def test_a_member_of_a_zip_without_a_name_is_left_out(make):
+    source = make.tmp / "one.zip"
+    nameless = zipfile.ZipInfo("x")
+    nameless.filename = ""
+    with zipfile.ZipFile(source, "w") as archive:
+        archive.writestr(nameless, b"1")
+        for name, content in make.files("euroc").items():
+            archive.writestr(name, content)
+    assert [len(recording.imu) > 0 for recording in euroc.read(source)] == [True]
+
+
 def test_a_text_file_named_zip_is_refused(make):
     source = make.tmp / "one.zip"
     source.write_text("<html>404</html>")

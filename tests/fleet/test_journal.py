@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import random
 import re
 import subprocess
 import sys
@@ -13,6 +12,8 @@ from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.fleet import journal as journals
@@ -72,31 +73,41 @@ def test_a_line_that_cannot_be_read_costs_that_log_alone(tmp_path: Path) -> None
         assert journal.ours("a.mcap")
 
 
-def test_after_random_bytes_only_what_they_hit_is_done_again(tmp_path: Path) -> None:
+KEYS = [f"log_{k:02d}" for k in range(80)]
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the journal of 80 finished logs."""
+    folder = tmp_path_factory.mktemp("journal")
+    fill(folder, *KEYS)
+    (folder / "whole").write_bytes((folder / NAME).read_bytes())
+    return folder
+
+
+@given(at=st.integers(0, 10**6), at_end=st.booleans(), size=st.sampled_from([1, 2, 40, 900, 5000]), new=st.binary(min_size=1))
+@settings(max_examples=80, deadline=None)
+def test_after_random_bytes_only_what_they_hit_is_done_again(
+    filled: Path, at: int, at_end: bool, size: int, new: bytes
+) -> None:
     """Anywhere, of any length, also over the ends of lines and over the line that says with which settings it was begun."""
-    keys = [f"log_{k:02d}" for k in range(80)]
-    fill(tmp_path, *keys)
-    whole, rng = (tmp_path / NAME).read_bytes(), random.Random(0)
+    whole = (filled / "whole").read_bytes()
     ends = [at for at, byte in enumerate(whole) if byte == 10]
-    for n in range(60):
-        raw, at, size = (
-            bytearray(whole),
-            rng.choice([0, rng.choice(ends), rng.randrange(len(whole))]),
-            rng.choice([1, 1, 40, 900]),
-        )
-        raw[at : at + size] = rng.choice([rng.randbytes(size), bytes(size), b"\n" * size])[: len(raw) - at]
-        (tmp_path / NAME).write_bytes(raw)
-        changed = [k for k in range(at, min(at + size, len(whole))) if raw[k] != whole[k]]
-        spared = set()
-        with Journal(tmp_path, SETTINGS, resume=True) as journal:
-            for key in keys:
-                line = whole.index(b'{"line":"done","key":"%s"' % key.encode())
-                if not any(line <= k < whole.index(b"\n", line) for k in changed):
-                    spared.add(key)
-            assert {key for key in keys if journal.done(key) == result(key, messages=7)} == spared, (n, at, size)
-            assert {key for key in keys if journal.done(key)} == spared
-            if at + size < ends[-2]:  # else the last note that a target is ours goes as well
-                assert all(journal.ours(f"{key}.mcap") for key in keys)
+    raw, at = bytearray(whole), ends[at % len(ends)] if at_end else at % len(whole)
+    raw[at : at + size] = (new * size)[: min(size, len(raw) - at)]
+    (filled / NAME).write_bytes(raw)
+    changed = [k for k in range(at, min(at + size, len(whole))) if raw[k] != whole[k]]
+    spared = set()
+    with Journal(filled, SETTINGS, resume=True) as journal:
+        for key in KEYS:
+            line = whole.index(b'{"line":"done","key":"%s"' % key.encode())
+            if not any(line <= k < whole.index(b"\n", line) for k in changed):
+                spared.add(key)
+        assert {key for key in KEYS if journal.done(key) == result(key, messages=7)} == spared
+        assert {key for key in KEYS if journal.done(key)} == spared
+        if at + size < ends[-2]:  # else the last note that a target is ours goes as well
+            near = size > 2000  # a hole that takes both notes of a target, 32 logs apart
+            assert near or all(journal.ours(f"{key}.mcap") for key in KEYS)
 
 
 def test_a_changed_digit_in_a_line_is_seen(tmp_path: Path) -> None:

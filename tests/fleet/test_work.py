@@ -13,6 +13,7 @@ import pytest
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from fuzz.numbers import put_log
 from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
@@ -24,6 +25,7 @@ from imutool.fleet.work import target_name, work
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write
+from imutool.sensor.made_up_flight import flight
 
 
 def task(source: Path, out: Path, settings: Settings, name: str = "a/log.mcap", **changes: Any) -> Task:
@@ -50,6 +52,15 @@ def test_a_debiased_log_is_what_debias_makes_of_it(done: Result, logs: Path, tmp
     assert done.messages > 4000
     (imu,) = done.imus
     assert (imu.topic, imu.model) == ("/imu0", "linear")
+
+
+@pytest.mark.parametrize("kind", ["debias", "repair"])
+def test_a_log_without_crcs_is_said_to_be_unchecked(tmp_path: Path, kind: Any) -> None:
+    imu = flight(1, duration_s=6.0).imu
+    put_log(tmp_path / "in.mcap", imu.t_ns, imu.gyro, imu.accel, None, crcs=False)
+    done = work(task(tmp_path / "in.mcap", tmp_path / "out", Settings(command=kind)))
+    assert done.status == "ok", done.error
+    assert any("lie where no CRC covers them" in warning for warning in done.warnings)
 
 
 def test_a_model_of_another_sensor_is_refused_or_warned_of(logs: Path, tmp_path: Path) -> None:

@@ -70,10 +70,12 @@ def problems(rng: random.Random, folder: Path) -> Iterator[str]:
         yield from (f"{'+'.join(names)}: {' '.join(words)}: {sentence}" for sentence in finite_log(folder / "out.mcap"))
 
 
-def put_log(path: Path, t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray, poses: Poses | None) -> None:
+def put_log(
+    path: Path, t_ns: np.ndarray, gyro: np.ndarray, accel: np.ndarray, poses: Poses | None, *, crcs: bool = True
+) -> None:
     """Writes any samples, also those that a `Recording` refuses."""
     with path.open("wb") as file:
-        out = Writer(file, chunk_size=20_000)
+        out = Writer(file, chunk_size=20_000, enable_crcs=crcs)
         out.start("ros2")
         topics = [("/imu0", schemas.IMU, t_ns, encode_imu(t_ns, gyro, accel, "imu0"))]
         if poses is not None:

@@ -80,7 +80,7 @@ def test_without_the_extra_the_refusal_says_what_to_install_and_what_else_there_
 def test_a_page_is_shut_in_its_frame_whatever_a_log_is_called(data: RunData, monkeypatch: pytest.MonkeyPatch) -> None:
     content = '<h1>"flight"</h1><script>alert(1)</script></iframe><img src=x>'
     monkeypatch.setattr(notebook.report, "page", lambda logs: content)
-    shown = notebook.page([data], height_px=500)._repr_html_()
+    shown = notebook.page([data])._repr_html_()
     ((tag, attributes),) = Frame(shown).tags
     assert (tag, attributes["sandbox"], attributes["srcdoc"]) == ("iframe", "", content)
-    assert "height: 500px" in str(attributes["style"])
+    assert "height: 720px" in str(attributes["style"])

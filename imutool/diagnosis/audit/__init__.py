@@ -1,1 +1,144 @@
-"""Audit of a simulator's IMU: what it does wrong by itself."""
+"""Audit of a simulator: its IMU beside its own poses, a data sheet and a recording.
+
+log ─ kinematics ─> Kinematics ─ kinematic_fit ─> KinematicFit ─ motion_faults, noise_faults ─> AuditReport
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from imutool.bias_start.stretches import longest_stretch, measured_recording
+from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
+from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
+from imutool.diagnosis.audit.noise import Expected, noise_faults
+from imutool.diagnosis.result import Estimate
+from imutool.diagnosis.wording.quantity import grouped
+from imutool.errors import ImutoolError
+from imutool.location import Location
+from imutool.mcap_io.read import read
+from imutool.noise import datasheet
+from imutool.recording import Recording
+from imutool.report import Report
+from imutool.units import AXES, SENSORS
+
+BY_RECORDING = ("body_centre", "clipping_absent", "digits_absent", "bandwidth_absent")
+BY_NOISE = ("noise_absent", "noise_per_sample", "noise_density")
+
+
+class AuditReport(Report, frozen=True, tag="imutool.audit/1"):
+    """Report of `imutool audit`: faults of a simulator, and what these logs cannot show.
+
+    Attributes:
+        faults: each with its signal, numbers, equation and the report of a simulator that had it.
+        tested: names of the faults that were looked for.
+        not_tested: the others, with the reason.
+    """
+
+    sim: str
+    real: str | None
+    faults: tuple[FaultFound, ...]
+    tested: tuple[str, ...]
+    not_tested: Mapping[str, str]
+
+
+def audit(sim: Location, real: Location | None = None, *, noise: str | Path = "none", imu: str | None = None) -> AuditReport:
+    """Faults of a simulator's IMU, by its own poses, a data sheet's `noise` and a recording.
+
+    Raises:
+        ConfigError, LogError: a log or the data sheet cannot be read.
+        DataError: the simulation has no poses that can be differentiated.
+    """
+    simulated = measured_recording(longest_stretch(read(sim, imu=imu)), free_fall=True)
+    recording = None if real is None else measured_recording(longest_stretch(read(real, imu=imu)))
+    sheet = datasheet.read(noise)
+    faults = simulator_faults(simulated, recording, sheet)
+    not_tested = dict(_not_tested(recording, sheet))
+    tested = tuple(name for name in FAULTS if name not in not_tested)
+    return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested)
+
+
+def simulator_faults(sim: Recording, real: Recording | None, sheet: datasheet.Noise) -> list[FaultFound]:
+    """Faults of a simulation by its own poses, and beside a recording and a data sheet.
+
+    Raises:
+        DataError: it has no poses that can be differentiated.
+    """
+    if not sim.truths:
+        raise sim.no_truth("a simulation without poses", "a simulation with the poses of its body")
+    moved = kinematics(sim)
+    fit = kinematic_fit(moved)
+    by_motion = motion_faults(moved, fit)
+    expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
+    expected += [] if real is None else [Expected.of_recording(real.imu)]
+    faults = noise_faults(sim.imu, fit.residual, expected)
+    if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step
+        by_motion = [fault for fault in by_motion if fault.fault not in ("backward_difference", "step_delay")]
+    faults = by_motion + faults
+    if real is not None and real.truths:
+        faults += _body_centre(fit, real)
+    return faults
+
+
+def simulator_remarks(sim: Recording) -> list[str]:
+    """Remarks on a simulation's errors by its own poses; none without usable poses."""
+    try:
+        faults = simulator_faults(sim, None, datasheet.read("none"))
+    except ImutoolError:
+        return []
+    return [f"The simulation is wrong by itself: {fault.sentence} ({fault.fault})" for fault in faults]
+
+
+def lines(report: AuditReport) -> list[str]:
+    """Text of a report: a sentence, then one line for each fault with its numbers and source."""
+    count = len(report.faults)
+    head = (
+        "No fault of the simulator found." if not count else f"{count} fault{'s' if count > 1 else ''} of the simulator found:"
+    )
+    out = [head]
+    for fault in report.faults:
+        numbers = ", ".join(quantity.labelled for quantity in grouped(fault.parameters))
+        out.append(f"{fault.fault}: {fault.sentence}{f' ({numbers})' if numbers else ''}.")
+        out.append(f"    {fault.equation}; reported in {fault.source}")
+    out += [f"Not tested: {', '.join(names)}: {why}." for why, names in _grouped(report.not_tested).items()]
+    return out
+
+
+def _has_noise(sheet: datasheet.Noise) -> bool:
+    """Whether a data sheet states any density; `none` states zeros."""
+    return any((sheet.values(f"{sensor}_density") > 0.0).any() for sensor in SENSORS)
+
+
+def _grouped(not_tested: Mapping[str, str]) -> dict[str, list[str]]:
+    out: dict[str, list[str]] = {}
+    for name, why in not_tested.items():
+        out.setdefault(why, []).append(name)
+    return out
+
+
+def _not_tested(real: Recording | None, sheet: datasheet.Noise) -> Iterator[tuple[str, str]]:
+    if not _has_noise(sheet):
+        yield "bias_never_walks", "it needs a data sheet (`noise`)"
+    if real is None:
+        yield from ((name, "they need a recording (`real`)") for name in BY_RECORDING)
+    if real is None and not _has_noise(sheet):
+        yield from ((name, "they need a data sheet (`noise`) or a recording (`real`)") for name in BY_NOISE)
+
+
+def _body_centre(fit: KinematicFit, real: Recording) -> list[FaultFound]:
+    """A sensor at the body's centre, where the recording's sits off it."""
+    try:
+        moved: Kinematics = kinematics(real)
+    except ImutoolError:
+        return []
+    ours, theirs = fit.estimates, kinematic_fit(moved).estimates
+    clear = [abs(theirs[a].value - ours[a].value) > CERTAIN * np.hypot(theirs[a].std, ours[a].std) for a in AXES]
+    sizes = [float(np.linalg.norm([arm[a].value for a in AXES])) for arm in (ours, theirs)]
+    if not any(clear) or sizes[0] > 0.2 * sizes[1] or sizes[1] < LEAST_ARM_M:
+        return []
+    return [found("body_centre", "accel", **{a: Estimate(theirs[a].value, theirs[a].std, "m") for a in AXES})]
+
+
+LEAST_ARM_M = 0.02  # of the recording's sensor from its poses' point

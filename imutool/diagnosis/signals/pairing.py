@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.quantities import in_one_unit, is_quantity, metres, unwrapped
+from imutool.diagnosis.signals.quantities import in_one_unit, metres, unwrapped
 from imutool.geometry import quaternion
 from imutool.location import Location
 from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, TF, TWIST
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording.columns import longest_run
+from imutool.sensor.channels import is_quantity
 
 MOST_READ, MOST_COMPARED, MOST_DRIVERS = 400, 24, 6
 SAME = 1e-12  # relative difference of two copies

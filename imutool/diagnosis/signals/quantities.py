@@ -1,4 +1,4 @@
-"""Numbers of a log as quantities: enumerations, angles that wrap, units that differ."""
+"""Signals as quantities: angles that wrap, units that differ, positions in metres."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ from jaxtyping import Float64
 
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.mcap_io.fields import Fields
-from imutool.recording import seconds
 
-MOST_STATES = 16  # whole numbers of an enumeration
-CLOCK_CORRELATION = 0.9999  # with time, of a number that only counts
 FACTOR_ERROR = 0.05
 TURNS = (2.0 * np.pi, 360.0)
 EARTH_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
@@ -25,16 +22,6 @@ FACTORS = {
     0.01: "hundreds",
     1e-3: "thousands",
 }
-
-
-def is_quantity(values: Fields) -> bool:
-    """Whether a number is a quantity: no enumeration, counter or clock."""
-    v = values.values
-    if bool((v == np.rint(v)).all()) and len(np.unique(v)) <= MOST_STATES:
-        return False
-    t_s = seconds(values.t_ns, int(values.t_ns[0]))
-    rising = bool((np.diff(v) >= 0.0).all())
-    return not (rising and abs(float(np.corrcoef(t_s, v)[0, 1])) > CLOCK_CORRELATION)
 
 
 def unwrapped(pair: SignalPair) -> SignalPair:

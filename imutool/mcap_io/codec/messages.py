@@ -6,7 +6,7 @@ A log holds millions of messages, so they go through numpy instead of the classe
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -49,6 +49,13 @@ class Messages(NamedTuple):
             LogError: one beyond 2^63 ns.
         """
         return signed(self.heads["log_time"])
+
+    def of_channels(self, channels: Collection[int]) -> Bool[np.ndarray, " n"]:
+        """Messages of some channels; `np.isin` takes ten times as long for the few there are."""
+        of, mask = self.heads["channel"], np.zeros(len(self.heads), bool)
+        for channel in channels:
+            mask |= of == channel
+        return mask
 
 
 class Rows(NamedTuple):

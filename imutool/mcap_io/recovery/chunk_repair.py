@@ -142,7 +142,7 @@ def find_definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
         while len(data) - at >= HEAD.size:
             opcode, length = HEAD.unpack_from(data, at)
             whole = data[at : at + HEAD.size + length] if length <= len(data) - at - HEAD.size else b""
-            if not whole:
+            if not whole or not opcode:  # no record: zeros that unpack to megabytes
                 break
             if opcode in DEFINITIONS:
                 with contextlib.suppress(LogError):
@@ -161,7 +161,7 @@ def _unpack_start(packed: bytes) -> bytes:
     """The contents before the damage, at most `MAX_UNPACKED` bytes."""
     if not packed.startswith(FRAME_MAGICS):
         return packed[:MAX_UNPACKED]
-    data = b""
+    data = bytearray()
     try:
         for piece in _unpack_steps(packed):
             data += piece
@@ -169,7 +169,7 @@ def _unpack_start(packed: bytes) -> bytes:
                 break
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError):
         pass  # the contents before the damage are kept
-    return data[:MAX_UNPACKED]
+    return bytes(data[:MAX_UNPACKED])
 
 
 def _unpack_steps(packed: bytes) -> Iterator[bytes]:

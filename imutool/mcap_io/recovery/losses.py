@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -124,11 +124,15 @@ def describe(losses: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"unproven: {losses['unproven_messages']} messages may be of either of two recordings, and are on no topic"
         )
+    return lines + [f"unchecked: {what}" for what in unchecked(losses)]
+
+
+def unchecked(losses: Mapping[str, Any]) -> Iterator[str]:
+    """What no CRC covers, in words."""
     if losses["unchecked_messages"]:
-        lines.append(f"unchecked: {losses['unchecked_messages']} messages lie where no CRC covers them")
+        yield f"{losses['unchecked_messages']} messages lie where no CRC covers them"
     if losses["unchecked_definitions"]:
-        lines.append(f"unchecked: no CRC covers the definition of {', '.join(losses['unchecked_definitions'])}")
-    return lines
+        yield f"no CRC covers the definition of {', '.join(losses['unchecked_definitions'])}"
 
 
 def _stretch(entry: Mapping[str, Any]) -> str:

@@ -21,7 +21,7 @@ from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.signals import KINDS
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color
 from imutool.viewing.rerun.plots import frame, whole_time_axis
-from imutool.viewing.rerun.sdk import FLUSH_S, elapsed_column, entity_path, new_stream, require_rerun, unique_names
+from imutool.viewing.rerun.sdk import elapsed_column, entity_path, new_stream, require_rerun, rrd_bytes, unique_names
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -47,15 +47,12 @@ def rrd(d: Diagnosis) -> bytes:
     Raises:
         ConfigError: Rerun is not installed.
     """
-    recording = new_stream(f"diagnosis {Path(d.real[0]).stem if d.real else ''}")
-    import rerun as rr
 
-    stream = rr.binary_stream(recording)
-    recording.send_blueprint(blueprint(d))
-    log(d, recording)
-    content = stream.read(flush_timeout_sec=FLUSH_S)
-    assert content, "a stream that was written to holds bytes"
-    return bytes(content)
+    def send(recording: rr.RecordingStream) -> None:
+        recording.send_blueprint(blueprint(d))
+        log(d, recording)
+
+    return rrd_bytes(new_stream(f"diagnosis {Path(d.real[0]).stem if d.real else ''}"), send)
 
 
 def log(d: Diagnosis, to: rr.RecordingStream) -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 if TYPE_CHECKING:
+    import rerun as rr
+
     from imutool.location import Location
     from imutool.mcap_io.log import Log
     from imutool.viewing.model.run_data import RunData
@@ -72,13 +74,12 @@ def rrd(path: Path, target: Target | None = None) -> bytes | None:
 
     target = target or Target()
     root = tuple(part for part in target.prefix.split("/") if part)
-    recording = sdk.new_stream(data.name, application=target.application, recording=target.recording)
-    import rerun as rr
 
-    written = rr.binary_stream(recording)
-    recording.send_blueprint(layout.blueprint([data], root=root))
-    scene.log([data], recording, root=root)
-    return written.read(flush_timeout_sec=sdk.FLUSH_S)
+    def send(recording: rr.RecordingStream) -> None:
+        recording.send_blueprint(layout.blueprint([data], root=root))
+        scene.log([data], recording, root=root)
+
+    return sdk.rrd_bytes(sdk.new_stream(data.name, application=target.application, recording=target.recording), send)
 
 
 def _is_mcap(path: Path) -> bool:

@@ -215,7 +215,7 @@ class _Imu:
                 static=True,
                 strict=True,
             )
-            to.log(self._path("bias", kind, "sigma"), styles.sigma_curves("estimated"), static=True, strict=True)
+            to.log(self._path("bias", kind, "sigma"), styles.sigma_curves(), static=True, strict=True)
 
     def log(self, block: DebiasedBlock, streams: list[rr.RecordingStream]) -> None:
         """Log the new samples of a block: after the recovery of a damaged log some come again."""

@@ -13,7 +13,7 @@ from imutool.viewing.rerun import layout
 from imutool.viewing.rerun import source as other_topics
 from imutool.viewing.rerun.entities import errors, paths, report, signals
 from imutool.viewing.rerun.plots import diagonal_m
-from imutool.viewing.rerun.sdk import FLUSH_S, Scope, recording_name, require_rerun, scopes, stream_of_logs
+from imutool.viewing.rerun.sdk import Scope, recording_name, require_rerun, rrd_bytes, scopes, stream_of_logs
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -65,14 +65,7 @@ def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:
     Raises:
         ConfigError: no log, or Rerun is not installed.
     """
-    recording = stream_of_logs(logs)
-    import rerun as rr
-
-    written = rr.binary_stream(recording)
-    send(logs, recording, source=source)
-    content = written.read(flush_timeout_sec=FLUSH_S)
-    assert content, "a stream that was written to holds bytes"
-    return bytes(content)
+    return rrd_bytes(stream_of_logs(logs), lambda recording: send(logs, recording, source=source))
 
 
 def _log_one(data: RunData, to: rr.RecordingStream, scope: Scope, with_source: bool) -> None:

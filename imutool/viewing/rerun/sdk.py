@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal
 
 from imutool.errors import ConfigError, not_installed
@@ -66,6 +66,17 @@ def new_stream(name: str, *, application: str | None = None, recording: str | No
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     return stream
+
+
+def rrd_bytes(recording: rr.RecordingStream, send: Callable[[rr.RecordingStream], None]) -> bytes:
+    """Content of an .rrd file with what `send` logs into a recording."""
+    import rerun as rr
+
+    written = rr.binary_stream(recording)
+    send(recording)
+    content = written.read(flush_timeout_sec=FLUSH_S)
+    assert content, "a stream that was written to holds bytes"
+    return bytes(content)
 
 
 def recording_name(logs: Sequence[RunData]) -> str:

@@ -1,1 +1,30 @@
-"""Streams of samples: sources, debiased one sample at a time, shown live."""
+"""Live streams of samples: sources, messages, the session, and its statistics."""
+
+from __future__ import annotations
+
+from imutool.report import Section
+
+
+class Delay(Section, frozen=True):
+    """Delay from a sample's arrival to its corrected value, in ms, after the start."""
+
+    median: float
+    p99: float
+    max: float
+
+
+class StreamStatistics(Section, frozen=True):
+    """Statistics of a live stream; `start` says where the start bias comes from."""
+
+    samples: int
+    seconds: float
+    rate_hz: float
+    delay_ms: Delay | None
+    start: str
+    gaps: int
+    out_of_order: int
+    not_measured: int
+    malformed: int
+    not_shown: int
+    gyro_bias: list[float]
+    accel_bias: list[float]

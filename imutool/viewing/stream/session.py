@@ -21,35 +21,9 @@ from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
-from imutool.report import Section
+from imutool.viewing.stream import Delay, StreamStatistics
 from imutool.viewing.stream.samples import Malformed, Sample
 from imutool.viewing.stream.sources import Samples
-
-
-class Delay(Section, frozen=True):
-    """Delay from a sample's arrival to its corrected value, in ms, after the start."""
-
-    median: float
-    p99: float
-    max: float
-
-
-class StreamStatistics(Section, frozen=True):
-    """Statistics of a live stream; `start` says where the start bias comes from."""
-
-    samples: int
-    seconds: float
-    rate_hz: float
-    delay_ms: Delay | None
-    start: str
-    gaps: int
-    out_of_order: int
-    not_measured: int
-    malformed: int
-    not_shown: int
-    gyro_bias: list[float]
-    accel_bias: list[float]
-
 
 START_S = 2.0  # of the stream, from which the start bias is taken
 BATCH_S = 0.1  # shown together

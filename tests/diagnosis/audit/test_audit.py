@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from support.report_schema import assert_valid
 
-from imutool.diagnosis.audit.audit import simulator_faults, simulator_remarks
+from imutool.diagnosis.audit import simulator_faults, simulator_remarks
 from imutool.diagnosis.audit.faults import FAULTS
 from imutool.mcap_io.write import write
 

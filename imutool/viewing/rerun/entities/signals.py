@@ -56,7 +56,7 @@ def _log_bias(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace)
         if run.bias_std is not None:
             margin = SIGMAS * run.bias_std[:, columns]
             band = np.hstack([bias + margin, bias - margin])
-            log_curves(to, data, f"{entity}/sigma", run.imu.t_ns, band, styles.sigma_curves("estimated", rank=rank))
+            log_curves(to, data, f"{entity}/sigma", run.imu.t_ns, band, styles.sigma_curves(rank))
 
 
 def model_index(data: RunData, trace: Trace) -> int:

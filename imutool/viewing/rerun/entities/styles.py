@@ -101,9 +101,9 @@ def true_bias_curves() -> rr.SeriesLines:
     return curves(axis_names("true"), [blend_to_grey(color, TRUE_FADE) for color in XYZ], 2.0 * BOLD_WIDTH)
 
 
-def sigma_curves(name: str, *, rank: int = 0) -> rr.SeriesLines:
+def sigma_curves(rank: int = 0) -> rr.SeriesLines:
     """Style of six thin curves: three standard deviations above the estimate, and three below."""
-    names = [f"{axis} {name} {sign}3σ" for sign in "+-" for axis in AXES]
+    names = [f"{axis} estimated {sign}3σ" for sign in "+-" for axis in AXES]
     return curves(names, [blend_to_grey(color, RAW_FADE) for color in axis_colors(rank)] * 2, RAW_WIDTH)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.recording.two_sensors import sensor_delay, unit_by_gravity
+from imutool.recording.joined_imu import sensor_delay, unit_by_gravity
 
 RNG = np.random.default_rng(11)
 DURATION_S = 60.0
