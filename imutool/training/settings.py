@@ -29,7 +29,7 @@ class IncrementSettings(Settings, frozen=True):
 
 
 class PoseFloors(Settings, frozen=True):
-    """Least residual of a window by the kind of its poses: what their makers claim, whatever the log shows.
+    """Least residual of a window by the kind of its poses: what their makers claim.
 
     Poses made with this IMU follow its errors, so that a small residual is no sign of their quality. An estimate is taken for
     the best there is: 0.1 degrees and 0.05 km/h, by which KITTI's OXTS RT3003 is specified. Ten times that is odometry.
