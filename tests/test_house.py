@@ -361,7 +361,14 @@ def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-WITHOUT_TORCH = "import sys; sys.modules.update(torch=None, torchdiffeq=None); sys.argv[0] = 'imutool'\n"
+WITHOUT_TORCH = """import sys
+class Missing:
+    def find_spec(self, name, *others):
+        if name.partition(".")[0] in ("torch", "torchdiffeq"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Missing())
+sys.argv[0] = "imutool"
+"""
 
 
 def test_without_torch_training_says_what_to_install_and_debias_works(tmp_path: Path, logs: Path) -> None:
