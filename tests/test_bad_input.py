@@ -259,6 +259,7 @@ JUMPING: tuple[tuple[str, ...], ...] = (
     ("audit", "in.mcap"),
     ("convert", "in.mcap", "out.mcap"),
     ("export", "in.mcap", "out", "--format", "euroc"),
+    ("live", "--from", "in.mcap", "--speed", "1e12", "--no-view"),
     ("clean", "in.mcap", "--json", "-"),
     ("view", "in.mcap", "--html", "out.html"),
 )  # debias: tests/bias_start/test_stretches.py; train: tests/training/test_segments.py

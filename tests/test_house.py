@@ -361,12 +361,16 @@ def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-WITHOUT_TORCH = """import sys
-class Missing:
-    def find_spec(self, name, *others):
-        if name.partition(".")[0] in ("torch", "torchdiffeq"):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-sys.meta_path.insert(0, Missing())
+WITHOUT_TORCH = """
+import importlib.machinery
+import sys
+
+class Finder(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        return None if name in {"torch", "torchdiffeq"} else super().find_spec(name, path, target)
+
+sys.meta_path = [Finder if each is importlib.machinery.PathFinder else each for each in sys.meta_path]
 sys.argv[0] = "imutool"
 """
 

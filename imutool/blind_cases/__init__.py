@@ -19,7 +19,7 @@ from numpy.random import Generator, SeedSequence, default_rng
 
 from imutool.blind_cases import catalogue, draw
 from imutool.blind_cases.catalogue import NO_LIMIT
-from imutool.blind_cases.effects import TEMPERATURE, Model, Theta
+from imutool.blind_cases.effects import Model, Theta
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter, digest, read_json, seal, unseal
 from imutool.blind_cases.gain import WITHOUT_MISFIT
 from imutool.blind_cases.information import achievable_rms, cramer_rao_bounds, detectability, location
@@ -244,6 +244,3 @@ def _grade(noise: str | Path, rng: Generator) -> tuple[str, Noise]:
 def _check(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
         raise ConfigError(f"`{name}` is {value!r}", where=name, expected=f"one of {', '.join(known)}")
-
-
-assert {TEMPERATURE, *catalogue.DRIVERS} == set(catalogue.TOPICS)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 
 from imutool.blind_cases import effects as forward
-from imutool.blind_cases.effects import ACCEL, GYRO, Model, Parameter, Reading, Six, Stage, Theta, Times, on
+from imutool.blind_cases.effects import ACCEL, GYRO, TEMPERATURE, Model, Parameter, Reading, Six, Stage, Theta, Times, on
 
 RATE_HZ = 50.0  # of the channels
 LONGEST_LAG_S = 0.3
@@ -24,7 +24,7 @@ TOPICS: Mapping[str, str] = {
     "/rotor/speed": "rad/s",
     "/servo/position": "rad",
 }
-DRIVERS = ("/battery/voltage", "/motor/current", "/rotor/speed", "/servo/position")
+DRIVERS = tuple(topic for topic in TOPICS if topic != TEMPERATURE)
 AXES = "xyz"
 PAIRS = tuple(a + b for a in AXES for b in AXES)
 NO_LIMIT = 1e9  # a sensor that never clips

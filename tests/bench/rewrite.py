@@ -10,7 +10,8 @@ Jobs: `debias` is the whole command with its start and a shipped model, checks a
 the model that costs least. The others are parts, shown with `--jobs`, in CPU seconds and memory beyond what a python costs
 that only imports what they need: `rewrite` adds the four topics of `imutool debias`, with a constant for a bias; `rewrite
 verify none` and `rewrite verify all` check less and more; `pass` adds nothing; `re-encode` is the best existing way, every
-message read and written by the `mcap` package; `sha256` is what a digest of all bytes would add.
+message read and written by the `mcap` package; `sha256` is what a digest of all bytes would add; `floor` is the least
+that Python can do with a check of every byte: read into one buffer, CRC, write.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.codec.messages import message_record, message_rows
+from imutool.mcap_io.codec.records import crc32
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
@@ -151,6 +153,15 @@ def reencode(source: Path, target: Path, packing: str) -> None:
         writer.finish()
 
 
+def floor(source: Path, target: Path) -> None:
+    """Every byte read into one buffer, summed and written: no log is looked at."""
+    buffer, crc = memoryview(bytearray(1 << 20)), 0
+    with source.open("rb", buffering=0) as file, target.open("wb", buffering=0) as out:
+        while count := file.readinto(buffer):
+            crc = crc32(buffer[:count], crc)
+            out.write(buffer[:count])
+
+
 def job(name: str, source: Path, target: Path, packing: str) -> None:
     """One job, in a process of its own; then says its peak memory (which the parent's would hide from getrusage)."""
     if name.startswith("rewrite") or name in ("pass", "crc"):
@@ -160,6 +171,8 @@ def job(name: str, source: Path, target: Path, packing: str) -> None:
         reencode(source, target, packing)
     elif name == "sha256":
         sha256(source)
+    elif name == "floor":
+        floor(source, target)
     status = Path("/proc/self/status").read_text()
     print(json.dumps(next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))))
 

@@ -21,6 +21,7 @@ from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import Imu
+from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.viewing.stream import Delay, StreamStatistics
 from imutool.viewing.stream.samples import Malformed, Sample
 from imutool.viewing.stream.sources import Samples
@@ -163,6 +164,8 @@ class _Session:
             self._out_of_order += 1
         elif step_ns > GAP_S * 1e9:
             self._gaps += 1
+            for warning in jump_warnings(clock_jumps(np.array([self._last_ns, found.stamp_ns]))):
+                logger.warning("%s", warning)
         self._last_ns = max(self._last_ns, found.stamp_ns)
         self._samples += 1
 
