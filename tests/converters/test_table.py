@@ -325,6 +325,49 @@ def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
     assert list(recording.truths) == ["/ground_truth/pose"]
 
 
+@pytest.mark.parametrize("poses", ["xyzw in ns", "single columns in mm", "unknown order"])
+def test_groups_of_hdf5_with_their_own_times_come_in_on_these(convert, tmp_path, poses):
+    """An IMU, poses and GPS of three lengths; only what has no time of its own is left out, and named."""
+    import h5py
+
+    rng = np.random.default_rng(5)
+    t_ns, gps_ns = T_NS[0] + 30_000_000 + 8_000_000 * np.arange(40), T_NS[0] + 200_000_000 * np.arange(7)
+    p, latitude = rng.normal(size=(40, 3)), rng.normal(size=7)
+    q_wxyz = rng.normal(size=(40, 4))
+    q_wxyz /= np.linalg.norm(q_wxyz, axis=1, keepdims=True)
+    in_mm = poses == "single columns in mm"
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values, unit in (("time", T_NS, "ns"), ("gyro", GYRO, "rad/s"), ("accel", ACCEL, "m/s^2")):
+            file[f"imu/{name}"] = values
+            file[f"imu/{name}"].attrs["units"] = unit
+        file["mocap/time"], file["mocap/position"] = t_ns if not in_mm else t_ns * 1e-9, p * 1000.0 if in_mm else p
+        file["mocap/position"].attrs["units"] = "mm" if in_mm else "m"
+        if in_mm:
+            for axis, column in zip("wxyz", q_wxyz.T, strict=True):
+                file[f"mocap/q{axis}"] = column
+        else:
+            file["mocap/quaternion_xyzw" if "xyzw" in poses else "mocap/orientation"] = q_wxyz[:, [1, 2, 3, 0]]
+        file["gps/time"], file["gps/latitude"] = gps_ns, latitude
+        file["levels"] = np.arange(17.0)
+    done = convert(tmp_path / "log.h5", tmp_path / "out.mcap")
+    assert done.returncode == 3
+    (loss,) = [line for line in done.stderr.splitlines() if "left out" in line]
+    assert loss.endswith("left out: levels")
+    same(tmp_path / "out.mcap")
+    recording = read(tmp_path / "out.mcap")
+    assert np.array_equal(recording.scalars["/gps_latitude"].t_ns, gps_ns)
+    assert np.array_equal(recording.scalars["/gps_latitude"].values[:, 0], latitude)
+    if poses == "unknown order":
+        assert "mocap/orientation has four columns of no certain order" in done.stderr
+        assert not recording.truths
+        assert np.array_equal(recording.scalars["/mocap_orientation_3"].values[:, 0], q_wxyz[:, 0])
+        return
+    truth = recording.truth
+    np.testing.assert_allclose(truth.t_ns, t_ns, atol=500 if in_mm else 0)  # a double of this epoch keeps 240 ns
+    np.testing.assert_allclose(truth.p_wb, p, atol=1e-12)
+    np.testing.assert_allclose(np.abs((truth.q_wb_wxyz * q_wxyz).sum(axis=1)), 1.0, atol=1e-12)
+
+
 def test_hdf5_of_ronin_gives_the_uncorrected_rates_and_an_estimate(convert, tmp_path):
     h5py = pytest.importorskip("h5py", reason="needs imutool[tables]")
     seconds = 1000.0 + np.arange(COUNT) * 0.005
