@@ -64,19 +64,6 @@ DIGITS = str.maketrans("012", "xyz")
 
 
 Entries = dict[str, str | list[str]]  # of a map
-RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
-    "time": "synced/time",
-    "time_unit": "s",
-    "gyro": [f"synced/gyro_uncalib[{axis}]" for axis in range(3)],
-    "gyro_unit": "rad/s",
-    "accel": [f"synced/acce[{axis}]" for axis in range(3)],
-    "accel_unit": "m/s^2",
-}
-RONIN_POSES: Entries = {  # by the visual-inertial estimate of a second phone
-    "position": [f"pose/tango_pos[{axis}]" for axis in range(3)],
-    "quaternion_wxyz": [f"pose/tango_ori[{axis}]" for axis in range(4)],
-    "pose_kind": "estimate",
-}
 
 
 class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -154,9 +141,6 @@ class Proposal(msgspec.Struct):
 def propose(columns: Columns) -> Proposal:
     """Map that names, units and magnitudes of the columns suggest."""
     proposal = Proposal({}, [], [])
-    if {"synced/time", "synced/gyro_uncalib[0]", "synced/acce[0]"} <= columns.values.keys():
-        poses = RONIN_POSES if {"pose/tango_pos[0]", "pose/tango_ori[3]"} <= columns.values.keys() else {}
-        return Proposal({**RONIN, **poses}, [], ["its arrays are those of RoNIN"])
     names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values}
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)

@@ -21,21 +21,24 @@ from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
-from ._files import head, name
+from ._files import find_folders, head, name
 from ._table_files import kind_of, load
-from ._table_groups import group_entries, time_beside
+from ._table_groups import group_entries, known_layout, time_beside
 from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map
 from ._table_text import Columns
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 LARGEST_NS = 2**63 - 1
+DATA_FILE = "data.hdf5"
+MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is a table file; tables in folders are not looked for."""
+    """The source itself, if it is a table file; of folders those of data sets that hold `data.hdf5`, as RoNIN's."""
     if source.is_dir():
-        return []
+        folders = find_folders(source, lambda path: kind_of(head(path / DATA_FILE), path / DATA_FILE) == "hdf5")
+        return [Sequence(folder.name, folder.path / DATA_FILE) for folder in folders]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
     return [Sequence(name(source), source)] if kind_of(head(source), source) else []
@@ -71,14 +74,19 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     poses = _truth(columns, table, path, place, remarks)
     if poses and table.truth_time and not table.truth_file:
         used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
+    scalars, constants = _further(columns, table, used, gyro_ns, place)
     return MessageLog(
         sequence.name,
         path.name,
         imus={table.topic: imu},
         poses=poses,
         kinds=dict.fromkeys(poses, table.pose_kind),
-        scalars=_scalars(columns, table, used, gyro_ns, place),
-        metadata={"imutool": {"format": "table", "sequence": sequence.name}, "imutool/map": _described(table)},
+        scalars=scalars,
+        metadata={
+            "imutool": {"format": "table", "sequence": sequence.name},
+            "imutool/map": _described(table),
+            **({"imutool/constants": constants} if constants else {}),
+        },
         remarks=remarks,
     )
 
@@ -94,7 +102,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
     Raises:
         ConfigError: something is open; the message holds a map file to complete.
     """
-    proposal = propose(columns)
+    proposal = known_layout(columns) or propose(columns)
     if proposal.open:
         shown = ", ".join(list(columns.values)[:40])
         raise ConfigError(
@@ -190,12 +198,12 @@ def _quaternions(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, 
     return quaternion.unit(Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]])
 
 
-def _scalars(
+def _further(
     columns: Columns, table: TableMap, used: set[str], t_ns: Int64[np.ndarray, " n"], where: Path
-) -> dict[str, Scalars]:
-    """Further columns of the table as topics, on the clock of their group or on the IMU's."""
+) -> tuple[dict[str, Scalars], dict[str, str]]:
+    """Further columns as topics, on the clock of their group or on the IMU's, and short ones without time as texts."""
     clocks: dict[str, Int64[np.ndarray, " n"]] = {}
-    left = []
+    constants, left = {}, []
     for column in [c for c in columns.values if c not in used]:
         beside = time_beside(columns, column, table.time, table.time_unit)
         if beside is not None:
@@ -203,6 +211,8 @@ def _scalars(
                 clocks[column] = _times(columns, *beside, where)
         elif len(columns.values[column]) == len(t_ns):
             clocks[column] = t_ns
+        elif len(columns.values[column]) <= MOST_CONSTANTS:
+            constants[column] = str(columns.values[column].tolist())
         else:
             left.append(column)
     if left:
@@ -220,4 +230,4 @@ def _scalars(
             scalars[f"/{topic if topic[0].isalpha() else f'column_{topic}'}"] = Scalars(
                 kept.t_ns, kept.values, unit[1] if unit else ""
             )
-    return scalars
+    return scalars, constants

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import zipfile
 from datetime import UTC, datetime
 from pathlib import Path
@@ -368,22 +369,52 @@ def test_groups_of_hdf5_with_their_own_times_come_in_on_these(convert, tmp_path,
     np.testing.assert_allclose(np.abs((truth.q_wb_wxyz * q_wxyz).sum(axis=1)), 1.0, atol=1e-12)
 
 
-def test_hdf5_of_ronin_gives_the_uncorrected_rates_and_an_estimate(convert, tmp_path):
-    h5py = pytest.importorskip("h5py", reason="needs imutool[tables]")
+@pytest.mark.parametrize("rates", ["gyro_uncalib", "gyro"])
+def test_a_folder_of_ronin_gives_the_least_corrected_rates_and_an_estimate(convert, tmp_path, rates):
+    import h5py
+
     seconds = 1000.0 + np.arange(COUNT) * 0.005
-    with h5py.File(tmp_path / "data.hdf5", "w") as file:
-        arrays = {"time": seconds, "gyro": GYRO + 1.0, "gyro_uncalib": GYRO, "acce": ACCEL, "linacce": ACCEL, "grav": ACCEL}
+    q_wxyz = np.tile([0.5, 0.1, 0.7, 0.5], (COUNT, 1))
+    (tmp_path / "a000_1").mkdir()
+    (tmp_path / "a000_1" / "info.json").write_text("{}")
+    with h5py.File(tmp_path / "a000_1" / "data.hdf5", "w") as file:
+        arrays = {"time": seconds, "gyro": GYRO + 1.0, rates: GYRO, "acce": ACCEL, "linacce": ACCEL, "grav": ACCEL}
         for name, values in arrays.items():
             file[f"synced/{name}"] = values
-        file["pose/tango_pos"] = np.zeros((COUNT, 3))
-        file["pose/tango_ori"] = np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
-    done = convert(tmp_path / "data.hdf5", tmp_path / "out.mcap")
+        file["pose/tango_pos"] = GYRO * 100.0
+        file["pose/tango_ori"] = q_wxyz
+    done = convert(tmp_path / "a000_1", tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr
+    assert ("Android has corrected" in done.stderr) == (rates == "gyro")
     recording = read(tmp_path / "out.mcap", truth="/estimate/pose")
     assert np.array_equal(recording.imu.gyro, GYRO)
     assert np.array_equal(recording.imu.accel, ACCEL)
-    assert len(recording.truths["/estimate/pose"]) == COUNT
+    assert np.array_equal(recording.truths["/estimate/pose"].p_wb, GYRO * 100.0)
+    np.testing.assert_allclose(recording.truths["/estimate/pose"].q_wb_wxyz, q_wxyz, atol=1e-12)
     assert not read(tmp_path / "out.mcap").truths
+
+
+def test_hdf5_of_blackbird_gives_the_raw_rates_the_motion_capture_and_its_constants(convert, tmp_path):
+    import h5py
+
+    p, q_xyzw = GYRO * 100.0, np.tile([0.1, 0.7, 0.5, 0.5], (COUNT, 1))
+    (tmp_path / "train").mkdir()
+    with h5py.File(tmp_path / "train" / "data.hdf5", "w") as file:
+        file["ts"] = 1000.0 + np.arange(COUNT) * 0.01
+        for kind, bias in (("raw", 0.0), ("calib", 1.0)):
+            file[f"gyro_{kind}"], file[f"accel_{kind}"] = GYRO - bias, ACCEL - bias
+        file["traj_target"] = np.concatenate([p, q_xyzw, p], axis=1)
+        file["gyro_bias"] = file["accel_bias"] = np.array([0.25, 0.5, 1.0])
+    shutil.copytree(tmp_path / "train", tmp_path / "val")
+    done = convert(tmp_path, tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "val.mcap").is_file()
+    recording = read(tmp_path / "out" / "train.mcap")
+    assert np.array_equal(recording.imu.gyro, GYRO)
+    assert np.array_equal(recording.imu.accel, ACCEL)
+    assert np.array_equal(recording.truth.p_wb, p)
+    np.testing.assert_allclose(recording.truth.q_wb_wxyz, q_xyzw[:, [3, 0, 1, 2]], atol=1e-12)
+    assert recording.metadata["imutool/constants"]["gyro_bias"] == "[0.25, 0.5, 1.0]"
 
 
 def test_messages_written_as_a_table_keep_the_names_of_their_fields(convert, tmp_path):
