@@ -35,7 +35,7 @@ MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metada
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is a table file; of folders those of data sets that hold `data.hdf5`, as RoNIN's."""
+    """The source itself, if it is a table; of folders those that hold `data.hdf5`, as RoNIN's."""
     if source.is_dir():
         folders = find_folders(source, lambda path: kind_of(head(path / DATA_FILE), path / DATA_FILE) == "hdf5")
         return [Sequence(folder.name, folder.path / DATA_FILE) for folder in folders]
