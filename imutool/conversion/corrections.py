@@ -19,7 +19,7 @@ from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
 from imutool.cleaning.conventions import axis_names
 from imutool.cleaning.stamp_line import read_stamps, restamped
 from imutool.conversion.message_writer import write_log
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
@@ -130,7 +130,11 @@ class _Patch:
         at, order = self.layout.stamps[which], self.layout.order
         seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
         nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
-        seconds[0], nanos[0] = divmod(self.stamp_ns(which) + by_ns, schemas.NS_PER_S)
+        moved_ns = self.stamp_ns(which) + by_ns
+        if moved_ns < 0 and self.layout.seconds == "u4":
+            what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, lies before 0"
+            raise DataError(what, expected="stamps that ROS 1 can store", fix="Cut the log there, or convert it to ROS 2 first")
+        seconds[0], nanos[0] = divmod(moved_ns, schemas.NS_PER_S)
 
 
 def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:

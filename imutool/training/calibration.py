@@ -132,7 +132,8 @@ def folded(pool: Pool, part: Part) -> Pool:
     before = torch.cumsum(length, 0) - length
     index = (torch.cumsum(counts, 0) - 1 - before[pool.log]).clamp(min=0)  # within the part; the others are not used
     log = pool.log * FOLDS + (index * FOLDS // length.clamp(min=1)[pool.log]).clamp(max=FOLDS - 1)
-    return replace(pool, names=tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS)), log=log)
+    names = tuple(f"{n} {k + 1}/{FOLDS}" for n in pool.names for k in range(FOLDS))
+    return replace(pool, names=names, log=log, floors=pool.floors.repeat_interleave(FOLDS, dim=0))
 
 
 def parameter_columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
@@ -200,7 +201,7 @@ class PhysicsFirst:
             DataError: no truth, too little of it, or different rates.
             ConfigError: unknown settings, or an effect that is not known.
         """
-        pool = Pool.of(recordings, device=device)
+        pool = Pool.of(recordings, device=device, floors=settings.pose_floors)
         torch.manual_seed(settings.seed)
         model = hybrid.Network(config_of(settings), pool.rate_hz).double()
         signals, fits = _online_signals(recordings, pool), {}

@@ -28,7 +28,6 @@ from imutool.units import SENSORS, Sensor
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
 CORRELATED = 10.0  # errors of the truth last longer than a window: this many windows are taken to say the same once
-LEAST_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
 ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
 MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes
 
@@ -131,7 +130,7 @@ def solve(
             if matrix:
                 u, _ = windows.segment.of(sensor)
                 J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
-            weight = _weight(e, windows.log, len(own))
+            weight = _weight(e, windows.log, pool.least(sensor))
             H += torch.einsum("m,mij,mik->jk", weight, J, J)
             g += torch.einsum("m,mij,mi->j", weight, J, e)
         step = -torch.linalg.solve(H, g)
@@ -251,18 +250,18 @@ def _by_log(J: Float[Tensor, "m 3 k"], log: Int[Tensor, " m"], logs: int, turns:
     return out.flatten(2)
 
 
-def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, " m"]:
+def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], least: Float[Tensor, " logs"]) -> Float[Tensor, " m"]:
     """Huber's weights, scaled so that a component of an ordinary window of its log has about unit noise, as the prior has."""
     size = e.norm(dim=1)
-    delta = HUBER_MEDIANS * median_per_log(size, log, logs)[log]
+    delta = HUBER_MEDIANS * median_per_log(size, log, least)[log]
     weight: Tensor = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
     return weight
 
 
-def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], logs: int) -> Float[Tensor, " logs"]:
-    """The median size of each log's windows.
+def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], least: Float[Tensor, " logs"]) -> Float[Tensor, " logs"]:
+    """The median size of each log's windows, and not less than a least one.
 
     Truths differ in quality by a factor of eight between rooms of one data set.
     """
-    medians = [size[log == i].median() if bool((log == i).any()) else size.median() for i in range(logs)]
-    return torch.stack(medians).clamp_min(LEAST_RESIDUAL)
+    medians = [size[log == i].median() if bool((log == i).any()) else size.median() for i in range(len(least))]
+    return torch.maximum(torch.stack(medians), least.to(size))

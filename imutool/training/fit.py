@@ -108,7 +108,7 @@ class Training:
     ) -> None:
         self.settings, self._constant = settings_for(method, settings), constant
         check_device(device)
-        self.pool = Pool.of(recordings, device=device)
+        self.pool = Pool.of(recordings, device=device, floors=self.settings.pose_floors)
         torch.manual_seed(self.settings.seed)
         config = build(registry.load("imutool.bias", method).Config, self.settings.model, where=f"model settings of {method}")
         self.model: BiasNetwork = (

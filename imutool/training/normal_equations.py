@@ -179,7 +179,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     pattern = torch.from_numpy(patterns(effects)).to(seen.pool.t)
     for step in range(len(sets) + 2):
         fit = judged = Equations.none(prior, logs, len(prior) + len(width))
-        size = prior.new_zeros(logs)
+        size = seen.pool.least(seen.sensor)
         error = terms @ torch.einsum("iqp,p->qi", pattern, theta)
         for windows in sets[: step + 1]:
             equations, size = _equations(seen, terms, pattern, error, own, windows, size)
@@ -272,7 +272,7 @@ def _summed(
     """Normal equations with Huber's weights, in units of each log's median residual; and these medians."""
     # errors add up: a median below that of shorter windows comes from so few that a log's own unknowns fit their noise
     size, logs = e.norm(dim=1), len(shorter)
-    usual = torch.maximum(median_per_log(size, log, logs), shorter)
+    usual = median_per_log(size, log, shorter)
     delta = HUBER_MEDIANS * usual[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
     parts = [log == i for i in range(logs)]

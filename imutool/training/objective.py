@@ -187,7 +187,7 @@ class WindowEndObjective(Objective):
         for n, first in self.pools:
             some = first[:: max(1, -(-len(first) * n // USUAL_SAMPLES))]
             size = torch.cat([self.errors(part, n) for part in torch.split(some, BATCH)])
-            usual[n] = median_per_log(size, self.pool.log[some], len(self.pool.names))
+            usual[n] = median_per_log(size, self.pool.log[some], self.pool.least(self.sensor))
         return usual
 
     def terms(self, generator: torch.Generator) -> Iterator[Float[Tensor, ""]]:

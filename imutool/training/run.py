@@ -150,7 +150,7 @@ def _physics_first(
     compared: dict[str, Any] = {}
     if settings.compare:
         descent.say(note("scoring left-out logs"))
-        comparison = compare(recordings, Pool.of(recordings), physics.fits, without.model)
+        comparison = compare(recordings, Pool.of(recordings, floors=settings.pose_floors), physics.fits, without.model)
         compared["left_out"] = comparison.card()
         if simpler := simpler_effects(physics.fits, comparison.kept):
             named = msgspec.structs.replace(settings, model=settings.model | simpler)
@@ -177,7 +177,7 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
         hybrid_settings = msgspec.structs.replace(settings, model=names)
         physics = PhysicsFirst.of(recordings, hybrid_settings, descent.device, lambda epoch: None)
         without = descent(physics.recordings, static.Model.method, msgspec.structs.replace(settings, model={}))
-        comparison = compare(recordings, Pool.of(recordings), physics.fits, without.model)
+        comparison = compare(recordings, Pool.of(recordings, floors=settings.pose_floors), physics.fits, without.model)
         compared["left_out"] = comparison.card()
         constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
     training = descent(recordings, linear.Model.method, settings, constant)

@@ -23,6 +23,7 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Recording, seconds
+from imutool.training.settings import PoseFloors
 from imutool.units import SENSORS, Sensor
 
 HELD_OUT = 0.2  # the last fifth of every training log validates, as in the paper
@@ -65,20 +66,27 @@ class Pool:
     held_out: Bool[Tensor, " n"]
     late: Bool[Tensor, " n"]  # samples are missing just before this one
     spans_ns: tuple[tuple[int, int], ...]  # stamps of the first and last sample of each log
+    floors: Float[Tensor, "logs 2"]  # least residual of each log's windows: gyro (rad), accel (m/s)
 
     @classmethod
-    def of(cls, recordings: Sequence[Recording], dtype: torch.dtype = torch.float64, device: str = "cpu") -> Pool:
+    def of(
+        cls,
+        recordings: Sequence[Recording],
+        dtype: torch.dtype = torch.float64,
+        device: str = "cpu",
+        floors: PoseFloors | None = None,
+    ) -> Pool:
         """All recordings of one sensor.
 
         Raises:
             DataError: no truth, logs sampled at different rates, or no log long enough to hold anything.
         """
-        pools = [cls._of_log(recording, dtype, device) for recording in recordings]
+        pools = [cls._of_log(recording, dtype, device, floors or PoseFloors()) for recording in recordings]
         rates = [pool.rate_hz for pool in pools]
         if max(rates) / min(rates) - 1 > MAX_RATE_SPREAD:
             listed = ", ".join(f"{pool.names[0]} {pool.rate_hz:.1f}" for pool in pools)
             raise DataError(f"training logs at different rates ({listed} Hz)", expected="logs of one sensor")
-        columns = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in ("t", *SAMPLED, *FLAGS)}
+        columns = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in ("t", *SAMPLED, *FLAGS, "floors")}
         log = torch.cat([pool.log + i for i, pool in enumerate(pools)])
         return cls(
             names=tuple(pool.names[0] for pool in pools),
@@ -89,7 +97,7 @@ class Pool:
         )
 
     @classmethod
-    def _of_log(cls, recording: Recording, dtype: torch.dtype, device: str) -> Pool:
+    def _of_log(cls, recording: Recording, dtype: torch.dtype, device: str, floors: PoseFloors) -> Pool:
         """One recording, on its IMU's clock."""
         try:
             both = recording.overlap()
@@ -107,9 +115,14 @@ class Pool:
             spans_ns=((int(imu.t_ns[0]), int(imu.t_ns[-1])),),
             t=torch.tensor(t, dtype=dtype, device=device),
             log=torch.zeros(len(t), dtype=torch.long, device=device),
+            floors=torch.tensor([floors.of(recording.kind_of(next(iter(recording.truths))))], dtype=dtype, device=device),
             **{name: torch.tensor(np.asarray(x), dtype=dtype, device=device) for name, x in zip(SAMPLED, sampled, strict=True)},
             **{name: torch.tensor(x, device=device) for name, x in zip(FLAGS, flags, strict=True)},
         )
+
+    def least(self, sensor: Sensor) -> Float[Tensor, " logs"]:
+        """Least residual of each log's windows."""
+        return self.floors[:, SENSORS.index(sensor)]
 
     def samples(self, window_s: float) -> int:
         """How many steps a window of this length takes."""

@@ -13,6 +13,7 @@ from imutool.errors import ConfigError
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+LEAST_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must not outweigh the prior beyond float64's digits
 
 
 class IncrementSettings(Settings, frozen=True):
@@ -25,6 +26,24 @@ class IncrementSettings(Settings, frozen=True):
     gyro_samples: tuple[Count, ...] = (16, 32)
     accel_samples: tuple[Count, ...] = (16, 32)
     stretch_s: Positive = 16.0
+
+
+class PoseFloors(Settings, frozen=True):
+    """Least residual of a window by the kind of its poses: what their makers claim.
+
+    Poses made with this IMU follow its errors, so that a small residual is no sign of their quality. An estimate is taken for
+    the best there is: 0.1 degrees and 0.05 km/h, by which KITTI's OXTS RT3003 is specified. Ten times that is odometry.
+    """
+
+    estimate_rad: Positive = 1.7e-3
+    estimate_m_s: Positive = 0.014
+    odometry_rad: Positive = 1.7e-2
+    odometry_m_s: Positive = 0.14
+
+    def of(self, kind: str) -> tuple[float, float]:
+        """Least residuals of gyro (rad) and accel (m/s); of a truth and of poses of unknown kind almost none."""
+        known = {"estimate": (self.estimate_rad, self.estimate_m_s), "odometry": (self.odometry_rad, self.odometry_m_s)}
+        return known.get(kind, (LEAST_RESIDUAL, LEAST_RESIDUAL))
 
 
 class TrainSettings(Settings, frozen=True):
@@ -47,6 +66,7 @@ class TrainSettings(Settings, frozen=True):
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
+    pose_floors: PoseFloors = PoseFloors()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
 
 

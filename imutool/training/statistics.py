@@ -145,7 +145,7 @@ def _walk(
     length = torch.bincount(pool.log)
     later = torch.arange(len(pool.t), device=pool.log.device) - begins[pool.log] >= length[pool.log] // 2
     names = tuple(f"{name} {half}" for name in pool.names for half in ("early", "late"))
-    halves = replace(pool, log=2 * pool.log + later, names=names)
+    halves = replace(pool, log=2 * pool.log + later, names=names, floors=pool.floors.repeat_interleave(2, dim=0))
     both, out = rest.repeat_interleave(2, dim=0), []
     for sensor in SENSORS:
         columns = COLUMNS[sensor]

@@ -227,3 +227,17 @@ def test_nuisances_are_as_wide_as_logs_scatter() -> None:
     assert shown(2e-3, 0.0) == (pytest.approx(2e-3, rel=0.3), pytest.approx(turn / 20))
     assert shown(0.0, 4e-3) == (pytest.approx(clock / 20), pytest.approx(4e-3, rel=0.3))
     assert shown(0.05, 0.1) == (pytest.approx(clock), pytest.approx(turn))
+
+
+def test_an_estimate_that_hides_the_errors_of_the_imu_counts_less_than_a_truth(flights: list[Recording], planted: Make) -> None:
+    """Poses made with the IMU follow it: beside them it seems to have no matrix, and their small residual is no merit."""
+    small, none = ({sensor: size * W[sensor] for sensor in W} for size in (0.1, 0.0))
+    no_rest = {sensor: np.zeros(3) for sensor in W}
+    true, hidden = planted(flights[0], small, no_rest, noise=NOISE["gyro"]), planted(flights[1], none, no_rest)
+    misses = {}
+    for kind in ("truth", "estimate", "odometry"):
+        doubtful = replace(hidden, other_poses={} if kind == "truth" else {"/ground_truth/pose": kind})
+        misses[kind] = float(np.abs(calibrate([true, doubtful])["gyro"].W.numpy() - small["gyro"]).max())
+    assert misses["truth"] > 0.9 * np.abs(small["gyro"]).max()
+    assert misses["estimate"] < 0.3 * misses["truth"], misses
+    assert misses["odometry"] < misses["estimate"], misses

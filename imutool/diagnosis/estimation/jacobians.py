@@ -72,7 +72,7 @@ class ForwardPass:
                 state = state.through(other, values)
             for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
                 if then is not now:
-                    rows = ((then - now) / h).T
+                    rows = np.subtract(then.T, now.T, order="C") / h
                     yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())
 
 

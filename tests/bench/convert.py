@@ -1,0 +1,94 @@
+"""A ROS 1 bag with an IMU and images to MCAP: imutool convert beside rosbags-convert, in one run.
+
+    python tests/bench/convert.py [--megabytes 2000]
+
+Each command runs alone in a process of its own, three times in turn; the least of each figure counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+RUNS = 3
+IMU_HZ, CAMERA_HZ, WIDTH, HEIGHT = 200, 20, 752, 480
+START_NS = 1_700_000_000_000_000_000
+
+
+def write_bag(path: Path, megabytes: int) -> int:
+    """Bag of raw images, about 7 MB a second, and an IMU; the number of its messages."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kinds = store.types
+    rng = np.random.default_rng(1)
+    pixels = rng.integers(0, 255, (8, WIDTH * HEIGHT), dtype=np.uint8)
+    ninth = np.zeros(9)
+    zero, one = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 9.81), kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    count = megabytes * 1_000_000 // (WIDTH * HEIGHT)
+    messages = 0
+    with Writer(path) as bag:
+        imu = bag.add_connection("/imu", "sensor_msgs/msg/Imu", typestore=store)
+        camera = bag.add_connection("/cam/image_raw", "sensor_msgs/msg/Image", typestore=store)
+        for n in range(count * IMU_HZ // CAMERA_HZ):
+            t_ns = START_NS + n * 1_000_000_000 // IMU_HZ
+            stamp = kinds["builtin_interfaces/msg/Time"](sec=t_ns // 10**9, nanosec=t_ns % 10**9)
+            header = kinds["std_msgs/msg/Header"](seq=n, stamp=stamp, frame_id="body")
+            sample = kinds["sensor_msgs/msg/Imu"](header, one, ninth, zero, ninth, zero, ninth)
+            bag.write(imu, t_ns, store.serialize_ros1(sample, sample.__msgtype__))
+            messages += 1
+            if n % (IMU_HZ // CAMERA_HZ) == 0:
+                image = kinds["sensor_msgs/msg/Image"](header, HEIGHT, WIDTH, "mono8", 0, WIDTH, pixels[n % 8])
+                bag.write(camera, t_ns, store.serialize_ros1(image, image.__msgtype__))
+                messages += 1
+    return messages
+
+
+def measured(command: list[str]) -> tuple[float, float, float]:
+    """Wall time and CPU time (s) and memory (MB) of a command."""
+    code = (
+        "import json, resource, subprocess, sys, time\n"
+        "start = time.perf_counter()\n"
+        "subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)\n"
+        "used = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
+        "print(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *command], check=True, capture_output=True, text=True)
+    wall, cpu, memory = map(float, done.stdout.split())
+    return wall, cpu, memory
+
+
+def main() -> None:
+    """Print a line for each command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--megabytes", type=int, default=2000)
+    parser.add_argument("--folder", type=Path, default=None, help="where bag and logs are written, and removed")
+    words = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=words.folder) as folder:
+        bag = Path(folder, "robot.bag")
+        messages = write_bag(bag, words.megabytes)
+        print(f"{bag.stat().st_size / 1e6:.0f} MB, {messages} messages")
+        rosbags = str(Path(sys.executable).with_name("rosbags-convert"))
+        commands = {
+            "imutool convert": ([sys.executable, "-m", "imutool", "convert", str(bag)], "robot.mcap"),
+            "rosbags-convert": ([rosbags, "--dst-storage", "mcap", "--src", str(bag), "--dst"], "robot"),
+        }
+        runs: dict[str, list[tuple[float, float, float]]] = {name: [] for name in commands}
+        for number in range(RUNS):
+            for name, (command, target) in commands.items():
+                out = Path(folder, f"{number}_{target}")
+                runs[name].append(measured([*command, str(out)]))
+                shutil.rmtree(out) if out.is_dir() else out.unlink()
+        for name, found in runs.items():
+            wall, cpu, memory = (min(column) for column in zip(*found, strict=True))
+            print(f"{name}: {wall:.1f} s wall, {cpu:.1f} s CPU, {memory:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()
