@@ -33,6 +33,7 @@ MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"
 HEADER_BYTES = 16
 LEAST_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
+UP_FROM_DOWN = np.array([1.0, 1.0, -1.0])
 Q_ENU_FROM_NED_WXYZ = np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]])
 Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
 NO_ACCEL = 0x7FFFFFFF  # accelerometer_timestamp_relative without an accelerometer
@@ -217,15 +218,17 @@ def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses |
         return None
     t_ns, q_ned_frd = q.t_ns, quaternion.unit(q.values)
     p_wb, v_w = np.zeros((len(t_ns), 3)), None
-    if position is not None and {*"xyz", "vx", "vy", "vz"} <= position.keys():
-        moves = in_order(_sample_ns(position), _vectors(position, "y x z vy vx vz"), f"vehicle_local_position{ending}")
-        if len(moves.t_ns) > 1:
+    has_position = position is not None and {*"xyz"} <= position.keys()
+    if position is not None and has_position:
+        names = "y x z vy vx vz" if {"vx", "vy", "vz"} <= position.keys() else "y x z"
+        moves = in_order(_sample_ns(position), _vectors(position, names), f"vehicle_local_position{ending}")
+        if has_position := len(moves.t_ns) > 1:
             inside = (t_ns >= moves.t_ns[0]) & (t_ns <= moves.t_ns[-1])
             t_ns, q_ned_frd, start = t_ns[inside], q_ned_frd[inside], moves.t_ns[0]
             knots, t = (moves.t_ns - start).astype(float), (t_ns - start).astype(float)
             both = np.stack([np.interp(t, knots, column) for column in moves.values.T], axis=1)
-            p_wb, v_w = both[:, :3] * [1.0, 1.0, -1.0], both[:, 3:] * [1.0, 1.0, -1.0]
-    if v_w is None:
+            p_wb, v_w = both[:, :3] * UP_FROM_DOWN, both[:, 3:] * UP_FROM_DOWN if both.shape[1] > 3 else None
+    if not has_position:
         remarks.notes.append(f"vehicle_attitude{ending} has no positions with it: those of its poses are zero")
     q_wb = quaternion.multiply(quaternion.multiply(Q_ENU_FROM_NED_WXYZ, q_ned_frd), Q_FRD_FROM_FLU_WXYZ)
     return Poses(t_ns, p_wb, quaternion.unit(q_wb), v_w)

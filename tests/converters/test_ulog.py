@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
 
 from imutool.converters import ulog
 from imutool.mcap_io.log import Log
@@ -177,6 +178,50 @@ def test_a_file_that_ends_within_a_message_is_told(convert, tmp_path):
     assert done.returncode == 3
     assert "ends within a message" in done.stderr
     assert len(read(tmp_path / "a.mcap", imu="/imu").imu.t_ns) == 250  # what is there comes in
+
+
+@pytest.mark.parametrize("fields", ["x y z vx vy vz", "x y z", "x y z vx vz", "x y"])
+def test_two_instances_and_simulated_truth_hold_what_pyulog_reads(convert, tmp_path, fields):
+    """Each IMU in FLU, the truth in ENU, whatever columns the position has."""
+    from pyulog import ULog
+
+    rng = np.random.default_rng(3)
+    times = [START_US + 4000 * n for n in range(500)]
+    writer, position = Writer(), "vehicle_local_position_groundtruth"
+    for instance in (0, 1):
+        for sensor in ("sensor_gyro", "sensor_accel"):
+            writer.topic(sensor, SENSOR, [(t, t, *rng.normal(size=3), 25.0) for t in times], instance)
+    q = rng.normal(size=(len(times), 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    writer.topic("vehicle_attitude_groundtruth", ATTITUDE, [(t, *row) for t, row in zip(times, q, strict=True)])
+    names = fields.split()
+    moves = [(t, *rng.normal(size=len(names))) for t in times]
+    writer.topic(position, "uint64_t timestamp;" + ";".join(f"float {name}" for name in names), moves)
+    path = writer.write(tmp_path / "sitl.ulg")
+    done = convert(path, tmp_path / "a.mcap")
+    assert done.returncode == 0, done.stderr
+    theirs = ULog(str(path))
+    for instance in (0, 1):
+        imu = read(tmp_path / "a.mcap", imu=f"/imu/sensor{instance}").imu
+        for values, sensor in ((imu.gyro, "sensor_gyro"), (imu.accel, "sensor_accel")):
+            sample = theirs.get_dataset(sensor, instance).data
+            assert np.array_equal(imu.t_ns, 1000 * sample["timestamp_sample"].astype(np.int64))
+            assert np.array_equal(values, np.stack([sample["x"], -sample["y"], -sample["z"]], axis=1).astype(float))
+    truth = read(tmp_path / "a.mcap", imu="/imu/sensor0").truth
+    sample, moved = (theirs.get_dataset(name).data for name in ("vehicle_attitude_groundtruth", position))
+    assert np.array_equal(truth.t_ns, 1000 * sample["timestamp"].astype(np.int64))
+    R_ned_frd = Rotation.from_quat(np.stack([sample[f"q[{n}]"] for n in (1, 2, 3, 0)], axis=1))
+    R_enu_ned, R_frd_flu = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+    R_wb = Rotation.from_quat(truth.q_wb_wxyz[:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(R_wb, R_enu_ned @ R_ned_frd.as_matrix() @ R_frd_flu, atol=1e-6)
+    position_known, velocity_known = {*"xyz"} <= {*names}, {"vx", "vy", "vz"} <= {*names}
+    p_wb = np.stack([moved["y"], moved["x"], -moved["z"]], axis=1) if position_known else np.zeros((len(times), 3))
+    assert np.array_equal(truth.p_wb, p_wb)
+    assert ("has no positions" in done.stderr) != position_known
+    if velocity_known:
+        assert np.array_equal(truth.v_w, np.stack([moved["vy"], moved["vx"], -moved["vz"]], axis=1))
+    else:
+        assert truth.v_w is None
 
 
 @pytest.mark.parametrize("sample", ["sample_log_small", "sample_px4_events"])
