@@ -97,6 +97,11 @@ FOUND: dict[str, tuple[int, tuple[Damage, ...], Craft]] = {
             exchanged(a.raw[:1466] + a.raw[2571:], (46, 1262), (2793, 4134)), 4024, (2**62).to_bytes(8, "little")
         ),
     ),
+    "a chunk with a damaged head of a log that nothing defines": (
+        20,
+        (overlap, length),
+        lambda a, b: over(a.raw[:1400] + b.raw[1400:], 3623, (1).to_bytes(8, "little")),
+    ),
 }
 
 

@@ -15,7 +15,7 @@ from mcap.records import Header
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.recovery.definitions import ChunkKey
+from imutool.mcap_io.recovery.definitions import NO_HABITS, ChunkKey, Habits
 from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.recovery.summary import Summary
 
@@ -31,6 +31,7 @@ class ScannedBlock:
     sizes: dict[int, tuple[int, int]]  # of the shortest and the longest message of a channel
     times: dict[int, tuple[int, int]]  # the first and the last log time of a channel
     evidence: int = 0  # for the recording it is assigned to, the more the better
+    habits: Habits = NO_HABITS  # of all blocks between two gaps
 
 
 class LogStart(NamedTuple):
@@ -91,6 +92,23 @@ def definition_runs(events: Sequence[Event]) -> dict[int, list[Definition]]:
     """Definitions outside chunks that follow one another, by the identity of the first."""
     runs = [[e for e in run if isinstance(e, Definition)] for kind, run in groupby(events, type) if kind is Definition]
     return {id(run[0]): run for run in runs}
+
+
+def note_habits(events: Sequence[Event]) -> None:
+    """Notes in every block the habits of the blocks around it, up to a gap or the end of a log."""
+    found: list[ScannedBlock] = []
+    for event in (*events, None):
+        if isinstance(event, ScannedBlock):
+            found.append(event)
+        elif not isinstance(event, Definition):
+            followed = found if isinstance(event, LogEnd) else found[:-1]  # behind the last one they may be damaged
+            bare = any(each.block.counts and not each.block.indexes for each in followed)
+            packing = {"no chunk" if each.block.compression is None else each.block.compression for each in found}
+            indexed = any(each.block.indexes for each in found)
+            habits = Habits(frozenset(packing - {""}), frozenset([True] * indexed + [False] * bare))
+            for each in found:
+                each.habits = habits
+            found = []
 
 
 class ScanResult:
