@@ -79,7 +79,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         q = {m["axis"]: c for leaf, c in leaves.items() if (m := re.fullmatch(QUATERNION, leaf))}
         q |= {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
         p = {m["axis"].translate(DIGITS): c for leaf, c in leaves.items() if (m := re.fullmatch(POSITION, leaf))}
-        is_true = any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in _group(clock[0]).split("/"))
+        is_true = any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", _group(clock[0])))
         if {*q} == {*"wxyz"}:
             poses.append((not is_true, clock, [q[a] for a in "wxyz"], [p[a] for a in "xyz"] if {*p} == {*"xyz"} else []))
         elif array := next((c for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), ""):
@@ -98,6 +98,8 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
 
     A unit that is not stated is the one in which it covers the IMU's time best.
     """
+    if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
+        return None  # a dot in the name of a plain table's column makes no group
     group, other = _group(column), ""
     while group and not other:
         for wanted, values in columns.values.items():
@@ -120,8 +122,8 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
 
 
 def _group(column: str) -> str:
-    """Group of a column: of `mocap/position[0]` it is `mocap`."""
-    return column.rpartition("/")[0]
+    """Group of a column: of `mocap/position[0]`, and of a structure's `mocap.position[0]`, it is `mocap`."""
+    return re.sub(r"(^|[/.])[^/.]*$", "", column)
 
 
 def _columns_of(entries: Entries) -> set[str]:

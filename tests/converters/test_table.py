@@ -326,6 +326,24 @@ def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
     assert list(recording.truths) == ["/ground_truth/pose"]
 
 
+def test_structures_of_mat_with_their_own_times_come_in_on_these(convert, tmp_path):
+    from scipy.io import savemat
+
+    t_ns = T_NS[0] + 30_000_000 + 8_000_000 * np.arange(40)
+    p, q_wxyz = RNG.normal(size=(40, 3)), np.tile([0.5, 0.1, 0.7, 0.5], (40, 1))
+    imu = {"time_ns": T_NS, "angular_velocity": GYRO, "linear_acceleration": ACCEL}
+    vicon = {"time": t_ns, "position": p, "q_wxyz": q_wxyz, "quality": np.arange(40.0)}
+    savemat(tmp_path / "log.mat", {"imu": imu, "vicon": vicon})
+    done = convert(tmp_path / "log.mat", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    same(tmp_path / "out.mcap")
+    recording = read(tmp_path / "out.mcap")
+    assert np.array_equal(recording.truth.t_ns, t_ns)
+    assert np.array_equal(recording.truth.p_wb, p)
+    np.testing.assert_allclose(recording.truth.q_wb_wxyz, q_wxyz, atol=1e-12)
+    assert np.array_equal(recording.scalars["/vicon_quality"].t_ns, t_ns)
+
+
 @pytest.mark.parametrize("poses", ["xyzw in ns", "single columns in mm", "unknown order"])
 def test_groups_of_hdf5_with_their_own_times_come_in_on_these(convert, tmp_path, poses):
     """An IMU, poses and GPS of three lengths; only what has no time of its own is left out, and named."""
