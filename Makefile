@@ -19,9 +19,13 @@ demo: $(READY_DEMO)  ## the whole way on a made-up recording: convert, train, de
 	@echo "demo: runs on made-up flights; everything goes to $(DEMO)"
 	@$(BIN)/imutool demo --output $(DEMO) --overwrite
 
-test: lint viewers  ## format, lint, types, then every test with warnings as errors
-	@echo "test: pytest, side by side"
-	@$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal
+test: viewers  ## format, lint, then every test with warnings as errors, types beside them
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@echo "test: mypy --strict and pytest, side by side"
+	@$(BIN)/python -m mypy & types=$$!; \
+	$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal; tests=$$?; \
+	wait $$types || { echo "test: mypy found what it says above" >&2; exit 1; }; exit $$tests
 
 check: lint  ## lint, types and the tests that a change touches (BASE=commit; else what is not on origin/main yet)
 	@$(BIN)/python -m pytest -q -n $(WORKERS) --maxprocesses 4 --dist worksteal $$($(BIN)/python tests/changed.py $(BASE))

@@ -48,23 +48,22 @@ UNITS = {
     "us": r"us|µs|microseconds?|usec",
     "ms": r"ms|milliseconds?|msec",
     "s": r"s|sec|seconds?",
+    "m": r"m|met(er|re)s?",
+    "cm": r"cm|centimet(er|re)s?",
+    "mm": r"mm|millimet(er|re)s?",
 }
+POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+UNITS_OF: dict[str, dict[str, float]] = {
+    "time_unit": TIME_NS,
+    "gyro_unit": GYRO_SI,
+    "accel_unit": ACCEL_SI,
+    "truth_time_unit": TIME_NS,
+    "position_unit": POSITION_SI,
+}
+DIGITS = str.maketrans("012", "xyz")
 
 
 Entries = dict[str, str | list[str]]  # of a map
-RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
-    "time": "synced/time",
-    "time_unit": "s",
-    "gyro": [f"synced/gyro_uncalib[{axis}]" for axis in range(3)],
-    "gyro_unit": "rad/s",
-    "accel": [f"synced/acce[{axis}]" for axis in range(3)],
-    "accel_unit": "m/s^2",
-}
-RONIN_POSES: Entries = {  # by the visual-inertial estimate of a second phone
-    "position": [f"pose/tango_pos[{axis}]" for axis in range(3)],
-    "quaternion_wxyz": [f"pose/tango_ori[{axis}]" for axis in range(4)],
-    "pose_kind": "estimate",
-}
 
 
 class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -84,7 +83,9 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     topic: str = "/imu0"
     truth_file: str = ""
     truth_time: str = ""
+    truth_time_unit: str = ""
     position: list[str] = []
+    position_unit: str = "m"
     quaternion_wxyz: list[str] = []
     rotation_matrix: str = ""
     pose_kind: str = "truth"
@@ -102,9 +103,9 @@ def read_map(path: Path) -> TableMap:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
     except (ValueError, RecursionError, msgspec.ValidationError) as error:
         raise ConfigError(f"is no map of a table ({error})", where=path) from error
-    for name, units in (("time", TIME_NS), ("gyro", GYRO_SI), ("accel", ACCEL_SI)):
-        if (unit := getattr(table, f"{name}_unit")) not in units:
-            raise ConfigError(f"{name}_unit is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
+    for name, units in UNITS_OF.items():
+        if (unit := getattr(table, name)) not in units and (unit or name != "truth_time_unit"):
+            raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
     if table.pose_kind not in KINDS:
         raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
     for name in ("gyro", "accel"):
@@ -126,8 +127,7 @@ class Proposal(msgspec.Struct):
         for name in ("time", "time_unit", "gyro", "gyro_unit", "accel", "accel_unit"):
             value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
             text = f'"{value}"' if isinstance(value, str) else "[" + ", ".join(f'"{part}"' for part in value) + "]"
-            choice = {"time_unit": TIME_NS, "gyro_unit": GYRO_SI, "accel_unit": ACCEL_SI}.get(name, {})
-            asked = f"  # please state: {' or '.join(choice) or 'the columns'}" if name in self.open else ""
+            asked = f"  # please state: {' or '.join(UNITS_OF.get(name, ['the columns']))}" if name in self.open else ""
             lines.append(f"{name} = {text}{asked}")
         lines.append(
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
@@ -141,10 +141,7 @@ class Proposal(msgspec.Struct):
 def propose(columns: Columns) -> Proposal:
     """Map that names, units and magnitudes of the columns suggest."""
     proposal = Proposal({}, [], [])
-    if {"synced/time", "synced/gyro_uncalib[0]", "synced/acce[0]"} <= columns.values.keys():
-        poses = RONIN_POSES if {"pose/tango_pos[0]", "pose/tango_ori[3]"} <= columns.values.keys() else {}
-        return Proposal({**RONIN, **poses}, [], ["its arrays are those of RoNIN"])
-    names = {column: _named(column, columns.units.get(column, "")) for column in columns.values}
+    names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values}
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
@@ -153,7 +150,7 @@ def propose(columns: Columns) -> Proposal:
     return proposal
 
 
-def _named(column: str, beside: str) -> tuple[str, str]:
+def name_and_unit(column: str, beside: str) -> tuple[str, str]:
     """Name and unit of a column; a unit `beside` the column counts where its name has none."""
     name, unit = split_name(column)
     return name, unit or next((known for known, pattern in UNITS.items() if re.fullmatch(pattern, beside.lower())), "")
@@ -181,7 +178,7 @@ def _propose_sensor(
     for column, (name, _) in names.items():
         axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?(?P<axis>[xyz012])(_(raw|adc|counts?))?", name)
         if axis:
-            groups.setdefault(axis[1], {})[axis["axis"].translate(str.maketrans("012", "xyz"))] = column
+            groups.setdefault(axis[1], {})[axis["axis"].translate(DIGITS)] = column
     whole = [group for group in groups.values() if set(group) == set("xyz")]
     if len(whole) != 1:
         proposal.open += [sensor, f"{sensor}_unit"]
@@ -233,8 +230,11 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     """Column of the time and its unit, from its name or from a plausible rate."""
     length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
     found = [c for c, (name, _) in names.items() if re.fullmatch(rf"(.*_)?{TIME_WORDS}", name or names[c][1])]
-    found = [c for c in found if length in (None, len(columns.values[c])) and _rises(columns.values[c])]
-    if not found and len(rising := [c for c, v in columns.values.items() if length in (None, len(v)) and _rises(v)]) == 1:
+    found = [c for c in found if length in (None, len(columns.values[c])) and rises(columns.values[c])]
+    if "gyro" in proposal.entries:
+        group = proposal.entries["gyro"][0].rpartition("/")[0]
+        found.sort(key=lambda c: c.rpartition("/")[0] != group)
+    if not found and len(rising := [c for c, v in columns.values.items() if length in (None, len(v)) and rises(v)]) == 1:
         proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
         found = rising
     if not found:
@@ -258,5 +258,6 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
 
 
-def _rises(values: np.ndarray) -> bool:
+def rises(values: np.ndarray) -> bool:
+    """Whether nearly every value is above the one before it."""
     return len(values) > 1 and float(np.mean(np.diff(values.astype(float)) > 0)) > 0.9

@@ -21,20 +21,24 @@ from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
-from ._files import head, name
+from ._files import find_folders, head, name
 from ._table_files import kind_of, load
-from ._table_map import ACCEL_SI, GYRO_SI, TIME_NS, TableMap, propose, read_map
+from ._table_groups import group_entries, known_layout, time_beside
+from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map
 from ._table_text import Columns
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 LARGEST_NS = 2**63 - 1
+DATA_FILE = "data.hdf5"
+MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is a table file; tables in folders are not looked for."""
+    """The source itself, if it is a table; of folders those that hold `data.hdf5`, as RoNIN's."""
     if source.is_dir():
-        return []
+        folders = find_folders(source, lambda path: kind_of(head(path / DATA_FILE), path / DATA_FILE) == "hdf5")
+        return [Sequence(folder.name, folder.path / DATA_FILE) for folder in folders]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
     return [Sequence(name(source), source)] if kind_of(head(source), source) else []
@@ -68,14 +72,21 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     remarks.notes.extend(notes)
     used = {table.time, table.accel_time, *(c.removeprefix("-") for c in (*table.gyro, *table.accel))}
     poses = _truth(columns, table, path, place, remarks)
+    if poses and table.truth_time and not table.truth_file:
+        used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
+    scalars, constants = _further(columns, table, used, gyro_ns, place)
     return MessageLog(
         sequence.name,
         path.name,
         imus={table.topic: imu},
         poses=poses,
         kinds=dict.fromkeys(poses, table.pose_kind),
-        scalars=_scalars(columns, used, gyro_ns, remarks),
-        metadata={"imutool": {"format": "table", "sequence": sequence.name}, "imutool/map": _described(table)},
+        scalars=scalars,
+        metadata={
+            "imutool": {"format": "table", "sequence": sequence.name},
+            "imutool/map": _described(table),
+            **({"imutool/constants": constants} if constants else {}),
+        },
         remarks=remarks,
     )
 
@@ -91,7 +102,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
     Raises:
         ConfigError: something is open; the message holds a map file to complete.
     """
-    proposal = propose(columns)
+    proposal = known_layout(columns) or propose(columns)
     if proposal.open:
         shown = ", ".join(list(columns.values)[:40])
         raise ConfigError(
@@ -99,7 +110,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
             where=path,
             fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml()}",
         )
-    entries = dict(proposal.entries)
+    entries = {**proposal.entries, **group_entries(columns, proposal.entries, proposal.reasons)}
     remarks.notes.append(
         "columns: "
         + ", ".join(f"{key} = {value if isinstance(value, str) else '/'.join(value)}" for key, value in entries.items())
@@ -157,7 +168,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         if not other.is_file():
             raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
         columns = load(other, kind_of(head(other), other))
-    t_ns = _times(columns, table.truth_time or table.time, table.time_unit, where)
+    t_ns = _times(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
     if table.quaternion_wxyz:
         q_wxyz = _vectors(columns, table.quaternion_wxyz, 1.0, 0.0, where)
     elif table.rotation_matrix in columns.matrices:
@@ -165,7 +176,11 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     else:
         expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices"
         raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
-    p = _vectors(columns, table.position, 1.0, 0.0, where) if table.position else np.zeros((len(q_wxyz), 3))
+    p = (
+        _vectors(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
+        if table.position
+        else np.zeros((len(q_wxyz), 3))
+    )
     if not table.position:
         remarks.notes.append("the truth has no positions: those of its poses are zero")
     if not len(t_ns) == len(q_wxyz) == len(p):
@@ -183,21 +198,36 @@ def _quaternions(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, 
     return quaternion.unit(Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]])
 
 
-def _scalars(columns: Columns, used: set[str], t_ns: Int64[np.ndarray, " n"], remarks: Remarks) -> dict[str, Scalars]:
-    """Further columns of the table as topics, on the IMU's clock."""
-    rest = {c: v for c, v in columns.values.items() if c not in used and len(v) == len(t_ns)}
-    left = [c for c in columns.values if c not in used and c not in rest]
+def _further(
+    columns: Columns, table: TableMap, used: set[str], t_ns: Int64[np.ndarray, " n"], where: Path
+) -> tuple[dict[str, Scalars], dict[str, str]]:
+    """Further columns as topics, on the clock of their group or on the IMU's, and short ones without time as texts."""
+    clocks: dict[str, Int64[np.ndarray, " n"]] = {}
+    constants, left = {}, []
+    for column in [c for c in columns.values if c not in used]:
+        beside = time_beside(columns, column, table.time, table.time_unit)
+        if beside is not None:
+            if beside[0] != column:
+                clocks[column] = _times(columns, *beside, where)
+        elif len(columns.values[column]) == len(t_ns):
+            clocks[column] = t_ns
+        elif len(columns.values[column]) <= MOST_CONSTANTS:
+            constants[column] = str(columns.values[column].tolist())
+        else:
+            left.append(column)
     if left:
-        remarks.losses.append(f"columns of another length than the IMU's are left out: {', '.join(left[:20])}")
-    if len(rest) > MOST_SCALARS:
-        remarks.losses.append(f"the table has {len(rest)} further columns: {len(rest) - MOST_SCALARS} of them are left out")
+        said = f"columns of another length than the IMU's, without a time in their group, are left out: {', '.join(left[:20])}"
+        columns.remarks.losses.append(said)
+    if len(clocks) > MOST_SCALARS:
+        said = f"the table has {len(clocks)} further columns: {len(clocks) - MOST_SCALARS} of them are left out"
+        columns.remarks.losses.append(said)
     scalars = {}
-    for column, values in list(rest.items())[:MOST_SCALARS]:
-        kept = in_order(t_ns, values.astype(np.float64)[:, None], column)
+    for column, times_ns in list(clocks.items())[:MOST_SCALARS]:
+        kept = in_order(times_ns, columns.values[column].astype(np.float64)[:, None], column)
         if len(kept.t_ns):
             unit = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
             topic = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
             scalars[f"/{topic if topic[0].isalpha() else f'column_{topic}'}"] = Scalars(
                 kept.t_ns, kept.values, unit[1] if unit else ""
             )
-    return scalars
+    return scalars, constants

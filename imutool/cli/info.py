@@ -163,6 +163,8 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         counts = ("out_of_order", "duplicated", "missing", "not_finite", "saturated")
         rows.append((imu["topic"], "samples", str(imu["samples"])))
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
+        if "time" in imu:
+            rows.append((imu["topic"], "time of the samples", f"{imu['time']}, not {', '.join(imu['other_times'])}"))
         rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
         rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
         alike: dict[str, list[str]] = {}

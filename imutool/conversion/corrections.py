@@ -17,11 +17,12 @@ from jaxtyping import Float64, Int64
 from imutool import registry
 from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
 from imutool.cleaning.conventions import axis_names
-from imutool.cleaning.stamp_line import read_stamps, restamped
+from imutool.cleaning.stamp_line import WRAPS, read_stamps, restamped
 from imutool.conversion.message_writer import write_log
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import VELOCITY_KEY
@@ -31,6 +32,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
+SAME_CLOCK_NS = 10**9  # most by which a topic may come into the log later than the IMU
 XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
@@ -41,7 +43,7 @@ class Corrections:
     Attributes:
         imus: by topic, the matrices that lead from its gyro and accel to right ones.
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
-        stamps: new stamps of an IMU's messages, in file order.
+        stamps: new stamps of messages of an IMU, of poses or vectors, in file order.
         notes: what is corrected, by topic.
     """
 
@@ -180,17 +182,19 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     stamps: dict[str, Int64[np.ndarray, "..."]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
     world, frame_id, late_ns = np.eye(3), "", 0
+    clock: dict[str, int] = {}
     with Log(path) as log:
         for topic in log.imu_topics:
             if log.topics[topic].message_encoding not in ENCODINGS or log.topics[topic].reflected is not None:
                 continue
             if STAMPS in wanted:
-                before = np.concatenate([np.zeros(0, np.int64), *(batch.stamp_ns for batch in raw_batches(log, topic))])
-                stamps[topic] = restamped(before)
+                log_ns, before = _times(raw_batches(log, topic))
+                stamps[topic], found = restamped(before), read_stamps(before)
                 moved_s = 1e-9 * float(np.abs(stamps[topic] - before).max(initial=0))
-                said = "; ".join(read_stamps(before).told)
                 line = f"stamps are now on a line under them, moved by {moved_s:.6f} s at most"
-                notes[topic].append(f"{said}; {line}" if said else line)
+                notes[topic].append("; ".join([*found.told, line]))
+                if found.wraps and not clock:
+                    clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
             if CONVENTIONS not in wanted:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
@@ -201,7 +205,37 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 world, late_ns = survey.world, survey.pose_delay_ns
                 frame_id = next(log.pose_batches(survey.pose_topic)).frame_id
                 notes[survey.pose_topic].append(_pose_note(survey))
+        for described in log.with_schema((*MESSAGE_POSES, schemas.VECTOR3)) if STAMPS in wanted else []:
+            if described.message_encoding in ENCODINGS and described.reflected is None:
+                decode = described.decode_poses if described.schema_name in MESSAGE_POSES else described.decode_scalars
+                log_ns, before = _times(batch for _, rows in log.rows([described.name]) for batch in decode(rows))
+                whole_ns = _unwrapped(log_ns, before, **clock)
+                if (whole_ns != before).any():
+                    stamps[described.name] = whole_ns
+                    told = "; ".join(read_stamps(before).told) or "stamps start after a wrap"
+                    notes[described.name].append(f"{told}; they run on now")
     return Corrections(imus, world, frame_id, late_ns, stamps, {topic: "; ".join(said) for topic, said in notes.items()})
+
+
+def _times(batches: Iterator[ImuBatch | PoseBatch | ScalarBatch]) -> Int64[np.ndarray, "2 n"]:
+    """Log times and stamps of a topic, in file order."""
+    every = [np.stack([batch.log_time.astype(np.int64), batch.stamp_ns]) for batch in batches]
+    return np.concatenate([np.zeros((2, 0), np.int64), *every], axis=1)
+
+
+def _unwrapped(
+    log_ns: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"], size_ns: int = 0, late_ns: int = 0
+) -> Int64[np.ndarray, " n"]:
+    """Stamps of poses or vectors without wraps; on the counter of the IMU, of `size_ns`, with as many turns as it has made.
+
+    The log lags behind the IMU's counter by `late_ns`; what lags alike but for whole turns is on the same counter.
+    """
+    whole_ns = read_stamps(stamp_ns).stamp_ns
+    if size_ns < 4 * SAME_CLOCK_NS or not len(whole_ns):
+        return whole_ns
+    turns = round((int(log_ns[0]) - late_ns - int(whole_ns[0])) / size_ns)
+    rest_ns = int(log_ns[0]) - late_ns - int(whole_ns[0]) - turns * size_ns
+    return whole_ns + turns * size_ns if abs(rest_ns) < SAME_CLOCK_NS else whole_ns
 
 
 def _imu_note(survey: Survey) -> str:

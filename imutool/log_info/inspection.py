@@ -31,6 +31,7 @@ from imutool.log_info.conventions import (
 )
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
@@ -129,6 +130,15 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     )
 
 
+def _times(topic: Topic) -> tuple[str, list[str]] | tuple[msgspec.UnsetType, msgspec.UnsetType]:
+    """Field that stamps the samples, and the other times, where a message holds several."""
+    found = topic.reflected
+    if not isinstance(found, Reflected) or not found.other_stamps:
+        return UNSET, UNSET
+    used, *others = [".".join(map(str, path)) for path in (found.stamp[0][0], *found.other_stamps)]
+    return used.removesuffix(f".{found.stamp[0][0][-1]}") if len(found.stamp) > 1 else used, others
+
+
 def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     """Defects, rest and noise of an IMU; only a warning if its encoding is unknown."""
     derived_from = topic.metadata.get(DERIVED_KEY, UNSET)
@@ -148,11 +158,14 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
     rest, whole = _rest(imu), convention_summary(imu, truth)
+    used, others = _times(topic)
     return ImuInfo(
         topic=topic.name,
         warnings=_imu_warnings(counts, imu, whole, stamps, clock_jumps(t_ns)),
         conventions=conventions(whole) if len(imu) else UNSET,
         derived_from=derived_from,
+        time=used,
+        other_times=others,
         samples=len(t_ns),
         **_clock(t_ns)._asdict(),
         **counts,

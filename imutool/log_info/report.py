@@ -66,12 +66,15 @@ class Convention(Section, frozen=True):
 class ImuInfo(Section, frozen=True, kw_only=True):
     """IMU topic: clock from the header stamps, defects, rest and noise.
 
+    `time` is the field that stamps the samples and `other_times` those that do not, where the message holds several.
     Only warnings where its encoding is unknown.
     """
 
     topic: str
     warnings: list[str]
     derived_from: str | UnsetType = UNSET
+    time: str | UnsetType = UNSET
+    other_times: list[str] | UnsetType = UNSET
     samples: int | UnsetType = UNSET
     rate_hz: float | UnsetType | None = UNSET
     jitter_s: float | UnsetType | None = UNSET

@@ -29,10 +29,10 @@ class IncrementSettings(Settings, frozen=True):
 
 
 class PoseFloors(Settings, frozen=True):
-    """Least residual of a window by the kind of its poses: what their makers claim.
+    """Least residual of a window by the kind of its poses: of the order of what good ones reach.
 
-    Poses made with this IMU follow its errors, so that a small residual is no sign of their quality. An estimate is taken for
-    the best there is: 0.1 degrees and 0.05 km/h, by which KITTI's OXTS RT3003 is specified. Ten times that is odometry.
+    Poses made with this IMU follow its errors, so that a small residual is no sign of their quality. An estimate counts as one
+    of a good GNSS/INS, of the order of 0.1 degrees and 0.014 m/s. Odometry counts as ten times worse. All four are choices.
     """
 
     estimate_rad: Positive = 1.7e-3

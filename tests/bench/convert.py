@@ -2,7 +2,8 @@
 
     python tests/bench/convert.py [--megabytes 2000]
 
-Each command runs alone in a process of its own, three times in turn; the least of each figure counts.
+Each command runs alone in a process of its own, three times in turn; the least of each figure counts. rosbags-convert writes
+without compression, so imutool does too in a row of its own.
 """
 
 from __future__ import annotations
@@ -74,20 +75,24 @@ def main() -> None:
         bag = Path(folder, "robot.bag")
         messages = write_bag(bag, words.megabytes)
         print(f"{bag.stat().st_size / 1e6:.0f} MB, {messages} messages")
+        convert = [sys.executable, "-m", "imutool", "convert", str(bag)]
         rosbags = str(Path(sys.executable).with_name("rosbags-convert"))
         commands = {
-            "imutool convert": ([sys.executable, "-m", "imutool", "convert", str(bag)], "robot.mcap"),
+            "imutool convert": (convert, "robot.mcap"),
+            "imutool convert --compression none": ([*convert, "--compression", "none"], "plain.mcap"),
             "rosbags-convert": ([rosbags, "--dst-storage", "mcap", "--src", str(bag), "--dst"], "robot"),
         }
         runs: dict[str, list[tuple[float, float, float]]] = {name: [] for name in commands}
+        sizes: dict[str, float] = {}
         for number in range(RUNS):
             for name, (command, target) in commands.items():
                 out = Path(folder, f"{number}_{target}")
                 runs[name].append(measured([*command, str(out)]))
+                sizes[name] = sum(path.stat().st_size for path in [out, *out.rglob("*")] if path.is_file()) / 1e6
                 shutil.rmtree(out) if out.is_dir() else out.unlink()
         for name, found in runs.items():
             wall, cpu, memory = (min(column) for column in zip(*found, strict=True))
-            print(f"{name}: {wall:.1f} s wall, {cpu:.1f} s CPU, {memory:.0f} MB")
+            print(f"{name}: {wall:.1f} s wall, {cpu:.1f} s CPU, {memory:.0f} MB; writes {sizes[name]:.0f} MB")
 
 
 if __name__ == "__main__":

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from imutool.conversion.corrections import RECORD
@@ -74,3 +77,35 @@ def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: P
     assert np.abs(even.t_ns - made.imu.t_ns).max() < 100_000
     assert (even.gyro == made.imu.gyro).all()
     assert inspect(tmp_path / "even.mcap").warnings == []
+
+
+@pytest.mark.parametrize("late_poses", [False, True], ids=["poses wrap too", "poses start after the wrap"])
+def test_a_counter_that_wraps_runs_on_for_the_imu_and_the_poses_alike(
+    made: Recording, tmp_path: Path, late_poses: bool
+) -> None:
+    """Header stamps of one 32 bit counter of microseconds; the log times are a computer's, a little late."""
+    size_ns, wrap_ns = 2**32 * 1000, int(made.imu.t_ns[len(made.imu) // 3] // 1000 * 1000)
+    truth = made.truth.between(wrap_ns + 1_000_000_000, int(made.imu.t_ns[-1])) if late_poses else made.truth
+    write(replace(made, truths={"/ground_truth/pose": truth}), tmp_path / "made.mcap")
+    rng = np.random.default_rng(2)
+    with (tmp_path / "made.mcap").open("rb") as source, (tmp_path / "wrapped.mcap").open("wb") as target:
+        reader, writer = make_reader(source), Writer(target)
+        writer.start()
+        ids: dict[str, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic not in ids:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata)
+            seconds, nanos = struct.unpack_from("<iI", message.data, 4)
+            counted_ns = (seconds * 10**9 + nanos - wrap_ns) // 1000 * 1000 % size_ns
+            data = bytearray(message.data)
+            struct.pack_into("<iI", data, 4, *divmod(counted_ns, 10**9))
+            late_ns = message.log_time + int(rng.integers(0, 3_000_000))
+            writer.add_message(ids[channel.topic], late_ns, bytes(data), late_ns)
+        writer.finish()
+    report = convert(tmp_path / "wrapped.mcap", tmp_path / "whole.mcap", correct=["stamps"])
+    whole = read(tmp_path / "whole.mcap")
+    origin_ns = wrap_ns - size_ns  # when the counter was at 0
+    assert np.abs(whole.imu.t_ns + origin_ns - made.imu.t_ns).max() <= 2000
+    assert np.abs(whole.truth.t_ns + origin_ns - truth.t_ns).max() <= 1000
+    assert sum("/ground_truth/pose" in note for note in report.notes) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import zipfile
 from datetime import UTC, datetime
 from pathlib import Path
@@ -325,22 +326,113 @@ def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
     assert list(recording.truths) == ["/ground_truth/pose"]
 
 
-def test_hdf5_of_ronin_gives_the_uncorrected_rates_and_an_estimate(convert, tmp_path):
-    h5py = pytest.importorskip("h5py", reason="needs imutool[tables]")
+def test_structures_of_mat_with_their_own_times_come_in_on_these(convert, tmp_path):
+    from scipy.io import savemat
+
+    t_ns = T_NS[0] + 30_000_000 + 8_000_000 * np.arange(40)
+    p, q_wxyz = RNG.normal(size=(40, 3)), np.tile([0.5, 0.1, 0.7, 0.5], (40, 1))
+    imu = {"time_ns": T_NS, "angular_velocity": GYRO, "linear_acceleration": ACCEL}
+    vicon = {"time": t_ns, "position": p, "q_wxyz": q_wxyz, "quality": np.arange(40.0)}
+    savemat(tmp_path / "log.mat", {"imu": imu, "vicon": vicon})
+    done = convert(tmp_path / "log.mat", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    same(tmp_path / "out.mcap")
+    recording = read(tmp_path / "out.mcap")
+    assert np.array_equal(recording.truth.t_ns, t_ns)
+    assert np.array_equal(recording.truth.p_wb, p)
+    np.testing.assert_allclose(recording.truth.q_wb_wxyz, q_wxyz, atol=1e-12)
+    assert np.array_equal(recording.scalars["/vicon_quality"].t_ns, t_ns)
+
+
+@pytest.mark.parametrize("poses", ["xyzw in ns", "single columns in mm", "unknown order"])
+def test_groups_of_hdf5_with_their_own_times_come_in_on_these(convert, tmp_path, poses):
+    """An IMU, poses and GPS of three lengths; only what has no time of its own is left out, and named."""
+    import h5py
+
+    rng = np.random.default_rng(5)
+    t_ns, gps_ns = T_NS[0] + 30_000_000 + 8_000_000 * np.arange(40), T_NS[0] + 200_000_000 * np.arange(7)
+    p, latitude = rng.normal(size=(40, 3)), rng.normal(size=7)
+    q_wxyz = rng.normal(size=(40, 4))
+    q_wxyz /= np.linalg.norm(q_wxyz, axis=1, keepdims=True)
+    in_mm = poses == "single columns in mm"
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values, unit in (("time", T_NS, "ns"), ("gyro", GYRO, "rad/s"), ("accel", ACCEL, "m/s^2")):
+            file[f"imu/{name}"] = values
+            file[f"imu/{name}"].attrs["units"] = unit
+        file["mocap/time"], file["mocap/position"] = t_ns if not in_mm else t_ns * 1e-9, p * 1000.0 if in_mm else p
+        file["mocap/position"].attrs["units"] = "mm" if in_mm else "m"
+        if in_mm:
+            for axis, column in zip("wxyz", q_wxyz.T, strict=True):
+                file[f"mocap/q{axis}"] = column
+        else:
+            file["mocap/quaternion_xyzw" if "xyzw" in poses else "mocap/orientation"] = q_wxyz[:, [1, 2, 3, 0]]
+        file["gps/time"], file["gps/latitude"] = gps_ns, latitude
+        file["levels"] = np.arange(17.0)
+    done = convert(tmp_path / "log.h5", tmp_path / "out.mcap")
+    assert done.returncode == 3
+    (loss,) = [line for line in done.stderr.splitlines() if "left out" in line]
+    assert loss.endswith("left out: levels")
+    same(tmp_path / "out.mcap")
+    recording = read(tmp_path / "out.mcap")
+    assert np.array_equal(recording.scalars["/gps_latitude"].t_ns, gps_ns)
+    assert np.array_equal(recording.scalars["/gps_latitude"].values[:, 0], latitude)
+    if poses == "unknown order":
+        assert "mocap/orientation has four columns of no certain order" in done.stderr
+        assert not recording.truths
+        assert np.array_equal(recording.scalars["/mocap_orientation_3"].values[:, 0], q_wxyz[:, 0])
+        return
+    truth = recording.truth
+    np.testing.assert_allclose(truth.t_ns, t_ns, atol=500 if in_mm else 0)  # a double of this epoch keeps 240 ns
+    np.testing.assert_allclose(truth.p_wb, p, atol=1e-12)
+    np.testing.assert_allclose(np.abs((truth.q_wb_wxyz * q_wxyz).sum(axis=1)), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("rates", ["gyro_uncalib", "gyro"])
+def test_a_folder_of_ronin_gives_the_least_corrected_rates_and_an_estimate(convert, tmp_path, rates):
+    import h5py
+
     seconds = 1000.0 + np.arange(COUNT) * 0.005
-    with h5py.File(tmp_path / "data.hdf5", "w") as file:
-        arrays = {"time": seconds, "gyro": GYRO + 1.0, "gyro_uncalib": GYRO, "acce": ACCEL, "linacce": ACCEL, "grav": ACCEL}
+    q_wxyz = np.tile([0.5, 0.1, 0.7, 0.5], (COUNT, 1))
+    (tmp_path / "a000_1").mkdir()
+    (tmp_path / "a000_1" / "info.json").write_text("{}")
+    with h5py.File(tmp_path / "a000_1" / "data.hdf5", "w") as file:
+        arrays = {"time": seconds, "gyro": GYRO + 1.0, rates: GYRO, "acce": ACCEL, "linacce": ACCEL, "grav": ACCEL}
         for name, values in arrays.items():
             file[f"synced/{name}"] = values
-        file["pose/tango_pos"] = np.zeros((COUNT, 3))
-        file["pose/tango_ori"] = np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
-    done = convert(tmp_path / "data.hdf5", tmp_path / "out.mcap")
+        file["pose/tango_pos"] = GYRO * 100.0
+        file["pose/tango_ori"] = q_wxyz
+    done = convert(tmp_path / "a000_1", tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr
+    assert ("Android has corrected" in done.stderr) == (rates == "gyro")
     recording = read(tmp_path / "out.mcap", truth="/estimate/pose")
     assert np.array_equal(recording.imu.gyro, GYRO)
     assert np.array_equal(recording.imu.accel, ACCEL)
-    assert len(recording.truths["/estimate/pose"]) == COUNT
+    assert np.array_equal(recording.truths["/estimate/pose"].p_wb, GYRO * 100.0)
+    np.testing.assert_allclose(recording.truths["/estimate/pose"].q_wb_wxyz, q_wxyz, atol=1e-12)
     assert not read(tmp_path / "out.mcap").truths
+
+
+def test_hdf5_of_blackbird_gives_the_raw_rates_the_motion_capture_and_its_constants(convert, tmp_path):
+    import h5py
+
+    p, q_xyzw = GYRO * 100.0, np.tile([0.1, 0.7, 0.5, 0.5], (COUNT, 1))
+    (tmp_path / "train").mkdir()
+    with h5py.File(tmp_path / "train" / "data.hdf5", "w") as file:
+        file["ts"] = 1000.0 + np.arange(COUNT) * 0.01
+        for kind, bias in (("raw", 0.0), ("calib", 1.0)):
+            file[f"gyro_{kind}"], file[f"accel_{kind}"] = GYRO - bias, ACCEL - bias
+        file["traj_target"] = np.concatenate([p, q_xyzw, p], axis=1)
+        file["gyro_bias"] = file["accel_bias"] = np.array([0.25, 0.5, 1.0])
+    shutil.copytree(tmp_path / "train", tmp_path / "val")
+    done = convert(tmp_path, tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "val.mcap").is_file()
+    recording = read(tmp_path / "out" / "train.mcap")
+    assert np.array_equal(recording.imu.gyro, GYRO)
+    assert np.array_equal(recording.imu.accel, ACCEL)
+    assert np.array_equal(recording.truth.p_wb, p)
+    np.testing.assert_allclose(recording.truth.q_wb_wxyz, q_xyzw[:, [3, 0, 1, 2]], atol=1e-12)
+    assert recording.metadata["imutool/constants"]["gyro_bias"] == "[0.25, 0.5, 1.0]"
 
 
 def test_messages_written_as_a_table_keep_the_names_of_their_fields(convert, tmp_path):

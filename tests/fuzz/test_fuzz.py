@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import random
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fuzz import kinds
-from fuzz.logs import Damage, Original, exchange, join, judged, length, overlap, overwrite, pair, record, remove
+from fuzz.logs import Damage, Original, exchange, join, judged, length, overlap, overwrite, pair, record, remove, wrong_index
 
 TOTAL_S = float(os.environ.get("IMUTOOL_FUZZ_SECONDS", "60" if os.environ.get("CI") else "15"))  # over all kinds
 SEED = os.environ.get("IMUTOOL_FUZZ_SEED", datetime.datetime.now(datetime.UTC).date().isoformat())
@@ -96,6 +97,21 @@ FOUND: dict[str, tuple[int, tuple[Damage, ...], Craft]] = {
         lambda a, b: over(
             exchanged(a.raw[:1466] + a.raw[2571:], (46, 1262), (2793, 4134)), 4024, (2**62).to_bytes(8, "little")
         ),
+    ),
+    "a chunk with a damaged head of a log that nothing defines": (
+        20,
+        (overlap, length),
+        lambda a, b: over(a.raw[:1400] + b.raw[1400:], 3623, (1).to_bytes(8, "little")),
+    ),
+    "two exchanged chunks, and a summary that lists every chunk one byte further on": (
+        2,
+        (exchange, wrong_index),
+        lambda a, b: wrong_index(exchanged(a.raw, (761, 1247), (2228, 2815)), a, b, random.Random(4)),
+    ),
+    "a chunk without its message indexes in front of what is left of a summary": (
+        3,
+        (remove, exchange),
+        lambda a, b: exchanged(a.raw[:3146] + a.raw[3974:], (2100, 2892), (8030, 8192)),
     ),
 }
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from imutool.cleaning import survey
 from imutool.cli.info import imu_rows, topic_rows
@@ -292,3 +293,27 @@ def test_what_is_no_log_is_refused(tmp_path, content):
     (tmp_path / "log.mcap").write_bytes(content)
     with pytest.raises(LogError, match=r"log\.mcap"):
         inspect(tmp_path / "log.mcap")
+
+
+@pytest.mark.parametrize("device_time", [True, False])
+def test_of_two_times_in_a_message_the_one_that_counts_is_named(tmp_path: Path, device_time: bool) -> None:
+    """A made-up driver's JSON: a header of the computer, and the sensor's own counter, which starts at 0."""
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        imu = writer.register_channel("/imu", "json", writer.register_schema("Imu", "jsonschema", b'{"type": "object"}'))
+        for n in range(200):
+            t_ns = 1_700_000_000_000_000_000 + n * 5_000_000
+            vectors = {name: {"x": 0.0, "y": 0.1, "z": 9.81} for name in ("angularVelocity", "linearAcceleration")}
+            header = {"stamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}}
+            content = {"header": header, **({"sensor_time_us": n * 5000} if device_time else {}), **vectors}
+            writer.add_message(imu, t_ns, json.dumps(content).encode(), t_ns)
+        writer.finish()
+    report = inspect(tmp_path / "a.mcap")
+    (info,) = json_values(report)["imu"]
+    assert info["first_ns"] == 1_700_000_000_000_000_000
+    assert (info.get("time"), info.get("other_times")) == (
+        ("header.stamp", ["sensor_time_us"]) if device_time else (None, None)
+    )
+    shown = [value for _, name, value in imu_rows(report) if name == "time of the samples"]
+    assert shown == (["header.stamp, not sensor_time_us"] if device_time else [])

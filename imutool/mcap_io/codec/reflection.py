@@ -76,6 +76,7 @@ class Reflected:
     stamp: tuple[tuple[Path, int], ...]  # fields that add up to the stamp, with their nanoseconds
     frame: Path | None
     covariances: tuple[Path | None, ...] = ()
+    other_stamps: tuple[Path, ...] = ()  # further times in the message, which do not count
 
     def sample(self, raw: bytes, log_time: int) -> Sample:
         """Sample in a message; at its log time where it has no stamp.
@@ -202,7 +203,9 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
         next((path for path, name, node in fields if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
         for pattern in (GYRO, ACCEL)
     ]
-    return Reflected(IMU, form, (*gyro, *accel), _stamp(fields), frame, tuple(covariances))
+    stamp, *others = [*_stamps(fields)] or [()]
+    unused = tuple(other[0][0] for other in others)
+    return Reflected(IMU, form, (*gyro, *accel), stamp, frame, tuple(covariances), unused)
 
 
 def _pose(tree: Tree, form: Format) -> Reflected | None:
@@ -216,7 +219,7 @@ def _pose(tree: Tree, form: Format) -> Reflected | None:
         parts = next(([f"{q}{axis}" for axis in "wxyz"] for q in ("", "q") if {f"{q}{a}" for a in "wxyz"} <= node.keys()), None)
         if position is not None and parts is not None:
             frame = next((p for p, text, kind in fields if kind == TEXT and re.fullmatch(FRAME, text)), None)
-            return Reflected(POSE, form, (*position, *((*path, part) for part in parts)), _stamp(fields), frame)
+            return Reflected(POSE, form, (*position, *((*path, part) for part in parts)), next(_stamps(fields), ()), frame)
     return None
 
 
@@ -248,17 +251,16 @@ def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path
     return None if x is None or y is None or z is None else (x, y, z)
 
 
-def _stamp(fields: Sequence[tuple[Path, str, Any]]) -> tuple[tuple[Path, int], ...]:
-    """Fields that make up the stamp; none where the message has no stamp of a known unit."""
+def _stamps(fields: Sequence[tuple[Path, str, Any]]) -> Iterator[tuple[tuple[Path, int], ...]]:
+    """Fields that make up each stamp of a known unit; the first counts."""
     for path, name, node in fields:
         if isinstance(node, Mapping) and re.fullmatch(STAMP, name):
             parts = [next((key for key in keys if node.get(key) == NUMBER), None) for keys in (SECONDS, NANOSECONDS)]
             if parts[0] is not None and parts[1] is not None:
-                return ((*path, parts[0]), NS_PER_S), ((*path, parts[1]), 1)
+                yield ((*path, parts[0]), NS_PER_S), ((*path, parts[1]), 1)
         for pattern, size in COUNTED.items():
             if node == NUMBER and re.fullmatch(pattern, name):
-                return ((path, size),)
-    return ()
+                yield ((path, size),)
 
 
 def _tree_of(value: Any, depth: int) -> Any:

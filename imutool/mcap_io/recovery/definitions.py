@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -17,11 +17,33 @@ from imutool.errors import LogError
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
+from imutool.mcap_io.codec.ros2_definition import decodes
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
 from imutool.mcap_io.writer import free_id
 
 SCHEMA = int(Opcode.SCHEMA)
 ChunkKey = tuple[int, int, int]  # start and end in ns, unpacked bytes: what a summary says of a chunk wherever it lies
+CDR_HEADS = (b"\0\0", b"\0\1")  # other payloads are not what the channel says, and tell nothing
+SAMPLES = 4  # messages of a channel that must decode by a definition
+
+
+class Habits(NamedTuple):
+    """How a writer writes messages, the same in a whole log; empty where that is not known."""
+
+    packing: frozenset[str] = (
+        frozenset()
+    )  # compressions, or that there are no chunks; some writers leave small chunks as they are
+    indexed: frozenset[bool] = frozenset()  # whether message indexes follow the chunks
+
+    def __or__(self, other: Habits) -> Habits:
+        return Habits(self.packing | other.packing, self.indexed | other.indexed)
+
+    def contradicts(self, other: Habits) -> bool:
+        """Whether no writer has both."""
+        return any(mine and its and not mine & its for mine, its in zip(self, other, strict=True))
+
+
+NO_HABITS = Habits()
 
 
 @dataclass(eq=False)
@@ -40,6 +62,7 @@ class Recording:
     moved: bool = False  # its definitions cannot stay as they are in its chunks
     sizes: dict[int, tuple[int, int]] = field(default_factory=dict)  # the shortest and the longest message of a channel
     samples: dict[int, MessageBlock] = field(default_factory=dict)  # a block with messages of a channel
+    habits: Habits = NO_HABITS  # of its writer
     renamed: dict[str, str] = field(default_factory=dict)  # topics that carry another type elsewhere
 
     def known(self, opcode: int) -> dict[int, Any]:
@@ -66,6 +89,19 @@ class Recording:
                 return False
         return True
 
+    def fits(self, channel: int, read: Callable[[], messages.Messages]) -> bool:
+        """Whether messages of a channel decode by its definition here; True if unknown."""
+        known = self.channels.get(channel)
+        schema = self.schemas.get(known.schema_id) if known else None
+        if known is None or schema is None or (schema.encoding, known.message_encoding) != ("ros2msg", "cdr"):
+            return True
+        found = read()
+        chosen = np.flatnonzero(found.heads["channel"] == channel)[:SAMPLES].tolist()
+        sizes = found.heads["length"].astype(np.int64) + HEAD.size
+        payloads = [found.data[found.offsets[i] + messages.MESSAGE.itemsize : found.offsets[i] + sizes[i]] for i in chosen]
+        plain = [raw for payload in payloads if (raw := payload.tobytes())[:2] in CDR_HEADS]
+        return all(decodes(raw, schema.name, schema.data) for raw in plain)
+
     def _gives_way(self, known: Any) -> bool:
         """Whether it is a schema that no CRC covers and no channel uses: bytes of a damaged chunk may look like one."""
         used = {channel.schema_id for channel in self.channels.values()} | {i for opcode, i in self.proven if opcode == SCHEMA}
@@ -90,6 +126,11 @@ def parsed(definitions: Iterable[tuple[int, bytes]], offset: int, losses: Losses
         except LogError as error:
             losses.add_harmless(reason(error))
     return found
+
+
+def topics_of(channel: int, recordings: Iterable[Recording]) -> set[str]:
+    """The topics that a channel id has in some recordings."""
+    return {recording.channels[channel].topic for recording in recordings if recording.meaning(channel) is not None}
 
 
 def same_definition(a: Any, b: Any) -> bool:

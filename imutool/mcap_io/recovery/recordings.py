@@ -8,23 +8,26 @@ and last from what its messages decode as. What stays open is on no topic.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages
-from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.codec.ros2_definition import decodes
-from imutool.mcap_io.recovery.definitions import Recording, different, key_pairs, parsed
+from imutool.mcap_io.recovery.definitions import NO_HABITS, Recording, different, key_pairs, parsed, topics_of
 from imutool.mcap_io.recovery.losses import Losses
-from imutool.mcap_io.recovery.scan_events import Definition, Event, Gap, LogEnd, LogStart, ScannedBlock, definition_runs
+from imutool.mcap_io.recovery.scan_events import (
+    Definition,
+    Event,
+    Gap,
+    LogEnd,
+    LogStart,
+    ScannedBlock,
+    definition_runs,
+    note_habits,
+)
 from imutool.mcap_io.recovery.summary import Summary
-
-CDR_HEADS = (b"\0\0", b"\0\1")  # other payloads are not what the channel says, and tell nothing
-SAMPLES = 4  # messages of a channel that must decode by a definition
 
 
 class Recordings:
@@ -62,6 +65,7 @@ class Recordings:
         """Finds the recording of every block, in file order."""
         blocks = [event for event in events if isinstance(event, ScannedBlock)]
         self._complete(blocks)
+        note_habits(events)
         runs = definition_runs(events)
         for event in events:
             if isinstance(event, LogStart):
@@ -123,6 +127,7 @@ class Recordings:
         if not (found.block.counts or {}).keys() <= recording.readable():
             self._early.append(found)
         self._certain = not foreign and (self._certain or found.evidence > 1 or bool(known))
+        recording.habits |= found.habits if found.evidence else NO_HABITS
         if found.evidence > 1:
             self._adopt(found, recording)
         else:
@@ -137,7 +142,8 @@ class Recordings:
             recording.samples.setdefault(channel, found.block)
 
     def _verify(self, found: ScannedBlock, recording: Recording) -> None:
-        """Checks that messages of unusual sizes decode; else they are of a log that nothing defines."""
+        """Checks how a block is written and that messages of unusual sizes decode; else it is of a log that nothing defines."""
+        foreign = not found.evidence and recording.habits.contradicts(found.habits)
         unusual = [
             channel
             for channel, (low, high) in found.sizes.items()
@@ -146,10 +152,12 @@ class Recordings:
         ]
         misfits = any(not self._fits(found.block, channel, recording) for channel in unusual)
         compared = [self._fits(block, channel, recording) for channel, block in recording.samples.items()] if misfits else []
-        if not misfits or (compared and not any(compared)):  # then the definitions never were those of the messages
+        never = bool(compared) and not any(compared)  # then the definitions never were those of the messages
+        if not foreign and (not misfits or never):
             self._adopt(found, recording)
             return
-        self.losses.add_harmless(f"messages from byte {found.block.offset} on do not fit the definitions before them")
+        what = "are written in another way than those before them" if foreign else "do not fit the definitions before them"
+        self.losses.add_harmless(f"messages from byte {found.block.offset} on {what}")
         self._current = self._new_behind_gap(found)
         self._current.anonymous = True
         self._give_up_misfits(self._current, [found])
@@ -212,16 +220,7 @@ class Recordings:
 
     def _fits(self, block: MessageBlock, channel: int, recording: Recording) -> bool:
         """Whether messages of a channel decode by the recording's definition; True if unknown."""
-        known = recording.channels.get(channel)
-        schema = recording.schemas.get(known.schema_id) if known else None
-        if known is None or schema is None or (schema.encoding, known.message_encoding) != ("ros2msg", "cdr"):
-            return True
-        found = self.found_in(block)
-        chosen = np.flatnonzero(found.heads["channel"] == channel)[:SAMPLES].tolist()
-        sizes = found.heads["length"].astype(np.int64) + HEAD.size
-        payloads = [found.data[found.offsets[i] + messages.MESSAGE.itemsize : found.offsets[i] + sizes[i]] for i in chosen]
-        plain = [raw for payload in payloads if (raw := payload.tobytes())[:2] in CDR_HEADS]
-        return all(decodes(raw, schema.name, schema.data) for raw in plain)
+        return recording.fits(channel, lambda: self.found_in(block))
 
     def drop_copies(self, blocks: Sequence[ScannedBlock]) -> None:
         """Keeps of equal chunks the one whose recording is best known."""
@@ -266,6 +265,7 @@ class Recordings:
             return self._now
         for narrower in (
             unlisted,
+            [r for r in pool if not r.habits.contradicts(found.habits)],
             [r for r in pool if used <= r.readable()],
             [r for r in pool if not r.ended],
             [r for r in pool if r.start <= found.block.offset],
@@ -285,16 +285,11 @@ class Recordings:
 
     def _by_content(self, found: ScannedBlock, used: set[int], pool: Sequence[Recording]) -> Recording:
         """The first recording whose definitions fit a block's messages; notes channels of which several topics are possible."""
-        open_ids = {i for i in used if len(_topics(i, pool)) > 1}
+        open_ids = {i for i in used if len(topics_of(i, pool)) > 1}
         if not open_ids:  # of two definitions of one topic the proven holds
             return max(pool, key=lambda r: sum((int(Opcode.CHANNEL), i) in r.proven for i in used))
         fitting = [r for r in pool if all(self._fits(found.block, i, r) for i in open_ids)]
         pool = fitting or pool
-        if still := {i: " or ".join(sorted(topics)) for i in open_ids if len(topics := _topics(i, pool)) > 1}:
+        if still := {i: " or ".join(sorted(topics)) for i in open_ids if len(topics := topics_of(i, pool)) > 1}:
             self.unproven[found.block.offset] = still
         return pool[0]
-
-
-def _topics(channel: int, pool: Iterable[Recording]) -> set[str]:
-    """The topics that a channel id has in some recordings."""
-    return {recording.channels[channel].topic for recording in pool if recording.meaning(channel) is not None}

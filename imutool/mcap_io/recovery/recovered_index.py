@@ -69,7 +69,7 @@ class RecoveredIndex(LogIndex):
         self._read_records()
         if self.losses.intact and contradiction:
             self.losses.add_harmless(contradiction)
-        self._sort()
+        self.sort()
 
     def _read_summary(self) -> dict[int, ChunkIndex]:
         self._listed = super()._read_summary()
@@ -275,11 +275,11 @@ class RecoveredIndex(LogIndex):
         block.edited = True
         return remap(found, keep, channels[keep])
 
-    def _sort(self) -> None:
+    def sort(self) -> None:
         """Puts the chunks of a damaged log in order of log time, each with the records behind it."""
         keys, last = [], -1
         for item in self.items:
-            last = item.start_ns if isinstance(item, MessageBlock) and item.counts else last
+            last = item.start_ns if isinstance(item, MessageBlock) and item.counts != {} else last
             keys.append(last)
         if not self.losses.intact and any(a > b for a, b in pairwise(keys)):
             self.losses.add_harmless("the chunks are not in order of log time; they are put in order")

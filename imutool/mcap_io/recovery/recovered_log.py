@@ -97,6 +97,7 @@ class RecoveredLog(Log):
             losses.add(Loss(0, 0, f"{mismatch}: {what} may have changed, which no other CRC covers"))
         else:
             losses.add_harmless(mismatch)
+        index.sort()
 
     def _indexes_match(self, block: MessageBlock) -> bool:
         """Whether the message indexes of a chunk list its messages."""

@@ -193,6 +193,7 @@ class Scan(ScanResult):
         """Takes in a valid record; returns where it ends."""
         end = position + HEAD.size + length
         self._unproven = position
+        self.note_follower(position, opcode)
         if opcode == Opcode.MESSAGE_INDEX:
             self._open_gap = None
             self.add_message_index(position, self.source.at(position + HEAD.size, length))

@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt64
+from mcap.opcode import Opcode
 from mcap.records import Header
 
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
-from imutool.mcap_io.recovery.definitions import ChunkKey
+from imutool.mcap_io.recovery.definitions import NO_HABITS, ChunkKey, Habits
 from imutool.mcap_io.recovery.losses import LATEST_NS
 from imutool.mcap_io.recovery.summary import Summary
 
@@ -31,6 +32,8 @@ class ScannedBlock:
     sizes: dict[int, tuple[int, int]]  # of the shortest and the longest message of a channel
     times: dict[int, tuple[int, int]]  # the first and the last log time of a channel
     evidence: int = 0  # for the recording it is assigned to, the more the better
+    bare: bool = False  # another record follows at once where message indexes would stand
+    habits: Habits = NO_HABITS  # of all blocks between two gaps
 
 
 class LogStart(NamedTuple):
@@ -93,6 +96,22 @@ def definition_runs(events: Sequence[Event]) -> dict[int, list[Definition]]:
     return {id(run[0]): run for run in runs}
 
 
+def note_habits(events: Sequence[Event]) -> None:
+    """Notes in every block the habits of the blocks around it, up to a gap or the end of a log."""
+    found: list[ScannedBlock] = []
+    for event in (*events, None):
+        if isinstance(event, ScannedBlock):
+            found.append(event)
+        elif not isinstance(event, Definition):
+            bare = any(each.bare for each in found)
+            packing = {"no chunk" if each.block.compression is None else each.block.compression for each in found}
+            indexed = any(each.block.indexes for each in found)
+            habits = Habits(frozenset(packing - {""}), frozenset([True] * indexed + [False] * bare))
+            for each in found:
+                each.habits = habits
+            found = []
+
+
 class ScanResult:
     """Blocks, other records and gaps of a file as a scan meets them."""
 
@@ -106,6 +125,7 @@ class ScanResult:
         self.header: Header | None = None
         self.data_ends: list[int] = []
         self.used_channels: set[int] = set()
+        self._latest: ScannedBlock | None = None
         self.last: MessageBlock | Gap | None = None  # what message indexes would belong to
 
     def add_block(self, block: MessageBlock, found: messages.Messages, head: records.ChunkHead | None) -> None:
@@ -126,10 +146,24 @@ class ScanResult:
         if spans:
             block.start_ns, block.end_ns = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
         defined = [(opcode, found.data[first : first + length].tobytes()) for opcode, first, length in found.definitions]
+        self.note_follower(block.offset, Opcode.CHUNK)
         self.items.append(block)
         size, crc = (head.size, head.crc) if head else (block.length, 0)
-        self.events.append(ScannedBlock(block, (block.start_ns, block.end_ns, size), crc, defined, sizes, spans))
+        self._latest = ScannedBlock(block, (block.start_ns, block.end_ns, size), crc, defined, sizes, spans)
+        self.events.append(self._latest)
         self.used_channels.update(block.counts)
+
+    def note_follower(self, position: int, opcode: int) -> None:
+        """Notes whether another record than a message index begins where the last block ends."""
+        found = self._latest
+        if (
+            opcode != Opcode.MESSAGE_INDEX
+            and found
+            and found.block.counts
+            and not found.block.indexes
+            and found.block.end == position
+        ):
+            found.bare = True
 
     def add_message_index(self, position: int, body: bytes) -> None:
         """Assigns a message index to the chunk before it, or counts a lost chunk's messages."""

@@ -92,3 +92,24 @@ def test_chunks_between_two_gaps_may_be_of_the_log_that_follows_without_its_begi
     assert by_mcap(tmp_path / "out.mcap") == [*a[0][2], *b[0][2]]
     assert report.losses.unproven == 2
     assert report.losses.topics == {"(/mine or /other)": 2}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        ("no-message-index", "zstd", True),
+        ("zstd", "no-message-index", True),
+        ("zstd", "lz4", True),
+        ("zstd", "plain", False),  # a writer leaves small chunks as they are
+    ],
+)
+def test_chunks_written_in_another_way_are_not_on_the_topics_of_the_log_before_them(
+    foreign: Foreign, tmp_path: Path, first: str, second: str, told: bool
+) -> None:
+    mine = foreign([text("/mine", 100 + i) for i in range(3)], first, chunk_size=CHUNK_SIZE, name="first")
+    other = foreign([text("/other", 1000 + i) for i in range(5)], second, chunk_size=CHUNK_SIZE, name="second")
+    a, b = stretches(mine), stretches(other)
+    mine.write_bytes(mine.read_bytes()[: a[1][1]] + b"\0" * 5 + other.read_bytes()[b[2][0] : b[4][1]])
+    report = repair(mine, tmp_path / "out.mcap")
+    assert report.messages == {"/mine": 2 if told else 5}
+    assert report.losses.topics == ({"(channel 1, not defined)": 3} if told else {})

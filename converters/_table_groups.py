@@ -1,0 +1,132 @@
+"""Arrays of known data sets, and groups of arrays with times of their own."""
+
+from __future__ import annotations
+
+import re
+
+from ._table_map import DIGITS, POSITION_SI, TIME_NS, TIME_WORDS, Entries, Proposal, name_and_unit, rises, split_name
+from ._table_text import Columns
+
+LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
+QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
+POSITION = r"((p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
+TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|qualisys|leica|ground_?truth|truth|gt)\d*"
+
+RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
+    "time": "synced/time",
+    "time_unit": "s",
+    "gyro": [f"synced/gyro_uncalib[{axis}]" for axis in range(3)],
+    "gyro_unit": "rad/s",
+    "accel": [f"synced/acce[{axis}]" for axis in range(3)],
+    "accel_unit": "m/s^2",
+}
+RONIN_POSES: Entries = {  # by the visual-inertial estimate of a second phone
+    "position": [f"pose/tango_pos[{axis}]" for axis in range(3)],
+    "quaternion_wxyz": [f"pose/tango_ori[{axis}]" for axis in range(4)],
+    "pose_kind": "estimate",
+}
+BLACKBIRD: Entries = {  # HDF5 of Blackbird as github.com/uzh-rpg/learned_inertial_model_odometry prepares it
+    "time": "ts",
+    "time_unit": "s",
+    "gyro": [f"gyro_raw[{axis}]" for axis in range(3)],
+    "gyro_unit": "rad/s",
+    "accel": [f"accel_raw[{axis}]" for axis in range(3)],
+    "accel_unit": "m/s^2",
+}
+BLACKBIRD_POSES: Entries = {  # by motion capture: x y z qx qy qz qw
+    "position": [f"traj_target[{axis}]" for axis in range(3)],
+    "quaternion_wxyz": [f"traj_target[{axis}]" for axis in (6, 3, 4, 5)],
+    "pose_kind": "truth",
+}
+COLUMN_ENTRIES = "time", "gyro", "accel", "position", "quaternion_wxyz"
+LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set, its IMU, and its poses if there
+    ("its arrays are those of RoNIN", RONIN, RONIN_POSES),
+    (
+        "its arrays are those of RoNIN, with rates that Android has corrected",
+        {**RONIN, "gyro": [f"synced/gyro[{axis}]" for axis in range(3)]},
+        RONIN_POSES,
+    ),
+    ("its arrays are those of Blackbird for learned inertial odometry", {**BLACKBIRD, **BLACKBIRD_POSES}, {}),
+]
+
+
+def known_layout(columns: Columns) -> Proposal | None:
+    """Map of the first data set whose arrays are there."""
+    for reason, imu, poses in LAYOUTS:
+        if _columns_of(imu) <= columns.values.keys():
+            known = poses if _columns_of(poses) <= columns.values.keys() else {}
+            return Proposal({**imu, **known}, [], [reason])
+    return None
+
+
+def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
+    """Entries for sensors in groups with a time of their own: the accelerometer, and poses.
+
+    Of several groups with poses true ones come first. None are taken whose quaternions have no certain order.
+    """
+    time, unit = str(entries["time"]), str(entries["time_unit"])
+    found: Entries = {}
+    if len(columns.values[entries["accel"][0]]) != len(columns.values[time]):
+        other = time_beside(columns, entries["accel"][0], time, unit)
+        found = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
+    groups: dict[tuple[str, str], dict[str, str]] = {}
+    for column in columns.values:
+        beside = time_beside(columns, column, time, unit)
+        if beside is not None and "quaternion_wxyz" not in entries:
+            groups.setdefault(beside, {})[split_name(column.removeprefix(_group(column)))[0]] = column
+    poses = []
+    for clock, leaves in groups.items():
+        q = {m["axis"]: c for leaf, c in leaves.items() if (m := re.fullmatch(QUATERNION, leaf))}
+        q |= {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
+        p = {m["axis"].translate(DIGITS): c for leaf, c in leaves.items() if (m := re.fullmatch(POSITION, leaf))}
+        is_true = any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", _group(clock[0])))
+        if {*q} == {*"wxyz"}:
+            poses.append((not is_true, clock, [q[a] for a in "wxyz"], [p[a] for a in "xyz"] if {*p} == {*"xyz"} else []))
+        elif array := next((c for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), ""):
+            reasons.append(f"{array[:-3]} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them")
+    for is_estimate, clock, q_wxyz, position in sorted(poses)[:1]:
+        found |= {"truth_time": clock[0], "truth_time_unit": clock[1], "quaternion_wxyz": q_wxyz}
+        found["pose_kind"] = "estimate" if is_estimate else "truth"
+        if position:
+            stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
+            found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
+    return found
+
+
+def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[str, str] | None:
+    """Time in the group of a column or in one around it, if that is not the IMU's, and its unit.
+
+    A unit that is not stated is the one in which it covers the IMU's time best.
+    """
+    if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
+        return None  # a dot in the name of a plain table's column makes no group
+    group, other = _group(column), ""
+    while group and not other:
+        for wanted, values in columns.values.items():
+            is_time = _group(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
+            if is_time and len(values) == len(columns.values[column]) and rises(values):
+                other = wanted
+        group = _group(group)
+    if other in ("", time):
+        return None
+    stated = name_and_unit(other, columns.units.get(other, ""))[1]
+    if stated in TIME_NS:
+        return other, stated
+    first, last = columns.values[time][[0, -1]].astype(float) * TIME_NS[unit]
+    overlap = {}
+    for each, size in TIME_NS.items():
+        start, end = columns.values[other][[0, -1]].astype(float) * size
+        overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
+    best = max(overlap, key=lambda each: overlap[each])
+    return (other, best) if overlap[best] > LEAST_OVERLAP else None
+
+
+def _group(column: str) -> str:
+    """Group of a column: of `mocap/position[0]`, and of a structure's `mocap.position[0]`, it is `mocap`."""
+    return re.sub(r"(^|[/.])[^/.]*$", "", column)
+
+
+def _columns_of(entries: Entries) -> set[str]:
+    """Columns that a map names."""
+    parts = [[value] if isinstance(value, str) else value for name, value in entries.items() if name in COLUMN_ENTRIES]
+    return {column for part in parts for column in part}
