@@ -183,6 +183,10 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         if not isinstance(truth.gyro_rms_rad_s, UnsetType) and not isinstance(truth.gyro_explained, UnsetType):
             value = f"{100 * truth.gyro_explained:.1f} % of the motion, {truth.gyro_rms_rad_s:.4f} rad/s rms left"
             rows.append((truth.topic, "explains gyro", value))
+        if not isinstance(truth.body_turned_deg, UnsetType) and not isinstance(truth.body_turned_std_deg, UnsetType):
+            both = truth.body_turned_deg, truth.body_turned_std_deg
+            turned, std = (", ".join(f"{value:.2f}" for value in values) for values in both)
+            rows.append((truth.topic, "body of poses", f"turned by ({turned}) ± ({std})° against the gyro"))
     return rows
 
 

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
+from scipy.spatial.transform import Rotation
 
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
@@ -97,13 +98,24 @@ def _unknown(whole: TopicSummary, why: str) -> tuple[bool, str]:
 
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
+LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be told
+ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
+UNSURE_DEG = 3.0  # standard deviation of a rotation that is not told
+
+
+class Turned(NamedTuple):
+    """Rotation vector from the body of the poses to the gyro."""
+
+    deg: Float64[np.ndarray, "3"]
+    std_deg: Float64[np.ndarray, "3"]
 
 
 class Agreement(NamedTuple):
-    """Rms (rad/s) of the gyro that the poses leave unexplained, and the share that they explain."""
+    """What poses explain of the gyro, and how their body is turned."""
 
     rms_rad_s: float
     explained: float
+    turned: Turned | None  # None if the motion does not show it
 
 
 def agreement(poses: Truth, imu: Imu) -> Agreement | None:
@@ -130,7 +142,21 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     left, _, right = np.linalg.svd(gyro.T @ omega)
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
     rms = float(np.sqrt(((gyro - omega @ turn.T) ** 2).sum(axis=1).mean()))
-    return Agreement(rms, max(0.0, 1.0 - (rms / motion) ** 2))
+    explained = max(0.0, 1.0 - (rms / motion) ** 2)
+    body = _turned(turn, gyro, rms, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
+    return Agreement(rms, explained, body)
+
+
+def _turned(
+    turn: Float64[np.ndarray, "3 3"], gyro: Float64[np.ndarray, "n 3"], rms_rad_s: float, length_s: float
+) -> Turned | None:
+    """Rotation with its deviations, if these are small: an error about each axis moves the rates about the other two."""
+    squares = gyro.T @ gyro * (length_s / ERRORS_LAST_S / len(gyro))
+    seen = np.trace(squares) * np.eye(3) - squares
+    if np.linalg.eigvalsh(seen)[0] <= 0.0:
+        return None
+    std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
+    return Turned(Rotation.from_matrix(turn).as_rotvec(degrees=True), std_deg) if std_deg.max() < UNSURE_DEG else None
 
 
 def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]]]:

@@ -42,6 +42,7 @@ from imutool.units import SENSORS
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
+TURNED_DEG = 10.0  # of the poses' body: more than a mount that was meant to be straight
 
 
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
@@ -270,11 +271,13 @@ def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
     """Report on poses with their agreement with the gyro, where both show motion."""
     poses = read_truth(log, topics=[truth.topic])
     found = None if poses is None else agreement(poses, imu)
-    return (
-        truth
-        if found is None
-        else msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
-    )
+    if found is None:
+        return truth
+    truth = msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
+    if found.turned is None:
+        return truth
+    deg, std_deg = (values.tolist() for values in found.turned)
+    return msgspec.structs.replace(truth, body_turned_deg=deg, body_turned_std_deg=std_deg)
 
 
 def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
@@ -284,4 +287,10 @@ def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
     if not usable:
         others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
         return [f"no true poses: {others}" if others else "no true poses"]
-    return [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
+    warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
+    for truth in usable:
+        turned_deg = 0.0 if isinstance(truth.body_turned_deg, msgspec.UnsetType) else np.linalg.norm(truth.body_turned_deg)
+        if turned_deg > TURNED_DEG:
+            what = f"the body of the poses is turned by {turned_deg:.0f}° against the gyro"
+            warnings.append(f"{truth.topic}: {what}: an orientation that starts from a pose is wrong by as much")
+    return warnings

@@ -110,6 +110,8 @@ class TruthInfo(Section, frozen=True):
     ends_before_s: float | UnsetType = UNSET
     gyro_rms_rad_s: float | UnsetType = UNSET  # what the poses do not explain of the log's first gyro
     gyro_explained: float | UnsetType = UNSET  # share of its motion that they do
+    body_turned_deg: list[float] | UnsetType = UNSET  # rotation vector from the poses' body to the gyro's axes
+    body_turned_std_deg: list[float] | UnsetType = UNSET
 
 
 class LogInfo(Report, frozen=True, kw_only=True, tag="imutool.info/1"):

@@ -15,6 +15,7 @@ from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import ImutoolError, ModelError
 from imutool.evaluation import evaluate
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
@@ -111,3 +112,15 @@ def test_a_log_in_g_is_not_debiased_as_metres_a_second_squared(made: Recording, 
     with pytest.raises(ModelError, match=r"specific force has a median of .*--fix"):
         debias(log, out, init="0,0,0,0,0,0")
     assert not out.exists()
+
+
+@pytest.mark.parametrize("angle_deg", [3.0, 46.0])
+def test_info_measures_how_the_body_of_the_poses_is_turned(tmp_path: Path, angle_deg: float) -> None:
+    made, turn = flight(2, duration_s=20.0), Rotation.from_rotvec([0.0, -angle_deg, 0.0], degrees=True)
+    q_wb = (Rotation.from_quat(made.truth.q_wb_wxyz, scalar_first=True) * turn).as_quat(scalar_first=True)
+    write(replace(made, truths={"/ground_truth/pose": replace(made.truth, q_wb_wxyz=q_wb)}), tmp_path / "log.mcap")
+    report = inspect(tmp_path / "log.mcap")
+    (truth,) = report.truth
+    assert np.allclose(truth.body_turned_deg, turn.as_rotvec(degrees=True), atol=1.0)
+    warned = [warning for warning in report.warnings if "the body of the poses is turned by" in warning]
+    assert len(warned) == (angle_deg > 10.0)

@@ -44,11 +44,17 @@ def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias()
     assert found.explained > 0.999
     assert found.rms_rad_s < 2 * NOISE_RAD_S
 
+    assert found.turned is not None
+    turned_deg, std_deg = found.turned
+    assert np.abs(turned_deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * std_deg.max()
+    assert 0.001 < std_deg.max() < 0.5
+
 
 def test_poses_of_another_motion_do_not():
     found = agreement(poses(tempo=1.7), imu())
     assert found is not None
     assert found.explained < 0.3
+    assert found.turned is None
 
 
 def test_a_gyro_at_rest_or_poses_of_another_time_show_nothing():
