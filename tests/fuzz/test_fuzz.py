@@ -13,7 +13,21 @@ from pathlib import Path
 import pytest
 
 from fuzz import kinds
-from fuzz.logs import Damage, Original, exchange, join, judged, length, overlap, overwrite, pair, record, remove, wrong_index
+from fuzz.logs import (
+    Damage,
+    Original,
+    exchange,
+    flip,
+    join,
+    judged,
+    length,
+    overlap,
+    overwrite,
+    pair,
+    record,
+    remove,
+    wrong_index,
+)
 
 TOTAL_S = float(os.environ.get("IMUTOOL_FUZZ_SECONDS", "60" if os.environ.get("CI") else "15"))  # over all kinds
 SEED = os.environ.get("IMUTOOL_FUZZ_SEED", datetime.datetime.now(datetime.UTC).date().isoformat())
@@ -112,6 +126,11 @@ FOUND: dict[str, tuple[int, tuple[Damage, ...], Craft]] = {
         3,
         (remove, exchange),
         lambda a, b: exchanged(a.raw[:3146] + a.raw[3974:], (2100, 2892), (8030, 8192)),
+    ),
+    "a chunk that says it is as long as those behind it together": (
+        16,
+        (flip,),
+        lambda a, b: flipped(a.raw, {2303: 32, 4048: 4, 4860: 8}),
     ),
 }
 

@@ -80,12 +80,24 @@ def repair_head(raw: bytes, offset: int, known: ChunkIndex | None, max_chunk: in
         return None
     for candidate in _candidates(raw, known):
         try:
-            if records.ChunkHead.of(candidate[:128], len(candidate), offset).crc:
+            head = records.ChunkHead.of(candidate[:128], len(candidate), offset)
+            if head.crc:
                 records.unpack(candidate, offset, max_chunk)
-                return candidate
+                if _is_one_frame(candidate[head.data_at :]):
+                    return candidate
         except LogError:
             continue
     return None
+
+
+def _is_one_frame(packed: bytes) -> bool:
+    """Whether nothing follows a frame that unpacks; too long a chunk would hide those behind it."""
+    if not packed.startswith(FRAME_MAGICS):
+        return True
+    is_zstd = packed.startswith(FRAME_MAGICS[0])
+    frame = zstandard.ZstdDecompressor().decompressobj() if is_zstd else lz4.frame.LZ4FrameDecompressor()
+    frame.decompress(packed)
+    return not frame.unused_data
 
 
 def is_consistent(raw: bytes, offset: int, known: ChunkIndex | None) -> bool:
