@@ -21,6 +21,8 @@ from imutool.cleaning.stamp_line import WRAPS, read_stamps, restamped
 from imutool.conversion.message_writer import write_log
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
+from imutool.log_info.conventions import Body, turned_body
+from imutool.log_info.inspection import sound_samples
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
@@ -32,6 +34,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
+NOT_TURNED = Body(np.eye(3), frozenset())
 SAME_CLOCK_NS = 10**9  # most by which a topic may come into the log later than the IMU
 XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 
@@ -43,6 +46,7 @@ class Corrections:
     Attributes:
         imus: by topic, the matrices that lead from its gyro and accel to right ones.
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
+        body: rotation from the body of the poses on `pose_topic` to the IMU.
         stamps: new stamps of messages of an IMU, of poses or vectors, in file order.
         notes: what is corrected, by topic.
     """
@@ -51,6 +55,8 @@ class Corrections:
     world: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     frame_id: str = ""
     late_ns: int = 0
+    body: Body = NOT_TURNED
+    pose_topic: str = ""
     stamps: Mapping[str, Int64[np.ndarray, "..."]] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
 
@@ -85,7 +91,7 @@ class Corrections:
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         turned = bool((self.world != np.eye(3)).any())
-        if (turned or self.late_ns) and name in (*MESSAGE_POSES, schemas.TF):
+        if (turned or self.late_ns or self.body is not NOT_TURNED) and name in (*MESSAGE_POSES, schemas.TF):
             return message._replace(payload=self._poses(topic, bytes(message.payload)))
         if turned and name == schemas.VECTOR3 and VELOCITY_KEY in dict(topic.metadata):
             patch = _Patch(topic, bytes(message.payload))
@@ -96,13 +102,15 @@ class Corrections:
     def _poses(self, topic: MessageTopic, payload: bytes) -> bytes:
         patch = _Patch(topic, payload)
         named = 2 if "text" in schemas.SHAPES[patch.schema_name] else 1
-        turn = _quaternion(self.world)
+        turn, body = quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
         for which in range(len(patch.layout.stamps)):
             if patch.layout.texts[named * which] != self.frame_id:
                 continue
             numbers = patch.numbers(which)
             numbers[schemas.POSITION] = self.world @ numbers[schemas.POSITION]
             q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW][None].astype(np.float64)
+            if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
+                q_wxyz = quaternion.multiply(q_wxyz, body)
             numbers[schemas.XYZW] = quaternion.multiply(turn, q_wxyz)[0][XYZW_FROM_WXYZ]
             patch.move_stamp(-self.late_ns, which)
         return bytes(patch.data)
@@ -154,7 +162,7 @@ def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], 
         P, Q = (np.sign(matrix) * (matrix != 0) for matrix in (gyro, accel))
         if (P == Q).all() and np.linalg.det(P) > 0:
             q_wxyz = numbers[schemas.ORIENTATION][WXYZ_FROM_XYZW][None].astype(np.float64)
-            numbers[schemas.ORIENTATION] = quaternion.multiply(q_wxyz, _quaternion(P.T))[0][XYZW_FROM_WXYZ]
+            numbers[schemas.ORIENTATION] = quaternion.multiply(q_wxyz, quaternion.of_matrix(P.T))[0][XYZW_FROM_WXYZ]
         else:
             numbers[schemas.ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
     return bytes(patch.data)
@@ -181,7 +189,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
     stamps: dict[str, Int64[np.ndarray, "..."]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
-    world, frame_id, late_ns = np.eye(3), "", 0
+    world, frame_id, late_ns, body, pose_topic = np.eye(3), "", 0, NOT_TURNED, ""
     clock: dict[str, int] = {}
     with Log(path) as log:
         for topic in log.imu_topics:
@@ -201,10 +209,13 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             if (survey.matrices != np.eye(3)).any():
                 imus[topic] = survey.matrices
                 notes[topic].append(_imu_note(survey))
-            if not frame_id and (survey.pose_delay_ns or (survey.world != np.eye(3)).any()):
-                world, late_ns = survey.world, survey.pose_delay_ns
-                frame_id = next(log.pose_batches(survey.pose_topic)).frame_id
-                notes[survey.pose_topic].append(_pose_note(survey))
+            if frame_id or not survey.pose_topic:
+                continue
+            turned = None if topic in imus else turned_body(log, sound_samples(log, topic), survey.pose_topic)
+            if changes := _pose_notes(survey, turned):
+                world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
+                frame_id = next(log.pose_batches(pose_topic)).frame_id
+                notes[pose_topic] += changes
         for described in log.with_schema((*MESSAGE_POSES, schemas.VECTOR3)) if STAMPS in wanted else []:
             if described.message_encoding in ENCODINGS and described.reflected is None:
                 decode = described.decode_poses if described.schema_name in MESSAGE_POSES else described.decode_scalars
@@ -214,7 +225,8 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                     stamps[described.name] = whole_ns
                     told = "; ".join(read_stamps(before).told) or "stamps start after a wrap"
                     notes[described.name].append(f"{told}; they run on now")
-    return Corrections(imus, world, frame_id, late_ns, stamps, {topic: "; ".join(said) for topic, said in notes.items()})
+    said = {topic: "; ".join(lines) for topic, lines in notes.items()}
+    return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, said)
 
 
 def _times(batches: Iterator[ImuBatch | PoseBatch | ScalarBatch]) -> Int64[np.ndarray, "2 n"]:
@@ -244,10 +256,13 @@ def _imu_note(survey: Survey) -> str:
     return f"{scale}; x, y, z are now {gyro} of gyro and {accel} of accel as recorded"
 
 
-def _pose_note(survey: Survey) -> str:
+def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
     parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
     parts += [f"stamps are earlier by {survey.pose_delay_ns} ns"] if survey.pose_delay_ns else []
-    return "; ".join(parts)
+    if turned is not None:
+        deg = ", ".join(f"{angle:.4f}" for angle in np.degrees(quaternion.log(quaternion.of_matrix(turned.turn))[0]))
+        parts.append(f"the body is now that of the IMU, turned by ({deg})° from that recorded")
+    return parts
 
 
 def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
@@ -268,10 +283,3 @@ def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compressi
     content = found.put_on(replace(content, metadata=own))
     write_log(content, target, compression=compression, overwrite=overwrite)
     return tuple(content.remarks.notes)
-
-
-def _quaternion(R: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "1 4"]:
-    from scipy.spatial.transform import Rotation
-
-    q_wxyz: Float64[np.ndarray, "1 4"] = Rotation.from_matrix(R).as_quat(scalar_first=True)[None]
-    return q_wxyz

@@ -80,6 +80,13 @@ def matrix(q: Quaternions) -> Float64[np.ndarray, "n 3 3"]:
     return np.stack([rotate(q, np.broadcast_to(axis, (len(q), 3))) for axis in np.eye(3)], axis=2)
 
 
+def of_matrix(R: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "1 4"]:
+    """Quaternion of a rotation: the main eigenvector of q qᵀ, which is linear in R."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    outer = [[a + e + i, 0, 0, 0], [h - f, a - e - i, 0, 0], [c - g, b + d, e - a - i, 0], [d - b, c + g, f + h, i - a - e]]
+    return np.asarray(np.linalg.eigh(outer, "L").eigenvectors[:, -1:].T)
+
+
 def running_product(q: Quaternions) -> Quaternions:
     """Products q_0, q_0 q_1, q_0 q_1 q_2, ..., by recursion over pairs."""
     if len(q) <= 1:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial.transform import Rotation
 
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
@@ -16,10 +15,12 @@ from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import Motion, Samples
-from imutool.cleaning.truth import Truth, truth_of, turning
+from imutool.cleaning.truth import Truth, read_truth, truth_of, turning
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import LogError
+from imutool.geometry import quaternion
 from imutool.log_info.report import Convention, TruthInfo
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds, seconds
 
@@ -46,8 +47,19 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
     """Log the warnings about units, axes and frames for whoever uses the samples as they are."""
-    for warning in convention_warnings(convention_summary(imu, truth)) if len(imu) else []:
+    warnings = convention_warnings(convention_summary(imu, truth)) if len(imu) else []
+    found = agreement(truth, imu) if truth is not None and not warnings else None
+    if truth is not None and found is not None and found.turned is not None:
+        warnings = body_warnings(truth.topic, found.turned.deg.tolist())
+    for warning in warnings:
         logger.warning("%s: %s", where, warning)
+
+
+def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
+    """Warning of poses whose body is turned far against the gyro."""
+    deg = float(np.linalg.norm(turned_deg))
+    fix = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; imutool convert LOG OUT --fix corrects it"
+    return [fix] if deg > TURNED_DEG else []
 
 
 def warn_of_recordings(recordings: Iterable[Recording]) -> None:
@@ -101,6 +113,8 @@ LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be told
 ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
 UNSURE_DEG = 3.0  # standard deviation of a rotation that is not told
+TURNED_DEG = 10.0  # more than a mount that was meant to be straight
+SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 
 
 class Turned(NamedTuple):
@@ -147,6 +161,31 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     return Agreement(rms, explained, body)
 
 
+class Body(NamedTuple):
+    """Rotation from a turned body of poses to the gyro's axes, and its frames in transforms."""
+
+    turn: Float64[np.ndarray, "3 3"]
+    frames: frozenset[str]
+
+
+def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
+    """Body of poses that is turned by more than `TURNED_DEG`.
+
+    A frame of a transform that has the same orientations is the same body.
+    """
+    poses = read_truth(log, topics=[topic])
+    found = None if poses is None else agreement(poses, imu)
+    if poses is None or found is None or found.turned is None or not body_warnings(topic, found.turned.deg.tolist()):
+        return None
+    alike, other = set[str](), set[str]()
+    for named in log.with_schema((schemas.TF,)):
+        for batch in log.pose_batches(named.name):
+            _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
+            same = np.abs((poses.q_wb_wxyz[mine] * batch.q_wb_wxyz[theirs]).sum(axis=1)) > 1.0 - SAME_TURN
+            (alike if len(same) and same.all() else other).add(batch.child_frame_id)
+    return Body(quaternion.matrix(quaternion.exp(np.radians(found.turned.deg)[None]))[0], frozenset(alike - other))
+
+
 def _turned(
     turn: Float64[np.ndarray, "3 3"], gyro: Float64[np.ndarray, "n 3"], rms_rad_s: float, length_s: float
 ) -> Turned | None:
@@ -156,7 +195,7 @@ def _turned(
     if np.linalg.eigvalsh(seen)[0] <= 0.0:
         return None
     std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
-    return Turned(Rotation.from_matrix(turn).as_rotvec(degrees=True), std_deg) if std_deg.max() < UNSURE_DEG else None
+    return Turned(np.degrees(quaternion.log(quaternion.of_matrix(turn))[0]), std_deg) if std_deg.max() < UNSURE_DEG else None
 
 
 def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]]]:

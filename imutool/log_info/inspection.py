@@ -23,6 +23,7 @@ from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
 from imutool.log_info.conventions import (
     agreement,
+    body_warnings,
     convention_summary,
     convention_warnings,
     conventions,
@@ -42,7 +43,6 @@ from imutool.units import SENSORS
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
-TURNED_DEG = 10.0  # of the poses' body: more than a mount that was meant to be straight
 
 
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
@@ -82,7 +82,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
         )
     ]
     if check and own and truths and log.topics[own[0].topic].is_read:
-        samples = _sound(*_columns(log, own[0].topic))
+        samples = sound_samples(log, own[0].topic)
         truths = [_against_gyro(log, truth, samples) for truth in truths]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
     warnings += [*_truth_warnings(own, truths), *refused]
@@ -176,6 +176,11 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
         accel_at_rest_m_s2=rest.accel_m_s2,
         noise=rest.noise,
     )
+
+
+def sound_samples(log: Log, topic: str) -> Imu:
+    """Finite samples of an IMU in time order, each stamp once."""
+    return _sound(*_columns(log, topic))
 
 
 def _columns(log: Log, topic: str) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
@@ -274,9 +279,7 @@ def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
     if found is None:
         return truth
     truth = msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
-    if found.turned is None:
-        return truth
-    deg, std_deg = (values.tolist() for values in found.turned)
+    deg, std_deg = (UNSET, UNSET) if found.turned is None else (values.tolist() for values in found.turned)
     return msgspec.structs.replace(truth, body_turned_deg=deg, body_turned_std_deg=std_deg)
 
 
@@ -289,8 +292,5 @@ def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
         return [f"no true poses: {others}" if others else "no true poses"]
     warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
     for truth in usable:
-        turned_deg = 0.0 if isinstance(truth.body_turned_deg, msgspec.UnsetType) else np.linalg.norm(truth.body_turned_deg)
-        if turned_deg > TURNED_DEG:
-            what = f"the body of the poses is turned by {turned_deg:.0f}° against the gyro"
-            warnings.append(f"{truth.topic}: {what}: an orientation that starts from a pose is wrong by as much")
+        warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
     return warnings

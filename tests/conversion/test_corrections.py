@@ -59,6 +59,24 @@ def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarra
     assert sorted(path.name for path in tmp_path.iterdir()) == ["right.mcap", "wrong.mcap"]
 
 
+def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_path: Path) -> None:
+    """Poses of another frame than the IMU's, as of a marker that was mounted askew, and the transform beside them."""
+    turn = Rotation.from_rotvec([20.0, -30.0, 25.0], degrees=True)
+    true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
+    askew = replace(made.truth, q_wb_wxyz=(true * turn).as_quat(scalar_first=True))
+    write(replace(made, truths={"/ground_truth/pose": askew}), tmp_path / "askew.mcap")
+    report = convert(tmp_path / "askew.mcap", tmp_path / "straight.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "straight.mcap")
+    left = Rotation.from_quat(fixed.truth.q_wb_wxyz.copy(), scalar_first=True) * true.inv()
+    assert np.degrees(left.magnitude()).max() < 1.0  # the sensor's own misalignment is of that size
+    assert (fixed.truth.p_wb == made.truth.p_wb).all()
+    assert any("the body is now that of the IMU" in note for note in report.notes)
+    assert inspect(tmp_path / "straight.mcap").warnings == []
+    with Log(tmp_path / "straight.mcap") as log:
+        transforms = np.concatenate([batch.q_wb_wxyz for batch in log.pose_batches("/tf")])
+    np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
+
+
 def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
     write(made, tmp_path / "made.mcap")
     report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", correct=["conventions"])

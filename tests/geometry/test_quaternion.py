@@ -79,3 +79,12 @@ def test_roll_pitch_and_yaw_are_scipys_and_say_nothing_at_the_pole(turns: tuple[
     roll, pitch, yaw = quaternion.roll_pitch_yaw(wxyz(pole))[0]
     assert pitch == pytest.approx(np.pi / 2, abs=1e-7)
     assert np.isfinite([roll, yaw]).all()
+
+
+@pytest.mark.parametrize(
+    "xi", [[0, 0, 0], [1e-9, 0, 0], [0.3, -1.2, 0.7], [np.pi, 0, 0], [0, np.pi, 0], [0, 0, -3.14]], ids=str
+)
+def test_a_matrix_gives_its_quaternion_also_at_half_a_turn(xi: list[float]) -> None:
+    turn = Rotation.from_rotvec(xi)
+    (found,) = quaternion.of_matrix(turn.as_matrix())
+    assert abs(abs(float(found @ turn.as_quat(scalar_first=True))) - 1.0) < 1e-12
