@@ -78,10 +78,10 @@ def convert(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ConvertReport:
-    """Convert one sequence to the file `out`, or several (one too, to `logs/`) to the folder.
+    """Convert one sequence to the file `out`, or several to the folder `out`.
 
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
-    are worth. `mapping` is a file that states what the columns of a table mean.
+    are worth. `mapping` is a file that states what the columns of a table mean. `out` with a slash at its end is a folder.
     `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
     `correct` names what is corrected: `conventions` that the log's motion shows to be wrong, and `stamps`.
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.

@@ -27,7 +27,7 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
-NO_TURN = "the motion turns too little, or about one axis only"
+NO_TURN = "no order of the axes fits clearly: little motion, turns about one axis only, or a turned body"
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
 

@@ -25,6 +25,7 @@ from imutool.report import Report
 from imutool.units import AXES, SENSORS
 
 BY_RECORDING = ("body_centre", "clipping_absent", "digits_absent", "bandwidth_absent")
+LEAST_ARM_M = 0.02  # of the recording's sensor from its poses' point
 BY_NOISE = ("noise_absent", "noise_per_sample", "noise_density")
 
 
@@ -139,6 +140,3 @@ def _body_centre(fit: KinematicFit, real: Recording) -> list[FaultFound]:
     if not any(clear) or sizes[0] > 0.2 * sizes[1] or sizes[1] < LEAST_ARM_M:
         return []
     return [found("body_centre", "accel", **{a: Estimate(theirs[a].value, theirs[a].std, "m") for a in AXES})]
-
-
-LEAST_ARM_M = 0.02  # of the recording's sensor from its poses' point

@@ -28,12 +28,14 @@ SAMPLES = 4  # messages of a channel that must decode by a definition
 
 
 class Habits(NamedTuple):
-    """How a writer writes messages, the same in a whole log; empty where that is not known."""
+    """How a writer writes messages, the same in a whole log; empty where that is not known.
 
-    packing: frozenset[str] = (
-        frozenset()
-    )  # compressions, or that there are no chunks; some writers leave small chunks as they are
-    indexed: frozenset[bool] = frozenset()  # whether message indexes follow the chunks
+    `packing` are the compressions, or that there are no chunks; some writers leave small chunks as they are. `indexed` says
+    whether message indexes follow the chunks.
+    """
+
+    packing: frozenset[str] = frozenset()
+    indexed: frozenset[bool] = frozenset()
 
     def __or__(self, other: Habits) -> Habits:
         return Habits(self.packing | other.packing, self.indexed | other.indexed)

@@ -142,7 +142,7 @@ class Recordings:
             recording.samples.setdefault(channel, found.block)
 
     def _verify(self, found: ScannedBlock, recording: Recording) -> None:
-        """Checks how a block is written and that messages of unusual sizes decode; else it is of a log that nothing defines."""
+        """Give a block to no known log if it is written in another way, or if messages of unusual sizes do not decode."""
         foreign = not found.evidence and recording.habits.contradicts(found.habits)
         unusual = [
             channel
