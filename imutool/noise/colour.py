@@ -108,8 +108,8 @@ def measured(
 ) -> Colour | None:
     """Colour of recorded less expected samples; None where they are too short.
 
-    `parts` are stretches of (time, recorded, expected). An expected signal with noise of its own, as smoothed poses have, leaves more than a simulation along it lacks. There the
-    noise is the recorded less the expected power.
+    `parts` are stretches of (time, recorded, expected). An expected signal with noise of its own, as smoothed poses have,
+    leaves more than a simulation along it lacks. There the noise is the recorded less the expected power.
     """
     count = _count(WINDOW_S, rate_hz)
     windows = [window for part in parts for window in _windows(*part, count, rate_hz)]
