@@ -191,6 +191,19 @@ class _Search:
         return now
 
     def simplified(self, now: Fit) -> Fit:
+        """Fit with the simpler of two effects that the logs hardly tell apart."""
+        return self._without_arms(self._without_low_pass(now))
+
+    def _without_low_pass(self, now: Fit) -> Fit:
+        """Fit with a clock offset instead of a low pass beyond the poses' band, which only its delay shows."""
+        offset = next((e for e in self.named if e.name == "clock_offset" and e.key not in now.keys), None)
+        for k, (effect, theta) in enumerate(now.chosen):
+            if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, self.logs, self.settings):
+                delay_s = -1.0 / (2.0 * np.pi * theta)  # of a first order far below its cut-off
+                return fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :], (offset, delay_s)), near=now)
+        return now
+
+    def _without_arms(self, now: Fit) -> Fit:
         """Fit with a lever arm instead of a size effect of three equal arms, and the rest if it is significant."""
         arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect"]
         lever = [effect for effect in self.named if effect.name == "lever_arm" and effect.key not in now.keys]
@@ -286,6 +299,7 @@ class _Search:
 
     def _beyond_model_error(self, verdicts: Sequence[SelectedEffect]) -> list[SelectedEffect]:
         """Verdicts, with no trust in what may be the model error of a far larger effect."""
-        denoised = any(log.pair.denoised for log in self.logs)
-        hidden = below_model_error({verdict.effect.key: verdict.gain for verdict in verdicts}, denoised, self.settings)
+        pairs, gains = [log.pair for log in self.logs], {verdict.effect.key: verdict.gain for verdict in verdicts}
+        denoised, poses = any(pair.denoised for pair in pairs), not all(pair.exact for pair in pairs)
+        hidden = below_model_error(gains, self.settings, denoised=denoised, poses=poses)
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in hidden else verdict for verdict in verdicts]
