@@ -35,7 +35,7 @@ class BiasPrior:
     least_std: Vector6 | None = None
 
     def supported(self, state: State, elapsed_s: float) -> State:
-        """State of a filter that began with `std`, as if it had begun with the width that the log supports until now."""
+        """State of a filter that began with `std`, for the width that the log supports until now."""
         if self.least_std is None:
             return state
         walked = self.walk**2 * elapsed_s
@@ -48,9 +48,9 @@ class BiasPrior:
 
 
 def shown_bias(state: State, mean: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
-    """Bias minus the prior's mean that a log shows without the prior, and its variance, axis by axis.
+    """Bias minus the prior's mean, as a log shows it without the prior, and its variance.
 
-    Precision of the state minus that of the prior; infinite variance where the log shows little.
+    Axis by axis: the precision of the state minus that of the prior. The variance is infinite where the log shows little.
     """
     after = np.diag(state.covariance(False))
     precision = 1.0 / after - 1.0 / variance
@@ -60,9 +60,9 @@ def shown_bias(state: State, mean: Vector6, variance: Vector6) -> tuple[Vector6,
 
 
 def supported_std(std: Vector6, least_std: Vector6 | None, difference: Vector6, variance: Vector6) -> Vector6:
-    """Standard deviation of a prior that a log supports: `difference` and `variance` as for `widened`.
+    """Standard deviation of a prior that a log supports.
 
-    Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s, and one session does not tell. So the logarithm of
+    `difference` and `variance` are those of `widened`. Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s, and one session does not tell. So the logarithm of
     the width is uniform between `least_std` and `std`. The three axes of a sensor are switched on together and have the same
     share of the way: where two axes repeat, weak evidence about the third is not believed. The result is the mean of that
     logarithm, given the log.

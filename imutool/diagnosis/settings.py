@@ -123,6 +123,7 @@ class SignalSettings(Settings, frozen=True):
     edge_factor: Positive = 1.3  # over the edge, from where noise is measured
     least_edge: Share = 0.05  # of the sample rate
     most_edge: Share = 0.3  # of the sample rate
+    most_top: Share = 0.75  # of the highest frequency that is compared: above the edge some spectrum has to be left
     same_grid: Share = 0.01  # relative difference of two LSBs that are one
     motion_band_hz: Positive = 15.0  # of the motion of joints: above, accelerations are noise
     motion_band_share: Share = 0.15  # of the sample rate, for slower logs
