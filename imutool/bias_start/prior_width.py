@@ -62,10 +62,10 @@ def shown_bias(state: State, mean: Vector6, variance: Vector6) -> tuple[Vector6,
 def supported_std(std: Vector6, least_std: Vector6 | None, difference: Vector6, variance: Vector6) -> Vector6:
     """Standard deviation of a prior that a log supports.
 
-    `difference` and `variance` are those of `widened`. Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s, and one session does not tell. So the logarithm of
-    the width is uniform between `least_std` and `std`. The three axes of a sensor are switched on together and have the same
-    share of the way: where two axes repeat, weak evidence about the third is not believed. The result is the mean of that
-    logarithm, given the log.
+    `difference` and `variance` are those of `widened`. Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s,
+    and one session does not tell. So the logarithm of the width is uniform between `least_std` and `std`. The three axes of a
+    sensor are switched on together and have the same share of the way: where two axes repeat, weak evidence about the third is
+    not believed. The result is the mean of that logarithm, given the log.
     """
     std = widened(std, difference, variance)
     if least_std is None:

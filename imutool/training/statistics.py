@@ -67,7 +67,7 @@ class TurnOn(NamedTuple):
 def store_statistics(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> TurnOn:
-    """Store the prior, the spread of starts from truth and the noise; return the prior with its sessions.
+    """Store the prior, the spread of starts from truth and the noise; return the prior.
 
     From the training part.
     """
