@@ -1,4 +1,4 @@
-"""Cleaning of a log's IMU: `survey` finds the defects, a `Cleaner` removes them, batch by batch."""
+"""Cleaning of a log's IMU: `survey` finds the defects, a `Cleaner` removes them."""
 
 from __future__ import annotations
 
