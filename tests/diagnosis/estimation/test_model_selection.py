@@ -259,6 +259,12 @@ def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
     assert names(asked(replace(pair, against="true poses", band_hz=7.0), beyond=False)) == ["clock_offset"]
 
 
+def test_a_low_pass_that_replaced_its_delay_beside_a_scale_gives_way_to_it_again() -> None:
+    pair = planted.pair(planted.shaken(), {"low_pass": [20.0], "gyro_scale": [0.05, -0.05, 0.05]})
+    found = names(asked(replace(pair, against="true poses", band_hz=3.0), beyond=False))
+    assert sorted(found) == ["clock_offset", "gyro_scale"]
+
+
 @pytest.mark.parametrize("arms_mm", [(107.0, 101.0, 107.0), (150.0, 120.0, 150.0)])
 def test_three_arms_that_agree_are_a_lever_arm_and_the_rest_a_size_effect(arms_mm: tuple[float, float, float]) -> None:
     theta = [0.0, 0.0, arms_mm[0] * 1e-3, 0.0, 0.0, arms_mm[1] * 1e-3, 0.0, 0.0, arms_mm[2] * 1e-3]
