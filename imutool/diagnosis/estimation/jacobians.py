@@ -116,7 +116,7 @@ class EffectJacobian(NamedTuple):
     rows: Float64[np.ndarray, "r n"]
     axes: Int64[np.ndarray, " r"]
     parameters: Int64[np.ndarray, " r"]
-    count: int  # of the effect's parameters
+    width: int  # the number of the effect's parameters
 
     def on(self, axis: int) -> Int64[np.ndarray, " q"]:
         """Rows of an axis, in the order of the parameters."""
@@ -127,9 +127,9 @@ def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect) -> E
     """Jacobian of an effect in a forward pass, or of a linear one outside it."""
     entries = list(forward.derivatives(effect))
     axes, js = (np.array([entry[k] for entry in entries], np.int64) for k in (0, 1))
-    count, length = len(effect.parameters), len(forward.pair.stamp_s)
+    width, length = len(effect.parameters), len(forward.pair.stamp_s)
     rows = np.stack([row for _, _, row in entries]) if entries else np.zeros((0, length))
-    return EffectJacobian(whiten.rows(rows, axes), axes, js, count)
+    return EffectJacobian(whiten.rows(rows, axes), axes, js, width)
 
 
 class Jacobians:
@@ -164,7 +164,7 @@ class Jacobians:
             on = jacobian.on(axis)
             where.append(first + jacobian.parameters[on])
             rows += [jacobian.rows[k][mask] for k in on]
-            first += jacobian.count
+            first += jacobian.width
         return np.concatenate(where), np.stack(rows) if rows else np.zeros((0, int(mask.sum())))
 
     def along(self, log: int, axis: int, step: Theta, mask: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:

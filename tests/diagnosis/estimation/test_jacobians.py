@@ -112,7 +112,7 @@ def test_a_step_along_jacobians_is_the_sum_of_their_rows(pair: Pair, band: Band 
     for physics, _ in chosen:
         slope = effect_jacobian(whiten, ForwardPass(pair, chosen), physics)
         whole[slope.axes, first + slope.parameters] = slope.rows
-        first += slope.count
+        first += slope.width
     for axis in range(6):
         np.testing.assert_allclose(slopes.along(0, axis, step, rows), step @ whole[axis], atol=1e-9 * np.abs(whole).max())
 
