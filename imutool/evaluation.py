@@ -15,11 +15,11 @@ from msgspec import to_builtins
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import BiasPrior
 from imutool.bias_start.correction import DebiasedImu, apply
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.bias_start.stretches import measured_imu
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.bias.model import BiasModel, Vector6
-from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks, widened
+from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     TRACKED_BY,
@@ -27,6 +27,7 @@ from imutool.bias_start.initial_bias import (
     tracked_from_prior,
     training_source,
 )
+from imutool.bias_start.prior_width import BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
@@ -60,7 +61,7 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
         again = itertools.islice(filter_blocks(model, [relative_samples(imu)], before), len(rest_blocks))
         rest_blocks = _first_stop(model, stop, before) or list(again)
-    state = rest_blocks[-1].step.after
+    state = before.supported(rest_blocks[-1].step.after, end_s)
     std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
     noise = white_noise(u)
     source = f"{end_s - rest_blocks[0].start_s:.1f} s at rest from 0.0 s on"
@@ -97,7 +98,8 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     mean = residual.mean(axis=0)
     squares = ((residual - mean) ** 2).sum(axis=0)
     stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))
-    start = replace(start, std=widened(start.std, mean - start.rest, _at_rest_variance(model, residual)))
+    supported = supported_std(start.std, start.least_std, mean - start.rest, _at_rest_variance(model, residual))
+    start = replace(start, std=supported)
     return _combined(start, [stretch], int(imu.t_ns[0]))
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from imutool.bias.model import Array, BiasModel, Vector6
-from imutool.bias_start.bias_tracking import widened
 from imutool.bias_start.initial_bias import (
     LEAST_STD,
     TRACKED_BY,
@@ -21,6 +20,7 @@ from imutool.bias_start.initial_bias import (
     bias_prior,
     prior,
 )
+from imutool.bias_start.prior_width import supported_std
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
@@ -62,13 +62,13 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - bias_over(model, piece, start.rest)
     offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows])
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
-    start = replace(start, std=widened(start.std, offset, variance + WORLD_TILT_STD**2))
+    start = replace(start, std=supported_std(start.std, start.least_std, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     how = f"truth over {length_s:.1f} s{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)
     mean, spread = _updated(start, offset, variance + WORLD_TILT_STD**2)
-    before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD))
+    before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD), least_std=None)
     ends_s = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
 

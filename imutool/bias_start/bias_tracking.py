@@ -9,56 +9,23 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from imutool.bias.model import COLUMNS, GAP_S, BiasEstimate, BiasModel, Vector6
+from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.preintegration import integrate
 from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 
 BLOCK_S = 0.5
-USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
-CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
 
 Samples = tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"], Float64[np.ndarray, "_ 3"]]  # logs differ in length
-
-
-@dataclass(frozen=True)
-class BiasPrior:
-    """Prior of a run's biases.
-
-    Bias b in motion, offset at rest (mean zero), and random walk of b.
-
-    `walk` is in rad/s and m/s² per second^1/2.
-    """
-
-    mean: Vector6
-    std: Vector6
-    ground_std: Vector6
-    walk: Vector6 = field(default_factory=USUAL_WALK.copy)
-
-
-def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
-    """Standard deviation of a prior after comparison with what a log shows.
-
-    `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it
-    shows nothing). A sensor whose chi-square exceeds `CONTRADICTED` gets the root mean square of its difference.
-    """
-    out = std.copy()
-    for columns in COLUMNS.values():
-        shown = np.isfinite(variance[columns]) & (std[columns] > 0)  # a prior of zero variance stays
-        square = difference[columns][shown] ** 2
-        chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
-        if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
-            out[columns] = np.maximum(std[columns], np.sqrt(square.mean()))
-    return out
 
 
 class BiasTrajectory(NamedTuple):
@@ -184,7 +151,7 @@ class TrackedBiasStream:
     def __init__(self, model: BiasModel, prior: BiasPrior, rest: Vector6, hold_s: float) -> None:
         self._motion, self._mean = model.stream(prior.mean), prior.mean
         self.filter = BiasFilter(prior)
-        self._rest, self._now, self._hold_s = rest, rest, hold_s
+        self._rest, self._now, self._hold_s, self._prior = rest, rest, hold_s, prior
         self._covariance = np.diag(prior.std**2)
 
     def __call__(
@@ -203,8 +170,8 @@ class TrackedBiasStream:
         for block in self.filter.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:]):
             row = int(np.searchsorted(t_s, block.end_s))
             rest[done:row], covariance[done:row] = self._now, self._covariance
-            done, self._now = row, block.step.after.rest_bias(block.resting)
-            self._covariance = block.step.after.covariance(block.resting)
+            state = self._prior.supported(block.step.after, block.end_s)
+            done, self._now, self._covariance = row, state.rest_bias(block.resting), state.covariance(block.resting)
         rest[done:], covariance[done:] = self._now, self._covariance
         rest[t_s < self._hold_s] = self._rest
         return BiasEstimate(bias + rest, covariance)

@@ -23,8 +23,9 @@ from imutool.bias import static
 from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_tracking import BiasPrior, FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2

@@ -31,25 +31,21 @@ from imutool.bias.model import (
     Vector6,
 )
 from imutool.bias_start.bias_tracking import (
-    USUAL_WALK,
-    BiasPrior,
     BiasTrajectory,
     Samples,
     TrackedBiasStream,
     TrajectoryBiasStream,
     filter_blocks,
     smooth_blocks,
-    widened,
 )
+from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, shown_bias, supported_std
 from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
-from imutool.inertial.inertial_filter import State
 from imutool.recording import Imu, seconds
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
-LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 TRACKED_BY = "gravity in motion and every stop"
 
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
@@ -66,7 +62,8 @@ class InitialBias:
     """Rest bias (gyro rad/s, accel m/s²) with standard deviation, and a few words on its source.
 
     It holds for the whole log, unless `track` or `follows` is set. `track` is the rest bias in time. With `follows`, the prior
-    before the first sample, the rest bias is tracked from the samples from `hold_s` on (s from the first sample).
+    before the first sample, the rest bias is tracked from the samples from `hold_s` on (s from the first sample). With
+    `least_std`, a prior's standard deviation lies between that and `std`.
     """
 
     rest: Vector6
@@ -76,6 +73,7 @@ class InitialBias:
     track: BiasTrajectory | None = None
     follows: BiasPrior | None = None
     hold_s: float = 0.0
+    least_std: Vector6 | None = None
 
     def stream(self, model: BiasModel) -> Stream:
         """Bias stream of a model from this start."""
@@ -156,13 +154,13 @@ def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
 
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias of a log that begins at a stamp: that of its session, or of a new one."""
-    mean, std = model.prior_mean.copy(), model.prior_std.copy()
+    mean, std, least = model.prior_mean.copy(), model.prior_std.copy(), model.card.get("turn_on_least_std")
     sessions = [] if first_ns is None else model.card.get("sessions", [])
     apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
     if apart and min(apart) <= SESSION_GAP_S * 1e9:
         session = sessions[apart.index(min(apart))]
-        mean, std = np.array(session["mean"]), np.array(session["std"])
-    return InitialBias(mean, std, "prior of the training runs")
+        mean, std, least = np.array(session["mean"]), np.array(session["std"]), None
+    return InitialBias(mean, std, "prior of the training runs", least_std=None if least is None else np.array(least))
 
 
 def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
@@ -174,7 +172,8 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk)
+    least = None if start.least_std is None else np.maximum(start.least_std, LEAST_STD)
+    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least)
 
 
 def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
@@ -201,8 +200,8 @@ def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = ""
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:
         raise NoRestError("the log never rests", where=where, expected="1.5 s or more without motion")
-    std = widened(before.std, difference, variance)
-    if (std > before.std).any():
+    std = supported_std(before.std, before.least_std, difference, variance)
+    if not np.array_equal(std, before.std):
         track, *_ = smooth_bias(model, batches, replace(before, std=std))
     std = np.median(track.std, axis=0)
     parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
@@ -274,14 +273,5 @@ def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) 
         rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
         rested_s += (block.end_s - block.start_s) * block.resting
     table = np.array(rows).reshape(-1, 13)
-    shown = (np.zeros(6), np.full(6, np.inf)) if first is None else _shown(first, prior)
+    shown = (np.zeros(6), np.full(6, np.inf)) if first is None else shown_bias(first, prior.mean, prior.std**2)
     return SmoothedBias(BiasTrajectory(table[:, 0], table[:, 1:7], table[:, 7:]), rested_s, *shown)
-
-
-def _shown(first: State, prior: BiasPrior) -> tuple[Vector6, Vector6]:
-    """Bias that a log shows without the prior: precision of the smoothed bias minus that of the prior, axis by axis."""
-    after, before = np.diag(first.covariance(False)), prior.std**2
-    precision = 1.0 / after - 1.0 / before
-    measured = precision > LEAST_SHOWN / before
-    gain = np.where(measured, 1.0 - after / before, 1.0)
-    return (first.bias - prior.mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from imutool.bias.model import GAP_S
-from imutool.cleaning.cleaner import rows
+from imutool.cleaning import rows
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.topics import CLEAN_FIX

@@ -13,8 +13,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from imutool.bias.model import Vector6
-from imutool.bias_start.bias_tracking import BiasFilter, BiasPrior, FilteredBlock, smooth_blocks
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, smooth_blocks
 from imutool.bias_start.initial_bias import relative_samples
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.geometry import quaternion
 from imutool.inertial.inertial_filter import SIZE, State
 from imutool.inertial.strapdown import StartPose, dead_reckon

@@ -119,6 +119,7 @@ class TrainingReport(Report, frozen=True, kw_only=True, tag="imutool.training/1"
     logs: list[TrainingLog]
     held_out: dict[str, Any]
     sessions: list[dict[str, Any]]
+    turn_on_least_std: list[float] | UnsetType = UNSET  # of the next session's bias; older models have none
     compared: dict[str, Any] | UnsetType = UNSET
     physics: dict[str, Any] | UnsetType = UNSET
     left_out: dict[str, Any] | UnsetType = UNSET

@@ -123,6 +123,7 @@ class SignalSettings(Settings, frozen=True):
     edge_factor: Positive = 1.3  # over the edge, from where noise is measured
     least_edge: Share = 0.05  # of the sample rate
     most_edge: Share = 0.3  # of the sample rate
+    most_top: Share = 0.75  # of the highest frequency that is compared: above the edge some spectrum has to be left
     same_grid: Share = 0.01  # relative difference of two LSBs that are one
     motion_band_hz: Positive = 15.0  # of the motion of joints: above, accelerations are noise
     motion_band_share: Share = 0.15  # of the sample rate, for slower logs
@@ -162,6 +163,7 @@ class SearchSettings(Settings, frozen=True):
     model_error: Positive = 1e-5  # of the largest effect's squares (0.3 % of its size) may be its model's error
     model_error_denoised: Positive = 1e-3  # the same beside a simulation whose noise was filtered out (3 %)
     model_error_resonance: Positive = 1e-2  # the same beside a mount that rings, whose model is simplified
+    model_error_clock: Positive = 0.1  # of a filter beside a clock of poses, whose drift is no straight line (a third of it)
     observable_squares: Positive = 36.0  # six standard deviations, for some thousand hypotheses
 
 

@@ -12,12 +12,10 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64
-from scipy.signal import welch
 
-from imutool.diagnosis.estimation.whitening import autoregression
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding
-from imutool.noise.datasheet import Colour, Filters, Levels, Noise
+from imutool.noise.colour import measured
+from imutool.noise.datasheet import Noise
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
@@ -110,72 +108,19 @@ def _signal(signal: str) -> Literal["gyro", "accel", "both", ""]:
     return "both" if signal == "both" else _sensor(signal) or ""
 
 
-ORDER = 40  # of the autoregression: lines of a vibration need many
-WINDOW_S = 1.0  # over which the size of the noise comes and goes
-QUANTILES = 21
-SEGMENT = 1024  # of a spectrum
-BANDS = 10  # of it, of which the lowest is the white noise
-WHITE = 0.7  # of the lowest band: an autoregression fills valleys
-LEAST_POWER = 1e-6  # of the highest density, which is taken for nothing
-LEAST_REST = 1e-3  # of the power, below which all of it is white
-
-
 def to_noise_file(d: Diagnosis) -> Noise | None:
     """Noise with its colour, of all logs; None without samples of an IMU that vary."""
     if not d.traces:
         return None
     rate_hz = 1.0 / float(np.median([np.median(np.diff(trace.t_s)) for trace in d.traces]))
-    gap = np.full((1, 6), np.nan)
-    left = np.concatenate([part for trace in d.traces for part in (trace.real - trace.after, gap)])
-    known = np.isfinite(left)
-    left = np.where(known, left, 0.0) - np.nanmean(left, axis=0)
-    std = np.sqrt((left**2 * known).sum(axis=0) / known.sum(axis=0))
+    left = np.concatenate([trace.real - trace.after for trace in d.traces])
+    std = np.nanstd(left, axis=0)
     if not (std > 0.0).all():
         return None
-    powers = [welch(left[:, k] / std[k], rate_hz, nperseg=min(SEGMENT, len(left)))[1] / known[:, k].mean() for k in range(6)]
-    floors = WHITE * np.array([min(band.mean() for band in np.array_split(power, BANDS)) for power in powers])
-    white = np.sqrt(np.minimum(0.5 * floors * rate_hz, 1.0))  # of a density from both sides
-    filters = [_filter(power, floor, rate_hz) for power, floor in zip(powers, floors.tolist(), strict=True)]
-    parts = (slice(0, 3), slice(3, 6))
-    levels = [_levels((left / std)[:, part], known[:, part], white[part], rate_hz) for part in parts]
-    names = ", ".join(trace.log for trace in d.traces)
+    names = ", ".join(dict.fromkeys(trace.log for trace in d.traces))
     return Noise(
         gyro_density=three(std[:3] / np.sqrt(rate_hz)),
         accel_density=three(std[3:] / np.sqrt(rate_hz)),
         sources={f"{sensor}_density": f"what the findings leave of {names}" for sensor in SENSORS},
-        colour=Colour(
-            rate_hz=rate_hz,
-            window_s=WINDOW_S,
-            gyro=_filters(filters[:3]),
-            accel=_filters(filters[3:]),
-            gyro_white=three(white[:3]),
-            accel_white=three(white[3:]),
-            gyro_levels=levels[0],
-            accel_levels=levels[1],
-        ),
+        colour=measured([(trace.t_s, trace.real, trace.after) for trace in d.traces], std, rate_hz),
     )
-
-
-def _filter(power: Float64[np.ndarray, " f"], floor: float, rate_hz: float) -> tuple[float, ...]:
-    """Autoregression of what stands above the white noise."""
-    a, _ = autoregression(np.maximum(power - floor, LEAST_POWER * power.max()), rate_hz, ORDER)
-    return tuple(a[1:].tolist())
-
-
-def _levels(
-    x: Float64[np.ndarray, "n 3"], known: Bool[np.ndarray, "n 3"], white: Float64[np.ndarray, "3"], rate_hz: float
-) -> Levels:
-    """Quantiles of the local size of what is not white, over its size in all."""
-    count = max(2, round(WINDOW_S * rate_hz))
-    windows = x[: len(x) // count * count].reshape(-1, count, 3)
-    whole = known[: len(windows) * count].reshape(-1, count, 3).all(axis=(1, 2))
-    rest = float((1.0 - white**2).mean())
-    if not whole.any() or rest < LEAST_REST:
-        return (1.0, 1.0)
-    power = ((windows[whole] ** 2).mean(axis=1) - white**2).mean(axis=1)
-    return tuple(np.quantile(np.sqrt(np.maximum(power, 0.0) / rest), np.linspace(0.0, 1.0, QUANTILES)).tolist())
-
-
-def _filters(rows: list[tuple[float, ...]]) -> Filters:
-    x, y, z = rows
-    return x, y, z

@@ -84,9 +84,9 @@ class Twin:
                 half = DEVIATIONS * (value.std or 0.0)
                 out[f"{entry.name}.{name}"] = (value.value, value.value - half, value.value + half, value.unit)
         for sensor in SENSORS:
-            levels = (1.0, 1.0) if self.noise.colour is None else getattr(self.noise.colour, f"{sensor}_levels")
+            low, high = (1.0, 1.0) if self.noise.colour is None else getattr(self.noise.colour, f"{sensor}_range")
             for axis, std in zip(AXES, self.std(sensor), strict=True):
-                out[f"{sensor}_noise.{axis}"] = (float(std), float(std * levels[0]), float(std * levels[-1]), "")
+                out[f"{sensor}_noise.{axis}"] = (float(std), float(std * low), float(std * high), "")
             for axis, mean, std in zip(AXES, self.bias(sensor), self.bias_std[sensor], strict=True):
                 out[f"{sensor}_bias.{axis}"] = (float(mean), float(mean - DEVIATIONS * std), float(mean + DEVIATIONS * std), "")
         return out

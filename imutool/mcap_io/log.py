@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType, TracebackType
 
@@ -20,7 +20,7 @@ from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, decode_image
 from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
-from imutool.mcap_io.passthrough.chunk_check import KeptChunks
+from imutool.mcap_io.passthrough.chunk_check import KeptChunks, neighbours, unpack_together
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import (
     ENCODINGS,
@@ -271,19 +271,26 @@ class Log:
         every = set().union(*wanted.values()) if wanted else set()
         first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns
         with self.named():
-            for block in self.index.blocks:
-                if block.may_hold(every) and block.start_ns <= last and block.end_ns >= first:
-                    yield from self._rows_of(block, wanted, first, last)
+            blocks = (b for b in self.index.blocks if b.may_hold(every) and b.start_ns <= last and b.end_ns >= first)
+            for near in neighbours(blocks) if self.kept is None else ([block] for block in blocks):
+                yield from self._rows_of(near, wanted, first, last)
 
     def _rows_of(
-        self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
+        self, blocks: Sequence[MessageBlock], wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, messages.Rows]]:
-        if self.kept is not None and (kept := self.kept.rows(block, wanted, first, last)) is not None:
-            yield from kept
+        together = unpack_together(self._source, blocks, self.max_chunk) if len(blocks) > 1 else None
+        if together is not None:
+            yield from self._cut(together, wanted, first, last)
             return
-        found = self.index.unpack_or_lose(block)
-        if found is None:
-            return
+        for block in blocks:
+            if self.kept is not None and (kept := self.kept.rows(block, wanted, first, last)) is not None:
+                yield from kept
+            elif (found := self.index.unpack_or_lose(block)) is not None:
+                yield from self._cut(found, wanted, first, last)
+
+    def _cut(
+        self, found: messages.Messages, wanted: Mapping[str, set[int]], first: int, last: int
+    ) -> Iterator[tuple[str, messages.Rows]]:
         times = found.times()
         inside = (times >= first) & (times <= last)
         for topic, channels in wanted.items():

@@ -1,7 +1,8 @@
 """Repair a damaged log: copy intact chunks, rebuild every index, record what was lost.
 
-An intact chunk is copied; its message indexes are made from its messages, which its CRC proves, and never copied. Definitions
-stand in front of everything, so that the next damage costs less. Messages that no CRC covers go into chunks that state none:
+A log with all indexes and CRCs, which are right, is copied as it is. Of any other an intact chunk is copied; its indexes
+are made from its messages, which its CRC proves, and never copied. Definitions stand in front of everything, so that the next
+damage costs less. Messages that no CRC covers go into chunks that state none:
 recovery must not make them look proven.
 """
 
@@ -21,16 +22,18 @@ from mcap.records import Metadata, MetadataIndex
 
 import imutool
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.location import Location, io_errors, same_location
+from imutool.location import Location, identity, io_errors, same_location
 from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, ChunkHead
 from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
-from imutool.mcap_io.storage.source import BLOCK_BYTES, Source
+from imutool.mcap_io.storage.outputs import refuse_existing
+from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.system import collector_paused
-from imutool.mcap_io.verify import verify
+from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.verify import verify, verify_index
 from imutool.mcap_io.writer import LogWriter
 
 RECORD = "imutool_repair"  # name of the metadata record
@@ -68,8 +71,9 @@ def repair(
     """Writes the intact part of `source` to `target`, in order of log time, with all indexes.
 
     With `damaged="keep"` the bytes of damaged stretches become attachments `imutool/damaged/OFFSET`, which no reader takes
-    for messages. The metadata record `imutool_repair` lists what was lost; an intact log gets none. The result is
-    read back as a whole before it takes its place. A chunk of more than `max_chunk` bytes, packed or unpacked, is left out.
+    for messages. The metadata record `imutool_repair` lists what was lost. A log with all indexes and CRCs, which are right, is
+    copied byte for byte. The result is read back as a whole before it takes its place. A chunk of more than `max_chunk` bytes,
+    packed or unpacked, is left out.
 
     Raises:
         ConfigError: source or target cannot be opened, the target exists or is the source, or an unknown `damaged`.
@@ -82,7 +86,7 @@ def repair(
     tell = progress or (lambda done, total: None)
     with collector_paused(), RecoveredLog(source, max_chunk=max_chunk) as log:
         try:
-            return _repair(log, target, damaged, overwrite, tell)
+            return _copy_intact(log, target, overwrite, tell) or _repair(log, target, damaged, overwrite, tell)
         except _ContradictionError:
             log.read_by_records()
             return _repair(log, target, damaged, overwrite, tell)
@@ -90,6 +94,39 @@ def repair(
 
 class _ContradictionError(Exception):
     """The contents of a log are not as its index says."""
+
+
+def _copy_intact(log: RecoveredLog, target: Location, overwrite: bool, tell: Callable[[int, int], None]) -> RepairReport | None:
+    """Copies a log whose indexes and CRCs are all there and right; None for any other.
+
+    Frames of lz4 may lack their end mark, without which other readers refuse them: such a log is none.
+    """
+    index, source = log.index, log.index.source
+    if index.by_records or any(block.compression == "lz4" for block in index.blocks):
+        return None
+    refuse_existing(target, overwrite=overwrite)
+    try:
+        verify_index(index, index.counts(), proven=True, progress=lambda done, total: tell(done, 2 * total))
+    except LogError:
+        return None
+    with Target(target, overwrite=overwrite) as out:
+        out.copy(source, 0, source.size)
+        out.flush()
+        written = Source(out.temporary)
+        with written.file:
+            same = crc_of(written, 0, source.size) == out.crc
+        if not same or identity(log.path) != source.identity:
+            raise LogError("the log changed while it was copied", where=log.path, fix="Wait until its recorder is done")
+    tell(2 * source.size, 2 * source.size)
+    return _report(log, index.counts(), len(index.blocks), 0, source.size)
+
+
+def _report(log: RecoveredLog, counts: Mapping[int, int], chunks: int, kept: int, target_bytes: int) -> RepairReport:
+    saved: dict[str, int] = {}
+    for channel, count in sorted(counts.items()):
+        topic = log.index.channels[channel].topic
+        saved[topic] = saved.get(topic, 0) + count
+    return RepairReport(log.losses, saved, chunks, kept, log.index.source.size, target_bytes)
 
 
 def _repair(
@@ -110,11 +147,7 @@ def _repair(
             progress=lambda done, total: tell(size + size * done // total, 2 * size),
         )
         tell(2 * size, 2 * size)
-        saved: dict[str, int] = {}
-        for channel, count in sorted(out.contents.counts.items()):
-            topic = index.channels[channel].topic
-            saved[topic] = saved.get(topic, 0) + count
-        return RepairReport(losses, saved, len(out.contents.chunks), kept, size, out.target.position)
+        return _report(log, out.contents.counts, len(out.contents.chunks), kept, out.target.position)
 
 
 def _loss_record(source: Location, damaged: str, losses: Losses) -> dict[str, str]:

@@ -63,29 +63,47 @@ def verify(
         LogError: the log contradicts its own indexes, statistics or CRCs.
     """
     with Log(path, max_chunk=max_chunk) as log, log.named():
-        index, done = log.index, 0
-        sums = _Sums()
-        for block in index.blocks:
-            whole = unpacked is None or block.offset in unpacked
-            sums.add(index, block, whole=whole)
-            done += whole
-            if progress:
-                progress(block.end, index.source.size)
-        sums.compare(index, counts)
-        _check_summary(index)
-        if unpacked is None:
-            for item in index.items:
-                if isinstance(item, RecordSpan) and item.opcode == Opcode.ATTACHMENT:
-                    Attachment.of(index.source, item.offset, item.length - HEAD.size).check_crc(index.source)
-            check_data_crc(index, crc_of(index.source, 0, index.data_end))
-        return done
+        return verify_index(log.index, counts, unpacked=unpacked, progress=progress)
+
+
+def verify_index(
+    index: LogIndex,
+    counts: Mapping[int, int],
+    *,
+    unpacked: Collection[int] | None = None,
+    proven: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """As `verify`, of a log that is open.
+
+    With `proven` a chunk without CRC is an error, as is a definition that the summary lacks.
+
+    Raises:
+        LogError: as `verify`.
+    """
+    sums, done = _Sums(proven=proven), 0
+    for block in index.blocks:
+        whole = unpacked is None or block.offset in unpacked
+        sums.add(index, block, whole=whole)
+        done += whole
+        if progress:
+            progress(block.end, index.source.size)
+    sums.compare(index, counts)
+    _check_summary(index, complete=proven)
+    if unpacked is None:
+        for item in index.items:
+            if isinstance(item, RecordSpan) and item.opcode == Opcode.ATTACHMENT:
+                Attachment.of(index.source, item.offset, item.length - HEAD.size).check_crc(index.source)
+        check_data_crc(index, crc_of(index.source, 0, index.data_end))
+    return done
 
 
 class _Sums:
     """Sums over the chunks, to compare with the statistics."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, proven: bool) -> None:
         self.counts: Counter[int] = Counter()
+        self.proven = proven
         self.start_ns, self.end_ns = 2**64, 0
 
     def add(self, index: LogIndex, block: MessageBlock, *, whole: bool) -> None:
@@ -94,7 +112,9 @@ class _Sums:
             raise LogError(f"messages lie outside chunks at byte {block.offset}", expected="chunks alone")
         if whole:
             everything = memoryview(index.source.at(block.offset, block.end - block.offset))
-            _, listed, right, _ = check_chunk(everything, block, index.max_chunk)
+            head, listed, right, _ = check_chunk(everything, block, index.max_chunk)
+            if self.proven and not head.crc:
+                raise LogError(f"the chunk at byte {block.offset} states no CRC", expected="one in every chunk")
         else:
             (_, listed), right = read_message_indexes(index.source, block), True
         if listed is None:
@@ -126,8 +146,8 @@ class _Sums:
             raise LogError(f"the statistics say the messages end at {stated.message_end_time} ns", expected=str(self.end_ns))
 
 
-def _check_summary(index: LogIndex) -> None:
-    """Checks that the groups of the summary are where its offsets say, and its indexes lead."""
+def _check_summary(index: LogIndex, *, complete: bool) -> None:
+    """Checks that the groups of the summary are where its offsets say, and its indexes lead, and `complete` definitions."""
     source, footer = index.source, index.footer
     start, end = footer.summary_start, source.size - len(MAGIC) - FOOTER_SIZE
     raw, at, groups = source.at(start, end - start), 0, dict[int, tuple[int, int]]()
@@ -137,7 +157,7 @@ def _check_summary(index: LogIndex) -> None:
         body, whole = raw[at + HEAD.size : at + HEAD.size + length], HEAD.size + length
         if opcode == Opcode.SUMMARY_OFFSET:
             group = records.parse(SummaryOffset, body, start + at)
-            if groups.pop(group.group_opcode, None) != (group.group_start, group.group_length):
+            if group.group_length and groups.pop(group.group_opcode, None) != (group.group_start, group.group_length):
                 raise LogError(f"the summary offset at byte {start + at} leads nowhere")
         else:
             first, size = groups.get(opcode, (start + at, 0))
@@ -157,6 +177,8 @@ def _check_summary(index: LogIndex) -> None:
         raise LogError(f"no summary offset leads to {', '.join(map(records.name_of, groups))}")
     stated = index.statistics
     assert stated is not None, "compared before"
+    if complete and (found[Opcode.SCHEMA], found[Opcode.CHANNEL]) != (stated.schema_count, stated.channel_count):
+        raise LogError("the summary lacks definitions", expected="those of all schemas and channels")
     kinds = (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX, Opcode.CHUNK_INDEX)
     if tuple(found[k] for k in kinds) != (stated.attachment_count, stated.metadata_count, stated.chunk_count):
         raise LogError("the statistics count other attachments, metadata or chunks than the summary lists")

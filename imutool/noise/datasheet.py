@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -24,6 +24,7 @@ from msgspec import Meta
 from imutool.config import Settings, build, toml
 from imutool.errors import ConfigError, did_you_mean
 from imutool.mcap_io.storage.target import Target
+from imutool.noise.colour import Colour
 
 UNITS = {
     "gyro_density": "rad/s/sqrt(Hz)",
@@ -35,59 +36,9 @@ UNITS = {
 }
 UNKNOWN = "unknown"  # TOML has no null
 
-SAME_RATE = 0.01  # by which two rates may differ and be one
-SETTLED = 4000  # samples in which an autoregression forgets its beginning
-
 Value = Annotated[float, Meta(ge=0.0)]
 Axes = tuple[Value | None, Value | None, Value | None]
 _NONE: Axes = (None, None, None)
-Filters = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-Share = Annotated[float, Meta(ge=0.0, le=1.0)]
-Shares = tuple[Share, Share, Share]
-Levels = Annotated[tuple[Value, ...], Meta(min_length=2)]
-
-
-class Colour(Settings, frozen=True, kw_only=True):
-    """Spectrum of the noise, and how its size comes and goes, as recorded at one rate.
-
-    The standard deviation of an axis is density * sqrt(rate). The share `*_white` of it is white and steady. The rest n is
-    autoregressive, n(k) + a_1 n(k-1) + ... = white, with (a_1, ...) of `gyro` and `accel` (Box and Jenkins, Time Series
-    Analysis, section 3.2). In stretches of `window_s` the rest is larger or smaller by one factor for all axes of a sensor,
-    drawn from `*_levels`, its quantiles in equal steps of probability.
-    """
-
-    rate_hz: Annotated[float, Meta(gt=0.0)]
-    window_s: Annotated[float, Meta(gt=0.0)]
-    gyro: Filters
-    accel: Filters
-    gyro_white: Shares
-    accel_white: Shares
-    gyro_levels: Levels
-    accel_levels: Levels
-
-    def holds_at(self, rate_hz: float) -> bool:
-        """Whether samples of this rate can have it."""
-        return abs(self.rate_hz / rate_hz - 1.0) < SAME_RATE
-
-    def shaped(
-        self,
-        white: Float64[np.ndarray, "n 3"],
-        t_s: Float64[np.ndarray, " n"],
-        sensor: Literal["gyro", "accel"],
-        rng: np.random.Generator,
-    ) -> Float64[np.ndarray, "n 3"]:
-        """White noise of standard deviation 1 with this colour, which comes and goes."""
-        from scipy.signal import lfilter
-
-        out, levels = np.empty_like(white), getattr(self, f"{sensor}_levels")
-        for axis, a in enumerate(getattr(self, sensor)):
-            before = white[:SETTLED, axis][::-1]  # its beginning, backwards, in which the filter settles
-            made = lfilter([1.0], [1.0, *a], np.concatenate([before, white[:, axis]]))[len(before) :]
-            out[:, axis] = made / np.linalg.norm(lfilter([1.0], [1.0, *a], np.eye(1, SETTLED)[0]))
-        window = ((t_s - t_s.min()) / self.window_s).astype(int)
-        size = np.interp(rng.uniform(size=int(window.max()) + 1), np.linspace(0.0, 1.0, len(levels)), levels)
-        steady = np.array(getattr(self, f"{sensor}_white"))
-        return np.asarray(steady * rng.normal(size=out.shape) + np.sqrt(1.0 - steady**2) * out * size[window][:, None])
 
 
 class Noise(Settings, frozen=True, kw_only=True):

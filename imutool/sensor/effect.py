@@ -217,21 +217,12 @@ class SignalState:
         return self.motion.sample(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
 
-def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
-    """Samples of a sensor with these effects at some stamps, applied in stage order."""
-    state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
-    for effect, theta in in_stage_order(acting):
-        state = state.through(effect, theta)
-    samples: SensorSamples = state.samples()
-    return samples
-
-
 def simulate_stretches(
     motions: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting
 ) -> SensorSamples:
     """Samples of a sensor with these effects over several stretches of one motion.
 
-    As `simulate_samples`, but clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
+    Clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
     """
     order = in_stage_order(acting)
     for effect, theta in order:

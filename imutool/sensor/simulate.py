@@ -4,7 +4,7 @@ Poses become a smooth motion (`trajectory`), the motion ideal signals, the effec
 (`effect`). Noise is added behind the sensor and before its converter; the log holds the samples and the truth.
 White noise has standard deviation density * sqrt(rate), the bias walks by walk * sqrt(dt) a sample from zero (IEEE 952);
 the instability of a data sheet, a floor of the Allan deviation, is not simulated beside a walk. A noise with a colour has
-that spectrum at its own rate, and comes and goes as it was recorded.
+that spectrum at its own rate, and follows the motion as it did when it was recorded.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import IdealMotion, SensorSamples, channels_at
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 from imutool.sensor.unnamed_effects import DRIVEN
-from imutool.units import SENSORS
 
 SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU
@@ -221,13 +220,15 @@ def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
         dt = np.diff(samples.stamp_s, prepend=samples.stamp_s[0])[:, None]  # a walk goes on in a hole
-        out = []
+        out, coloured = [], None
+        if colour is not None:
+            readings = np.concatenate([samples.gyro, samples.accel], axis=1)
+            coloured = colour.drawn(samples.stamp_s, readings, np.random.default_rng([seed, 2]))
         for k, (name, values) in enumerate((("gyro", samples.gyro), ("accel", samples.accel))):
             white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
             bias = np.cumsum(densities[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
-            if colour is not None:
-                white = colour.shaped(white, samples.stamp_s, SENSORS[k], np.random.default_rng([seed, k, 2]))
-            out.append(values + densities[f"{name}_density"] * np.sqrt(rate_hz) * white + bias)
+            noise = white if coloured is None else coloured[:, 3 * k : 3 * k + 3]
+            out.append(values + densities[f"{name}_density"] * np.sqrt(rate_hz) * noise + bias)
         return samples.with_readings(*out)
 
     return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)

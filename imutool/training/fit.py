@@ -120,7 +120,7 @@ class Training:
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
         self.stage: Stage | None = None
-        self.sessions: list[statistics.Session] = []
+        self.turn_on: statistics.TurnOn | None = None
 
     def epochs(self) -> Iterator[Epoch]:
         """Train and yield progress; a caller may stop and resume between two yields."""
@@ -137,7 +137,7 @@ class Training:
             self.done[sensor], self.stage = min(last, self.stage.before), None
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        self.sessions = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        self.turn_on = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:

@@ -162,11 +162,11 @@ def left_out_model(
         getattr(network, name).copy_(value)
     per_log = len(fits["gyro"].problem.own) // len(pool.names)
     spans = [span for span in pool.spans_ns for _ in range(per_log)]
-    mean, std, sessions = turn_on_prior(np.concatenate(rest, axis=1), spans[:index] + spans[index + 1 :])
-    network.prior_mean.copy_(torch.from_numpy(mean))
-    network.prior_std.copy_(torch.from_numpy(std))
+    turn_on = turn_on_prior(np.concatenate(rest, axis=1), spans[:index] + spans[index + 1 :])
+    network.prior_mean.copy_(torch.from_numpy(turn_on.mean))
+    network.prior_std.copy_(torch.from_numpy(turn_on.std))
     model = network.frozen()
-    model.card = {"logs": [{}] * (len(spans) - 1), "sessions": [session.card() for session in sessions]}
+    model.card = {"logs": [{}] * (len(spans) - 1), **turn_on.card()}
     return model
 
 

@@ -98,7 +98,7 @@ def train(
         model, about = _linear(recordings, chosen, descent)
     else:
         training = descent(recordings, method, chosen)
-        model, about = training.model, {"held_out": _held_out(training), "sessions": _sessions(training)}
+        model, about = training.model, {"held_out": _held_out(training), **_turn_on(training)}
     model.card = {
         **_card(method, chosen, recordings, logs),
         **about,
@@ -164,7 +164,7 @@ def _physics_first(
         held_out["effects and neural_ode"] = _held_out(ode)
         kept = ode if _helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
-    about = {"held_out": _held_out(kept), "sessions": _sessions(kept)}
+    about = {"held_out": _held_out(kept), **_turn_on(kept)}
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
 
 
@@ -193,7 +193,7 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
         compared["left_out"] = comparison.card()
         constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
     training = descent(recordings, linear.Model.method, settings, constant)
-    return training.model, {"held_out": _held_out(training), "sessions": _sessions(training)} | compared
+    return training.model, {"held_out": _held_out(training), **_turn_on(training)} | compared
 
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:
@@ -206,8 +206,9 @@ def _held_out(training: Training) -> dict[str, Any]:
     return {sensor: {"error": training.done[sensor], "unit": UNITS[sensor]} for sensor in SENSORS}
 
 
-def _sessions(training: Training) -> list[dict[str, Any]]:
-    return [session.card() for session in training.sessions]
+def _turn_on(training: Training) -> dict[str, Any]:
+    assert training.turn_on is not None, "the training has not ended"
+    return training.turn_on.card()
 
 
 def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording], logs: Sequence[Path]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -48,10 +48,26 @@ class Session:
         return {"start_ns": self.start_ns, "end_ns": self.end_ns, "mean": self.mean.tolist(), "std": self.std.tolist()}
 
 
+class TurnOn(NamedTuple):
+    """Rest bias of the next session, and the sessions known.
+
+    Its standard deviation is `std` for a sensor of the usual kind, and may be as little as `least_std`.
+    """
+
+    mean: Vector6
+    std: Vector6
+    least_std: Vector6
+    sessions: list[Session]
+
+    def card(self) -> dict[str, Any]:
+        """Entries of a model card."""
+        return {"sessions": [session.card() for session in self.sessions], "turn_on_least_std": self.least_std.tolist()}
+
+
 def store_statistics(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
-) -> list[Session]:
-    """Store the prior, the spread of starts from truth and the noise; return the sessions.
+) -> TurnOn:
+    """Store the prior, the spread of starts from truth and the noise; return the prior.
 
     From the training part.
     """
@@ -64,23 +80,22 @@ def store_statistics(
         u = pool.gyro if sensor == "gyro" else pool.accel
         model.noise_std[columns] = torch.from_numpy(white_noise(u.cpu().numpy())).to(rest)
     biases = rest.cpu().double().numpy()
-    mean, spread, sessions = turn_on_prior(biases, pool.spans_ns)
-    model.prior_mean.copy_(torch.from_numpy(mean))
-    model.prior_std.copy_(torch.from_numpy(spread))
+    turn_on = turn_on_prior(biases, pool.spans_ns)
+    model.prior_mean.copy_(torch.from_numpy(turn_on.mean))
+    model.prior_std.copy_(torch.from_numpy(turn_on.std))
     model.truth_std.copy_(_start_spread(scored, left, rest))
     model.walk_std.copy_(_walk(scored, left, rest, window_s))
     at_rest = rest_differences(scored.frozen(), _samples(left), biases)
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
-    return sessions
+    return turn_on
 
 
-def turn_on_prior(
-    rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]
-) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"], list[Session]]:
-    """Mean and standard deviation of the next session's rest bias, and the sessions.
+def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> TurnOn:
+    """Prior of the next session's rest bias.
 
     Logs of one switching-on are one draw of the turn-on bias. From S sessions with means m_s the next one has the variance
-    (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more.
+    (sum (m_s - m)^2 + TURN_ON_STD^2) / S (1 + 1/S): the size that sensors usually have counts as one session more. Without it
+    this is the least variance, of a sensor that repeats its bias as well as between the logs of one session.
     Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
     Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`. Where most logs that follow each other closely
     differ all the same, the next log is of a session of its own, and no session is returned.
@@ -92,7 +107,8 @@ def turn_on_prior(
     freedom = len(rest) - len(groups) + 1
     within = (squares + usual**2) / freedom * min(MOST_TAIL, freedom / max(freedom - 2.0, LEAST_FREEDOM))
     mean, count = means.mean(axis=0), len(groups)
-    between = (((means - mean) ** 2).sum(axis=0) + turn_on**2) / count * (1 + 1 / count)
+    apart = ((means - mean) ** 2).sum(axis=0)
+    most, least = ((apart + one_more) / count * (1 + 1 / count) + within for one_more in (turn_on**2, 0.0))
     sessions = [
         Session(
             min(spans_ns[log][0] for log in group),
@@ -103,7 +119,7 @@ def turn_on_prior(
         for group, of_group in zip(groups, means, strict=True)
         if broken <= len(rest) - len(groups)
     ]
-    return mean, np.sqrt(between + within), sessions
+    return TurnOn(mean, np.sqrt(most), np.sqrt(least), sessions)
 
 
 def _sessions(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[int, int]]) -> tuple[list[list[int]], int]:

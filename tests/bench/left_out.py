@@ -41,6 +41,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--start", action="append")
     parser.add_argument("--minute", action="store_true")
+    parser.add_argument("--new-session", action="store_true", help="the log left out counts as one of another switching-on")
     options = parser.parse_args()
     starts = options.start or list(STARTS)
     recordings = [read(log) for log in options.logs]
@@ -52,6 +53,8 @@ def main() -> None:
     table = []
     for left_out in recordings:
         model = learned([r for r in recordings if r is not left_out], options.set)
+        if options.new_session:
+            model.card = {**model.card, "sessions": []}
         table.append([aoe(model, left_out, start) for start in starts])
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
         print(f"| {left_out.name} | {' | '.join(f'{a:.2f}' for a in table[-1])} | {found} |", flush=True)
@@ -97,7 +100,7 @@ def learned(recordings: list[Recording], words: list[str]) -> BiasModel:
     for _ in training.epochs():
         pass
     model = physics.finish(training.model)
-    model.card = {"logs": [r.name for r in recordings], "sessions": [session.card() for session in training.sessions]}
+    model.card = {"logs": [r.name for r in recordings], **training.turn_on.card()}
     return model.frozen()
 
 

@@ -7,8 +7,9 @@ import pytest
 
 from imutool.bias import hybrid
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.bias_tracking import BiasPrior, BiasTrajectory
+from imutool.bias_start.bias_tracking import BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.prior_width import BiasPrior
 
 RATE_HZ, SIZE = 200.0, 8000
 SCALE_STD, G_STD = 2e-3, 1e-4  # of a share, and of rad/s per m/s²

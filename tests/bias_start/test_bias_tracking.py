@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import (
     CHUNK_S,
     BiasFilter,
-    BiasPrior,
     BiasTrajectory,
     FilteredBlock,
     TrackedBiasStream,
@@ -22,6 +22,7 @@ from imutool.bias_start.bias_tracking import (
     smooth_blocks,
 )
 from imutool.bias_start.initial_bias import smooth_bias
+from imutool.bias_start.prior_width import BiasPrior, shown_bias, supported_std
 from imutool.recording import Imu, seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
@@ -97,6 +98,21 @@ def test_it_is_as_sure_as_it_should_be(still_s: float, way: str) -> None:
         covariances.append(state.P[9:12, 9:12])
     found = consistency(np.array(errors), np.array(covariances), BOUND)
     assert 0.1 < found["nees_mean"] < found["nees_upper"], found
+
+
+def test_a_state_of_a_wide_prior_becomes_that_of_the_width_that_the_log_supports() -> None:
+    """As if the filter had begun with it: `supported` and a second run agree, but for the change of the linearization."""
+    imu = biased(3)
+    wide = replace(KNOWN, std=3.0 * KNOWN.std, least_std=0.1 * KNOWN.std)
+    last = forward(imu, wide)[-1]
+    found = wide.supported(last.step.after, last.end_s)
+    walked = wide.walk**2 * last.end_s
+    shown = shown_bias(last.step.after, wide.mean, wide.std**2 + walked)
+    again = forward(imu, replace(wide, std=supported_std(wide.std, wide.least_std, *shown), least_std=None))[-1].step.after
+    std = np.sqrt(np.diag(again.covariance(False)))
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance(False))), std, rtol=0.1)
+    assert (np.abs(found.bias - again.bias) < 0.5 * std).all()
+    assert np.linalg.norm(last.step.after.bias - again.bias) > np.linalg.norm(found.bias - again.bias)
 
 
 def test_a_stop_tells_the_bias_at_rest_from_that_in_motion() -> None:

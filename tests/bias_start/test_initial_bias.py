@@ -15,7 +15,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias_start import bias_at_rest
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest, rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
-from imutool.bias_start.bias_tracking import Samples, widened
+from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.initial_bias import (
     AT_REST_STD,
     InitialBias,
@@ -26,6 +26,7 @@ from imutool.bias_start.initial_bias import (
     smoothed_start,
 )
 from imutool.bias_start.model_choice import find_initial_bias
+from imutool.bias_start.prior_width import supported_std, widened
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.stationary import Blocks, block_statistics
 from imutool.inertial.strapdown import dead_reckon
@@ -374,6 +375,17 @@ def test_a_prior_that_the_log_contradicts_gives_way_and_one_that_it_bears_out_st
     wide = widened(std, far, variance)
     np.testing.assert_allclose(wide[:3], 9e-3 / np.sqrt(3))
     np.testing.assert_array_equal(wide[3:], std[3:]), "nothing was shown of the accelerometer"
+
+
+def test_two_axes_that_repeat_speak_for_the_third_and_a_large_change_is_believed() -> None:
+    least, most = np.array([5e-4] * 3 + [0.02] * 3), np.array([7e-3] * 3 + [0.15] * 3)
+    variance = np.array([4e-4, 4e-4, 5e-3] + [np.inf] * 3) ** 2
+    repeats = supported_std(most, least, np.array([3e-4, -2e-4, -7e-3, 0.0, 0.0, 0.0]), variance)
+    assert (repeats[:3] < 2 * least[:3]).all(), "the third axis shows 7 mrad/s with a deviation of 5"
+    np.testing.assert_allclose(repeats[3:], np.sqrt(least * most)[3:]), "nothing is shown of the accelerometer: the middle"
+    changed = supported_std(most, least, np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
+    assert (changed[:3] > 0.6 * most[:3]).all()
+    np.testing.assert_array_equal(supported_std(most, None, np.zeros(6), variance), most)
 
 
 @pytest.mark.parametrize("start", ["auto", "stationary", "smooth"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.bias_start.bias_tracking import BiasPrior
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import DataError
 from imutool.inertial.strapdown import StartPose, dead_reckon

@@ -735,7 +735,7 @@ def test_nothing_where_nothing_is_and_a_bias_is_no_news() -> None:
 
 def test_a_driver_must_be_the_right_one() -> None:
     truth = _truth(_concealed("driven", "gyro", "/motor/current", gain=0.1, lag=0.2))
-    field = _finding("driven", "gyro", "/motor/current.data", gain=(0.1, 0.01), delay=(0.2, 0.1))
+    field = _finding("driven", "gyro", "/motor/current.data", gain=(0.1, 0.01), lag=(0.2, 0.1))
     out = scored(truth, _findings([field]))
     assert out["right"]
     assert [row["parameter"] for row in out["parameters"]] == ["gain", "lag"]

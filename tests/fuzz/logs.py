@@ -302,7 +302,10 @@ def old_index(raw: bytes, a: Original, b: Original, rng: random.Random) -> bytes
 
 
 def wrong_index(raw: bytes, a: Original, b: Original, rng: random.Random) -> bytes:
-    """Numbers of the summary's chunk indexes are wrong, and its CRC is right."""
+    """Numbers of the summary's chunk indexes are wrong, and its CRC is right: of a summary without other damage.
+
+    A recorder computes the CRC of what it writes; no CRC is right over bytes that were flipped later.
+    """
     if raw[-len(MAGIC) :] != MAGIC or len(raw) < 60:
         return raw
     start = struct.unpack_from("<Q", raw, len(raw) - 28)[0]
@@ -315,7 +318,7 @@ def wrong_index(raw: bytes, a: Original, b: Original, rng: random.Random) -> byt
             value = (int.from_bytes(changed[at : at + 8], "little") + by) % 2**64
             changed[at : at + 8] = value.to_bytes(8, "little")
         position += HEAD.size + size
-    if 0 < start < len(raw) - 37:
+    if 0 < start < len(raw) - 37 and zlib.crc32(raw[start:-12]).to_bytes(4, "little") == raw[-12:-8]:
         changed[-12:-8] = zlib.crc32(bytes(changed[start:-12])).to_bytes(4, "little")
     return bytes(changed)
 

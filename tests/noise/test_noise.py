@@ -360,28 +360,3 @@ def test_the_table_holds_what_was_found(tmp_path: Path) -> None:
     assert cells["gyro_density"][0] == f"{found.noise.gyro_density[0]:.2e}"
     assert cells["gyro_walk"][:3] == ("–", "–", "–")
     assert {row[4] for row in rows(found)[1:]} == set(UNITS.values())
-
-
-def test_a_colour_has_its_spectrum_and_comes_and_goes() -> None:
-    flat = ((0.0,), (0.0,), (0.0,))
-    colour = datasheet.Colour(
-        rate_hz=200.0,
-        window_s=1.0,
-        gyro=((-0.9,), (0.0,), (0.5,)),
-        accel=flat,
-        gyro_white=(0.0, 0.0, 0.0),
-        accel_white=(0.0, 0.0, 0.0),
-        gyro_levels=(1.0, 1.0),
-        accel_levels=(0.5, 1.5),
-    )
-    t_s = np.arange(40_000) / 200.0
-    white = np.random.default_rng(0).normal(size=(len(t_s), 3))
-    gyro, accel = (colour.shaped(white, t_s, sensor, np.random.default_rng(1)) for sensor in ("gyro", "accel"))
-    np.testing.assert_allclose(gyro.std(axis=0), 1.0, rtol=0.05)
-    lag_1 = (gyro[1:] * gyro[:-1]).mean(axis=0) / gyro.var(axis=0)
-    np.testing.assert_allclose(lag_1, (0.9, 0.0, -0.5), atol=0.03)
-    size = accel.reshape(-1, 200, 3).std(axis=(1, 2))
-    assert size.min() < 0.6
-    assert size.max() > 1.4
-    assert colour.holds_at(200.5)
-    assert not colour.holds_at(100.0)

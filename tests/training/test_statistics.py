@@ -22,8 +22,9 @@ def biases(*means: float, seed: int = 0) -> np.ndarray:
 
 def test_six_logs_of_one_switching_on_say_little_of_the_next_one() -> None:
     rest = biases(*[0.01] * 6)
-    mean, std, sessions = turn_on_prior(rest, spans(*np.arange(6) / 4))
+    mean, std, least_std, sessions = turn_on_prior(rest, spans(*np.arange(6) / 4))
     assert (std[:3] > TURN_ON_STD["gyro"]).all()
+    assert (least_std < USUAL).all(), "unless the sensor repeats its bias"
     np.testing.assert_allclose(mean, rest.mean(axis=0))
     (session,) = sessions
     assert (session.std < USUAL).all(), "the next log of the same day is like them"
@@ -32,7 +33,7 @@ def test_six_logs_of_one_switching_on_say_little_of_the_next_one() -> None:
 
 def test_sessions_are_hours_apart_or_have_other_biases() -> None:
     rest = biases(0.01, 0.01, 0.011, 0.03, 0.0, 0.0)
-    _, std, sessions = turn_on_prior(rest[[3, 0, 1, 2, 4, 5]], [spans(20.0, 0.0, 1.0, 2.0, 3.0, 50.0)[k] for k in range(6)])
+    _, std, _, sessions = turn_on_prior(rest[[3, 0, 1, 2, 4, 5]], [spans(20.0, 0.0, 1.0, 2.0, 3.0, 50.0)[k] for k in range(6)])
     assert [round(float(s.mean[0]), 2) for s in sessions] == [0.01, 0.0, 0.03, 0.0]
     draws = np.array([0.01, 0.0, 0.03, 0.0])
     between = (((draws - draws.mean()) ** 2).sum() + TURN_ON_STD["gyro"] ** 2) / 4 * 1.25
@@ -40,13 +41,13 @@ def test_sessions_are_hours_apart_or_have_other_biases() -> None:
 
 
 def test_logs_that_follow_closely_and_differ_say_nothing_of_the_next_one() -> None:
-    _, std, sessions = turn_on_prior(biases(0.01, 0.02, 0.014, 0.006), spans(0.0, 1.0, 2.0, 3.0))
+    _, std, _, sessions = turn_on_prior(biases(0.01, 0.02, 0.014, 0.006), spans(0.0, 1.0, 2.0, 3.0))
     assert sessions == []
     assert (std > TURN_ON_STD["gyro"]).all()
 
 
 def test_one_log_is_a_session_of_its_own() -> None:
-    _, std, (session,) = turn_on_prior(biases(0.01), spans(0.0))
+    _, std, _, (session,) = turn_on_prior(biases(0.01), spans(0.0))
     np.testing.assert_allclose(std[:3], np.sqrt(2 * TURN_ON_STD["gyro"] ** 2 + MOST_TAIL * USUAL[0] ** 2))
     np.testing.assert_allclose(session.std, np.sqrt(2 * MOST_TAIL) * USUAL)
 
@@ -57,7 +58,7 @@ def test_the_next_log_of_a_session_lies_within_its_prior_however_few_its_logs() 
         deviations = []
         for _ in range(400):
             rest = np.repeat([0.5, 2.0], 3) * USUAL * rng.normal(size=(count + 1, 6))
-            _, _, (session,) = turn_on_prior(rest[:-1], spans(*np.arange(count) / 4))
+            *_, (session,) = turn_on_prior(rest[:-1], spans(*np.arange(count) / 4))
             deviations.append((rest[-1] - session.mean) / session.std)
         outside = (np.abs(deviations) > 1.96).reshape(-1, 2, 3).mean(axis=(0, 2))
         assert (outside < 0.08).all(), f"{count} logs: {outside} of 0.05; with the variance of the logs alone 0.09 and more"

@@ -60,7 +60,6 @@ def select_effects(
     """
     unnamed = tuple(effect for group in later for effect in group)
     settings = logs[0].pair.settings.search
-    penalty = settings.unnamed_penalty
     start = fit(logs, always)
     known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
@@ -71,7 +70,7 @@ def select_effects(
     if unnamed and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
-        if bic(other[1], penalty) < bic(now, penalty) - settings.clearly_better:
+        if bic(other[1], settings.unnamed_penalty) < bic(now, settings.unnamed_penalty) - settings.clearly_better:
             search, now = other
     return search.tested(search.simplified(now))
 
@@ -123,11 +122,10 @@ class _Search:
 
     def added(self, now: Fit) -> Fit | None:
         """The best fit with one more effect; none if chance explains its gain."""
-        share = self.settings.rival_share
+        share, count = self.settings.rival_share, self.settings.fitted_each_round
         if self.trials_of is not now:
             self.trials_of, self.trials = now, {}
         allowed = self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
-        count = self.settings.fitted_each_round
         best: tuple[float, Fit] | None = None
         for promised, effect, start, _ in self.candidates.ranked(now, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
@@ -153,9 +151,8 @@ class _Search:
         trial = fit(self.logs, (*others, (effect, start)), near=near, give_up_above=limit)
         theta = trial.chosen[-1][1]
         reduced = without_implausible(effect, theta, self.settings.implausible_factor)
-        if reduced is effect:
-            return trial
-        return fit(self.logs, (*others, (reduced, values_of(effect, reduced, theta))), near=near, give_up_above=limit)
+        start = values_of(effect, reduced, theta)
+        return trial if reduced is effect else fit(self.logs, (*others, (reduced, start)), near=near, give_up_above=limit)
 
     def refined(self, now: Fit) -> Fit:
         """The fit with more knots in the curve that has just come in, where an edge pays for them."""
@@ -191,18 +188,29 @@ class _Search:
         return now
 
     def simplified(self, now: Fit) -> Fit:
+        """Fit with the simpler of two effects that the logs hardly tell apart."""
+        return self._without_arms(self._without_low_pass(now))
+
+    def _without_low_pass(self, now: Fit) -> Fit:
+        """Fit with a clock offset instead of a low pass beyond the poses' band, which only its delay shows."""
+        offset = next((e for e in self.named if e.name == "clock_offset" and e.key not in now.keys), None)
+        for k, (effect, theta) in enumerate(now.chosen):
+            if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, self.logs, self.settings):
+                delay_s = -1.0 / (2.0 * np.pi * theta)  # of a first order far below its cut-off
+                return fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :], (offset, delay_s)), near=now)
+        return now
+
+    def _without_arms(self, now: Fit) -> Fit:
         """Fit with a lever arm instead of a size effect of three equal arms, and the rest if it is significant."""
-        arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect"]
+        # where a part of nine is implausible these are not three equal arms
+        arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
         lever = [effect for effect in self.named if effect.name == "lever_arm" and effect.key not in now.keys]
         if not arms or not lever:
             return now
         others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
-        if len(size_effect.parameters) < 9:  # a part is implausible: these are not three equal arms
-            return now
         without = fit(self.logs, others, near=now)
         simple = fit(self.logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
-        share = self.settings.common_arm_share
-        if without.objective - simple.objective < share * (without.objective - now.objective):
+        if without.objective - simple.objective < self.settings.common_arm_share * (without.objective - now.objective):
             return now
         rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
         both = fit(self.logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
@@ -275,8 +283,8 @@ class _Search:
         exact_p = prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
         held_out_p = min(held_out_p_value(blocks[:, 0]), exact_p)
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        std = (whole.stds() if scattered is None else scattered.std)[effect.key]
-        std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(std)])
+        stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
+        std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
         curve = isinstance(effect.forward, SplineCurve)
         beyond = beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std, curve=curve)
         if held_out_p > self.settings.held_out_p_value or beyond:
@@ -286,6 +294,7 @@ class _Search:
 
     def _beyond_model_error(self, verdicts: Sequence[SelectedEffect]) -> list[SelectedEffect]:
         """Verdicts, with no trust in what may be the model error of a far larger effect."""
-        denoised = any(log.pair.denoised for log in self.logs)
-        hidden = below_model_error({verdict.effect.key: verdict.gain for verdict in verdicts}, denoised, self.settings)
+        pairs, gains = [log.pair for log in self.logs], {verdict.effect.key: verdict.gain for verdict in verdicts}
+        denoised, poses = any(pair.denoised for pair in pairs), not all(pair.exact for pair in pairs)
+        hidden = below_model_error(gains, self.settings, denoised=denoised, poses=poses)
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in hidden else verdict for verdict in verdicts]

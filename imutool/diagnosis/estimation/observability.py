@@ -17,7 +17,9 @@ from imutool.sensor.effect import Effect, Theta
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_jump", "low_pass", "mount_resonance")}
 """What delays, rings or jumps needs the motion that shows a delay."""
-FOLLOWING = frozenset({"clock_offset", "clock_skew", "clock_jump", "low_pass", "mount_resonance"})
+CLOCKS = ("clock_offset", "clock_skew", "clock_jump")
+FILTERS = ("low_pass", "mount_resonance")
+FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 
 
 # ── what the motion can show ──
@@ -124,22 +126,27 @@ def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -
 # ── the error of models ──
 
 
-def below_model_error(gains: Mapping[str, float], denoised: bool, settings: SearchSettings) -> frozenset[str]:
+def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, denoised: bool, poses: bool) -> frozenset[str]:
     """Effects below the model error of a far larger effect that follow the same motion.
 
     A filter and a clock say how a sensor follows its motion, and so does the error of any other model: a mass on springs moves,
     and its lever arm with it; a simulator that holds its forces for a step reads accelerations half a step early; noise that
     was filtered out of a simulation took a little of its motion along. Such an error is a share of the large effect, however
-    certain against the noise. `gains` are squares that leaving an effect out costs, by key; `denoised` says whether noise was
-    filtered out of a simulation.
+    certain against the noise. The clock of `poses` drifts and jumps against the sensor's in more ways than one, and a filter
+    takes what the clock leaves. `gains` are squares that leaving an effect out costs, by key; `denoised` says whether noise
+    was filtered out of a simulation.
     """
     allowed = settings.model_error_denoised if denoised else settings.model_error
     simplified = {"mount_resonance": settings.model_error_resonance}  # models that are simpler than what they stand for
+    clocks = dict.fromkeys(CLOCKS, settings.model_error_clock) if poses else {}
+
+    def share(key: str, other: str) -> float:
+        return max(allowed, simplified.get(other, 0.0), clocks.get(other, 0.0) if key in FILTERS else 0.0)
+
     return frozenset(
         key
         for key, gain in gains.items()
-        if key in FOLLOWING
-        and any(gain < max(allowed, simplified.get(other, 0.0)) * more for other, more in gains.items() if other != key)
+        if key in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
     )
 
 

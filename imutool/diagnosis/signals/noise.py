@@ -36,7 +36,7 @@ def whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Seq
     slow, expected_slow = (values if band is None else band(values) for values in (residual, pair.sampled.x))
     top_hz = settings.signal.noise_band_end * rate_hz if pair.band_hz is None else 0.9 * pair.band_hz
     for k in range(pair.columns):
-        edge = _edge_hz(expected_slow[:, k], rate_hz, settings)
+        edge = min(_edge_hz(expected_slow[:, k], rate_hz, settings), settings.signal.most_top * top_hz)
         f_hz, power = _density(slow[:, k], usable, rate_hz, settings.noise, "median" if band is None else "mean")
         near = (f_hz >= edge) & (f_hz <= min(2.0 * edge, top_hz))
         far = (f_hz >= edge) & (f_hz <= top_hz)

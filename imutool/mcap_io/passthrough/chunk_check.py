@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
+from imutool.errors import LogError
 from imutool.mcap_io.blocks import MessageBlock, MessageIndexes, parse_message_indexes
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import ChunkHead
@@ -15,6 +16,7 @@ from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.topics import Topic
 
 NO_ENTRIES = np.zeros((0, 2), np.uint64)
+SMALL = 4096  # bytes of a chunk, packed and unpacked, that is unpacked together with its neighbours
 KEPT_BYTES = 10 << 20  # of messages: the two minutes of a 200 Hz IMU that the check of the fit reads, and all of a small log
 
 Heads = Shaped[np.ndarray, " n"]  # of dtype messages.MESSAGE
@@ -52,6 +54,42 @@ def check_chunk(everything: memoryview, block: MessageBlock, max_chunk: int) -> 
         return CheckedChunk(head, None, False, messages.parse(data, block.offset))
     found, right = indexes.messages(data, block.offset)
     return CheckedChunk(head, indexes, right, found)
+
+
+def neighbours(blocks: Iterable[MessageBlock]) -> Iterator[list[MessageBlock]]:
+    """Small chunks that lie close together, and every other block alone."""
+    near: list[MessageBlock] = []
+    for block in blocks:
+        if near and not (block.length <= SMALL >= near[0].length and block.end - near[0].offset <= messages.BATCH_BYTES):
+            yield near
+            near = []
+        near.append(block)
+    if near:
+        yield near
+
+
+def unpack_together(source: Source, blocks: Sequence[MessageBlock], max_chunk: int) -> messages.Messages | None:
+    """The messages of small chunks at once, which costs numpy as much as those of one.
+
+    None where they have to be unpacked one by one: damaged, without CRC, with definitions, or not as the summary says.
+    """
+    start, parts = blocks[0].offset, list[bytes | memoryview]()
+    if not all(block.trusted and block.compression is not None for block in blocks):
+        return None
+    try:
+        raw = memoryview(source.at(start, blocks[-1].end - start))
+        for block in blocks:
+            record = raw[block.offset - start : block.offset - start + block.length]
+            head = block.head(record)
+            if not head.crc or head.size > SMALL:
+                return None
+            parts.append(records.unpack(record, block.offset, max_chunk, head))
+        found = messages.parse(b"".join(parts), start)
+        found.times()
+    except LogError:
+        return None
+    starts = np.cumsum([0, *map(len, parts[:-1])])
+    return None if found.definitions or not np.isin(starts, found.offsets).all() else found
 
 
 class KeptChunk(NamedTuple):

@@ -60,6 +60,7 @@ class Recording:
     ended: bool = False  # its footer was met
     anonymous: bool = False  # no record in the file defines its ids
     headless: bool = False  # its begin is lost, and may lie ahead of `start`
+    gapped: bool = False  # a part of it is lost, perhaps with definitions
     ids: dict[int, int] = field(default_factory=dict)  # channel ids of the whole file by its own
     moved: bool = False  # its definitions cannot stay as they are in its chunks
     sizes: dict[int, tuple[int, int]] = field(default_factory=dict)  # the shortest and the longest message of a channel
@@ -74,6 +75,11 @@ class Recording:
     def readable(self) -> set[int]:
         """Channels that are defined together with their schema."""
         return {i for i, channel in self.channels.items() if not channel.schema_id or channel.schema_id in self.schemas}
+
+    def may_define(self, used: set[int]) -> bool:
+        """Whether it defines all of these channels, or some and the rest may be lost."""
+        readable = self.readable()
+        return used <= readable or ((self.headless or self.gapped) and not used.isdisjoint(readable))
 
     def meaning(self, channel: int) -> object:
         """What a channel id means here, to compare; None where it is not defined."""

@@ -76,6 +76,7 @@ class Recordings:
                 self._certain = False
             elif isinstance(event, Gap):
                 event.recording = self.each.index(self._now)
+                self._now.gapped = True
                 self._current, self._certain, self._behind_gap = self._named, False, []
             elif isinstance(event, Definition):
                 self._take_definitions(runs.get(id(event), []))
@@ -266,7 +267,7 @@ class Recordings:
         for narrower in (
             unlisted,
             [r for r in pool if not r.habits.contradicts(found.habits)],
-            [r for r in pool if used <= r.readable()],
+            [r for r in pool if r.may_define(used)],
             [r for r in pool if not r.ended],
             [r for r in pool if r.start <= found.block.offset],
         ):
@@ -279,7 +280,7 @@ class Recordings:
     def _doubt(self, found: ScannedBlock) -> None:
         """Weighs a block behind a gap against the logs behind it whose begin is lost: it may lie in one of them."""
         used, own = set(found.block.counts or {}), self.of(found.block)
-        later = [r for r in self.each if r.headless and r.start > found.block.offset and used <= r.readable()]
+        later = [r for r in self.each if r.headless and r.start > found.block.offset and r.may_define(used)]
         if later and not found.evidence and used <= own.readable():
             found.block.recording = self.each.index(self._by_content(found, used, [own, *later]))
 
@@ -287,9 +288,9 @@ class Recordings:
         """The first recording whose definitions fit a block's messages; notes channels of which several topics are possible."""
         open_ids = {i for i in used if len(topics_of(i, pool)) > 1}
         if not open_ids:  # of two definitions of one topic the proven holds
-            return max(pool, key=lambda r: sum((int(Opcode.CHANNEL), i) in r.proven for i in used))
+            return max(pool, key=lambda r: (len(used & r.readable()), sum((int(Opcode.CHANNEL), i) in r.proven for i in used)))
         fitting = [r for r in pool if all(self._fits(found.block, i, r) for i in open_ids)]
         pool = fitting or pool
         if still := {i: " or ".join(sorted(topics)) for i in open_ids if len(topics := topics_of(i, pool)) > 1}:
             self.unproven[found.block.offset] = still
-        return pool[0]
+        return max(pool, key=lambda r: len(used & r.readable()))

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import firwin
 from support import planted
+from support.planted import simulate_samples
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, step_of
 from imutool.diagnosis.estimation.whitening import Band, Whitener
-from imutool.sensor.effect import Effect, Stage, Theta, simulate_samples
+from imutool.sensor.effect import Effect, Stage, Theta
 
 ROUNDED = 1e-6  # of the largest derivative: differences of numbers to sixteen digits, over steps of a thousandth
 AROUND = {  # effects of every stage, so that each is asked with others before and behind it

@@ -47,6 +47,13 @@ def test_a_vehicle_lacks_what_was_planted_and_nothing_else(robot: str, kind: str
     within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
 
 
+def test_a_ripple_up_to_the_end_of_the_band_leaves_spectrum_for_the_noise(tmp_path: Path) -> None:
+    """27 waves a turn: the efforts' power reaches to where joints are compared."""
+    conceal_robot(tmp_path, 12003, "arm", "single", "gear_ripple")
+    (finding,) = diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap").findings
+    assert finding.effect == "gear_ripple"
+
+
 def test_an_arm_is_diagnosed_from_the_command_line_with_its_page(imutool: Run, tmp_path: Path) -> None:
     """A dry friction in MuJoCo: the command finds topics and fields by itself, and the page draws them."""
     conceal_robot(tmp_path, 3, "arm", "single", "coulomb_friction")

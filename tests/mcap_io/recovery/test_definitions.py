@@ -113,3 +113,19 @@ def test_chunks_written_in_another_way_are_not_on_the_topics_of_the_log_before_t
     report = repair(mine, tmp_path / "out.mcap")
     assert report.messages == {"/mine": 2 if told else 5}
     assert report.losses.topics == ({"(channel 1, not defined)": 3} if told else {})
+
+
+def test_a_log_that_may_have_lost_a_definition_stays_among_those_a_chunk_may_be_of(foreign: Foreign, tmp_path: Path) -> None:
+    """Its messages came back on the other log's topic, because only that one still defines all of the chunk's channels."""
+    mine = [text("/mine", 100, SHORT), text("/two", 101)]
+    other = [text("/other", 1000), text("/two", 1001), text("/other", 1002, SHORT), text("/two", 1003)]
+    first = foreign(mine, chunk_size=CHUNK_SIZE, name="first")
+    second = foreign(other, chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw = stretches(first), stretches(second), bytearray(second.read_bytes())
+    assert [len(each) for _, _, each in b] == [1, 1, 2]
+    raw[b[1][0] : b[1][1]] = bytes(b[1][1] - b[1][0])  # the chunk that defines /two
+    first.write_bytes(first.read_bytes()[: a[0][1]] + bytes(raw[: b[2][1]]))
+    report = repair(first, tmp_path / "out.mcap")
+    assert report.messages == {"/mine": 1, "/other": 1, "/two": 2}
+    assert report.losses.topics == {"(/mine or /other)": 1, "(channel 2, not defined)": 1}
+    assert report.losses.unproven == 1

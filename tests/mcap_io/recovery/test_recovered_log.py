@@ -357,6 +357,23 @@ def test_a_repaired_log_has_its_sound_chunks_as_they_were_and_everybody_reads_it
     with AnyReader([target]) as reader:
         assert sum(1 for _ in reader.messages()) == len(theory)
     assert repair(target, tmp_path / "again.mcap").whole
+    assert (tmp_path / "again.mcap").read_bytes() == after  # a log with every index and CRC is copied as it is
+    with pytest.raises(ConfigError, match="exists"):
+        repair(target, tmp_path / "again.mcap")
+
+
+def test_one_damaged_chunk_among_small_ones_that_are_read_together(foreign: Foreign, tmp_path: Path) -> None:
+    path = foreign(some(1, 40), chunk_size=1)
+    whole, each = stretches(path), blocks(path)
+    assert len(each) == 40
+    flip(path, each[7].offset + each[7].length - 1)
+    with RecoveredLog(path) as log:
+        found = [payload.tobytes() for topic in ("/a", "/b") for _, rows in log.rows([topic]) for payload in rows.payload]
+        assert log.losses
+    left = [m for n, (_, _, messages) in enumerate(whole) if n != 7 for m in messages]
+    assert sorted(found) == sorted(m[-1] for m in left)
+    with Log(path) as strict, pytest.raises(LogError, match=f"the chunk at byte {each[7].offset} "):
+        list(strict.rows(["/a", "/b"]))
 
 
 def test_damaged_stretches_are_kept_where_no_reader_takes_them_for_messages(
