@@ -127,7 +127,7 @@ def calibrate(
 
 
 def folded(pool: Pool) -> Pool:
-    """Pool with the training part of each log cut in equal folds where there are too few logs."""
+    """Pool with the training part of each log cut in folds where logs are few."""
     if len(pool.names) >= FOLDS:
         return pool
     counts = ~pool.held_out
@@ -146,9 +146,10 @@ def parameter_columns(effects: Sequence[LinearForm], names: Sequence[str]) -> li
 
 
 def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
-    """Forward selection, by the gain on other logs, stops where the best gain is small; then scale and misalignment join.
+    """Forward selection, by the gain on other logs; then scale and misalignment join.
 
-    A curve imitates a scale: where logs turn one way only, the two together are what no motion told apart.
+    It stops where the best gain is small. A curve imitates a scale, and where logs turn one way only nothing tells them apart:
+    then only a scale with evidence of its own joins.
     """
     gains: dict[str, float] = {}
     loss = problem.predicted([])

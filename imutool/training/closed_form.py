@@ -27,8 +27,7 @@ from imutool.units import SENSORS, Sensor
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
 REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
-REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
-SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
+CORRELATED = 10.0  # errors of the truth last longer than a window: this many windows are taken to say the same once
 ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
 MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes
 
@@ -131,7 +130,7 @@ def solve(
             if matrix:
                 u, _ = windows.segment.of(sensor)
                 J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
-            weight = _weight(e, windows.log, pool.least(sensor)) / design_effect(pool)
+            weight = _weight(e, windows.log, pool.least(sensor))
             H += torch.einsum("m,mij,mik->jk", weight, J, J)
             g += torch.einsum("m,mij,mi->j", weight, J, e)
         step = -torch.linalg.solve(H, g)
@@ -255,13 +254,8 @@ def _weight(e: Float[Tensor, "m 3"], log: Int[Tensor, " m"], least: Float[Tensor
     """Huber's weights, scaled so that a component of an ordinary window of its log has about unit noise, as the prior has."""
     size = e.norm(dim=1)
     delta = HUBER_MEDIANS * median_per_log(size, log, least)[log]
-    weight: Tensor = huber_weight(size, delta) * 3 / delta**2 / REPEATED
+    weight: Tensor = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
     return weight
-
-
-def design_effect(pool: Pool) -> float:
-    """How many logs say the same once: Kish's design effect 1 + (n - 1) rho of errors that n logs share."""
-    return 1.0 + SHARED * (len(pool.spans_ns) - 1)
 
 
 def median_per_log(size: Float[Tensor, " m"], log: Int[Tensor, " m"], least: Float[Tensor, " logs"]) -> Float[Tensor, " logs"]:

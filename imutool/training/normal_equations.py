@@ -23,7 +23,7 @@ from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
 from imutool.sensor.linear_form import LinearForm, patterns
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import REPEATED, design_effect, median_per_log, nuisance_jacobian, shown_by_logs, widest
+from imutool.training.closed_form import median_per_log, nuisance_jacobian, shown_by_logs, widest
 from imutool.training.segments import Part, Pool, Windows
 from imutool.training.settings import SensorPrior
 from imutool.units import Sensor
@@ -32,6 +32,8 @@ WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), 
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
 MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
+REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
+SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -128,6 +130,11 @@ class Problem:
         return fit.H[:, p:, p:] + torch.diag(self.own_prior), fit.g[:, p:] + self.own_prior * self.own
 
 
+def design_effect(pool: Pool) -> float:
+    """Kish's design effect 1 + (n - 1) rho of errors that n logs share."""
+    return 1.0 + SHARED * (len(pool.spans_ns) - 1)
+
+
 def prior_std(effect: LinearForm, sensors: SensorPrior | None = None) -> Float64[np.ndarray, " p"]:
     """Standard deviation of the prior of each parameter, which is about zero."""
     same: float | None = getattr(sensors or SensorPrior(), effect.name, None)
@@ -136,7 +143,7 @@ def prior_std(effect: LinearForm, sensors: SensorPrior | None = None) -> Float64
 
 @dataclass(frozen=True)
 class Seen:
-    """Samples of one sensor in a pool: signals, and the gyro for an accelerometer's attitude; the prior over sensors."""
+    """Samples of one sensor in a pool: signals, gyro under an accelerometer, prior over sensors."""
 
     pool: Pool
     sensor: Sensor

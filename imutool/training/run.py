@@ -162,13 +162,13 @@ def _physics_first(
     if physics.model.config.remainder:
         ode = descent(physics.recordings, neural_ode.Model.method, physics.ode_settings(settings))
         held_out["effects and neural_ode"] = _held_out(ode)
-        kept = ode if _helps(without.done, ode.done) else without
+        kept = ode if helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
 
 
-def _helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
+def helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
     """Whether a descent lowers one held-out error enough and does not raise the other."""
     gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
     return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN

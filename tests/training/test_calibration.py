@@ -15,8 +15,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration import FOLDS, LINEAR, Calibration, calibrate, folded
-from imutool.training.closed_form import design_effect
-from imutool.training.normal_equations import prior_std
+from imutool.training.normal_equations import design_effect, prior_std
 from imutool.training.segments import Pool
 from imutool.training.settings import SensorPrior
 from imutool.units import Sensor
