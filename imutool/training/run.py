@@ -15,13 +15,12 @@ from imutool import __version__, registry
 from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
-from imutool.bias_start.stretches import measured_recording
+from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import rotation_residual
 from imutool.log_info.conventions import warn_of_recordings
-from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
@@ -85,13 +84,13 @@ def train(
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
-    recordings = [measured_recording(read(log, imu=imu, truth=truth)) for log in logs]
+    parts = [(log, measured_recording(part)) for log in logs for part in read_stretches(log, imu=imu, truth=truth)]
+    recordings = [part for _, part in parts]
     warn_of_recordings(recordings)
     for recording in (recording for recording in recordings if recording.truth_caveat):
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
-    say = progress or (lambda epoch: None)
-    descent = _Descent(kept, resume, device, say)
+    descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
     if method == hybrid.Model.method:
         model, about = _physics_first(recordings, chosen, descent)
     elif method == linear.Model.method:
@@ -100,7 +99,7 @@ def train(
         training = descent(recordings, method, chosen)
         model, about = training.model, {"held_out": _held_out(training), **_turn_on(training)}
     model.card = {
-        **_card(method, chosen, recordings, logs),
+        **_card(method, chosen, parts),
         **about,
         **{key: _shared(recordings, key) for key in ("sensor", "dataset")},
     }
@@ -211,17 +210,14 @@ def _turn_on(training: Training) -> dict[str, Any]:
     return training.turn_on.card()
 
 
-def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording], logs: Sequence[Path]) -> dict[str, Any]:
+def _card(method: str, settings: TrainSettings, parts: Sequence[tuple[Path, Recording]]) -> dict[str, Any]:
     """Everything needed to repeat the training."""
     return {
         "imutool": __version__,
         "torch": torch.__version__,
         "method": method,
         "training": plain(settings),
-        "logs": [
-            {"name": r.name, "file": p.name, "sha256": sha256(p), "poses": _kind(r)}
-            for r, p in zip(recordings, logs, strict=True)
-        ],
+        "logs": [{"name": r.name, "file": p.name, "sha256": sha256(p), "poses": _kind(r)} for p, r in parts],
     }
 
 
