@@ -48,8 +48,9 @@ def evaluate(
     overwrite: bool = False,
     refused: Refused | None = None,
 ) -> list[dict[str, Any]]:
-    """One result for the raw samples and one for each model; of a log whose clock jumps, for each stretch.
+    """One result for the raw samples and one for each model.
 
+    A log whose clock jumps has these for each of its stretches, which are named NAME_1, NAME_2 and so on.
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
     `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
     log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.

@@ -145,7 +145,8 @@ def metadata(path: Path) -> list[tuple[str, dict[str, str]]]:
 
 
 @pytest.fixture
-def target(files: Path, tmp_path: Path) -> Path:
+def target(files: Path, source: Path, model_file: Path, tmp_path: Path) -> Path:
+    """What the model made of the log; both lie beside it."""
     return Path(shutil.copy(files / "out.mcap", tmp_path))
 
 

@@ -100,7 +100,9 @@ def longest_stretch(recording: Recording) -> Recording:
 
 
 def read_stretches(path: Location, *, imu: str | None = None, truth: str | None = None) -> list[Recording]:
-    """The recordings of a log, as `read`, one for each stretch between jumps of its clock: NAME_1, NAME_2 and so on.
+    """Recordings of a log, one for each stretch between jumps of its clock.
+
+    They are as `read` gives them, with the names NAME_1, NAME_2 and so on.
 
     Raises:
         ConfigError, LogError: as `read`.

@@ -60,7 +60,7 @@ def read(
 
 
 def longest_recording(found: Sequence[Recording]) -> Recording:
-    """The longest of the recordings of a log; a warning says which it is."""
+    """Longest of the recordings of a log; a warning says which it is."""
     longest = max(found, key=lambda recording: len(recording.imu))
     if len(found) > 1:
         between = f"from {longest.imu.t_ns[0]} to {longest.imu.t_ns[-1]} ns"
@@ -79,7 +79,7 @@ def read_recordings(
     derived: bool = True,
     refused: Callable[[str, LogError], None] | None = None,
 ) -> list[Recording]:
-    """As `read`, in a log that is open: one recording for each stretch in which the IMU's clock is not set back.
+    """Recordings of an open log, one for each stretch in which its clock is not set back.
 
     With `samples` those are the IMU's, and its messages are not read. With `refused`, poses that a recording cannot hold are
     left out and `refused` is called with topic and error. Without `derived` the scalars that imutool computed are not read.

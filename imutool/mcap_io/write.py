@@ -193,7 +193,7 @@ def _chunk_of(channel: int, parts: list[bytes], times: list[int], offsets: list[
 def own_and_user_metadata(
     records: Iterable[tuple[str, Mapping[str, str]]],
 ) -> tuple[Mapping[str, str], dict[str, dict[str, str]]]:
-    """The writer's notes on a recording, and the recording's own metadata, from the metadata records of a log.
+    """The writer's notes on a recording and its own metadata, from the records of a log.
 
     The writer's record is the first `imutool` that names what it shadows; later ones describe what was done to the log.
     """

@@ -155,7 +155,7 @@ def longest_run(t_ns: Int64[np.ndarray, " n"]) -> slice:
 
 
 class ClockRun(NamedTuple):
-    """Rows of an IMU between two places where its clock was set back, and their first and last stamp."""
+    """Rows of an IMU between two set-backs of its clock, and their first and last stamp."""
 
     rows: slice
     first_ns: int
@@ -169,7 +169,7 @@ class ClockRun(NamedTuple):
 
 
 def clock_runs(t_ns: Int64[np.ndarray, " n"]) -> list[ClockRun]:
-    """Runs between the places where the clock of an IMU was set back; one for an IMU without samples."""
+    """Runs between the set-backs of an IMU's clock; one for an IMU without samples."""
     runs = _set_back(t_ns)
     if not len(t_ns):
         return [ClockRun(runs[0], 0, 0, alone=True)]
