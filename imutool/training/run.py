@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,9 @@ from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
-from imutool.training.calibration import PhysicsFirst, config_of, described, helps
+from imutool.training.calibration import LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import LINEAR, compare, simpler_effects
+from imutool.training.left_out import compare, simpler_effects
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 LEAST_S = 10.0  # of truth without gaps, in all logs together
 LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
 WINDOW_S = 1.0
+LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 WORST_MISS = 0.5  # of a log's largest turns; a scale error of a tenth misses by a tenth
 
 
@@ -163,7 +164,18 @@ def _physics_first(
         kept = ode if helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
-    return model, about | {"compared": held_out, "physics": dict(described(physics.fits))} | compared
+    return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
+
+
+def helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
+    """Whether a descent lowers one held-out error enough and does not raise the other."""
+    gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
+    return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN
+
+
+def _described(fits: Mapping[Sensor, Calibration]) -> dict[str, Any]:
+    """Entries of a model card: effects, gains on logs left out of the fit, unseen parameters."""
+    return {s: {"effects": list(f.effects), "gains": dict(f.gains), "unseen": list(f.unseen)} for s, f in fits.items()}
 
 
 def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent) -> tuple[BiasNetwork, dict[str, Any]]:

@@ -22,10 +22,10 @@ from support.report_schema import assert_valid
 
 from imutool.blind_cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, catalogue, conceal, draw, open_case
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT
+from imutool.blind_cases.detectability import FALSE_ALARM, cramer_rao_bounds, detectability, detectable_misfit
 from imutool.blind_cases.draw import draw_parameters
 from imutool.blind_cases.effects import ACCEL, EARTH_RAD_S, GYRO, Reading, first_order, spring_mount
 from imutool.blind_cases.envelope import to_truth, unseal
-from imutool.blind_cases.information import FALSE_ALARM, cramer_rao_bounds, detectability, detectable_misfit
 from imutool.blind_cases.motion import Kinematics, smoother
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, Scene, place_scene
 from imutool.blind_cases.score import score
