@@ -23,7 +23,7 @@ from imutool.recording.message_log import MessageLog, Remarks, Table
 
 from . import Sequence
 from ._archive import refusing
-from ._files import find_files
+from ._source import find_files
 from .ulog import FLU_FROM_FRD, Q_ENU_FROM_NED_WXYZ, Q_FRD_FROM_FLU_WXYZ
 
 GENERAL = True

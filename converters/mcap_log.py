@@ -17,7 +17,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 from . import Sequence
-from ._files import head, name
+from ._source import head, name
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"

@@ -22,8 +22,8 @@ from imutool.errors import DataError, LogError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._files import find_files
 from ._ros_types import Ros1Types, ToCdr, need_rosbags, ros1_topic, ros2_name
+from ._source import find_files
 
 GENERAL = True
 SUFFIXES = (".bag", ".active")

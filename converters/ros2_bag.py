@@ -20,8 +20,8 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._files import find_files, find_folders, head
 from ._ros_types import need_rosbags, ros2_definition
+from ._source import find_files, find_folders, head
 
 GENERAL = True
 METADATA = "metadata.yaml"

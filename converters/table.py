@@ -21,7 +21,7 @@ from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
-from ._files import find_folders, head, name
+from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_groups import group_entries, known_layout, time_beside
 from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map

@@ -26,7 +26,7 @@ from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
 
 from . import Sequence
-from ._files import find_files, head
+from ._source import find_files, head
 
 GENERAL = True
 MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"

@@ -20,13 +20,12 @@ from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.prior_width import BiasPrior
-from imutool.bias_start.stretches import measured_imu
+from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.log_info.conventions import warn_of_recordings
-from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording
 
 RAW = "raw"
@@ -51,6 +50,7 @@ def evaluate(
 ) -> list[dict[str, Any]]:
     """One result for the raw samples and one for each model.
 
+    A log whose clock jumps has these for each of its stretches, which are named NAME_1, NAME_2 and so on.
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
     `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
     log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.
@@ -62,10 +62,26 @@ def evaluate(
     """
     if trajectories is not None:
         _refuse_twins(models)
-    recording = read(log, imu=imu, truth=truth)
+    results = list[dict[str, Any]]()
+    for recording in read_stretches(log, imu=imu, truth=truth):
+        chosen = recording.with_truth(next(iter(recording.truths))) if truth is None and recording.truths else recording
+        results += _evaluated(chosen, log, models, init, smooth, zupt, trajectories, overwrite, refused)
+    return results
+
+
+def _evaluated(
+    recording: Recording,
+    log: Path,
+    models: Sequence[str | Path],
+    init: str,
+    smooth: bool,
+    zupt: bool,
+    trajectories: Path | None,
+    overwrite: bool,
+    refused: Refused | None,
+) -> list[dict[str, Any]]:
+    """Results of one stretch of a log."""
     recording = replace(recording, imu=measured_imu(recording.imu, f"{log} {recording.imu_topic}"))
-    if truth is None and recording.truths:
-        recording = recording.with_truth(next(iter(recording.truths)))
     warn_of_recordings([recording])
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:

@@ -18,7 +18,7 @@ from imutool.errors import DataError
 from imutool.inertial.stationary import rest_stretches, white_noise
 from imutool.location import Location
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import read_recording
+from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.noise import allan
 from imutool.noise import datasheet as noise
 from imutool.noise.allan import Curve, Slopes
@@ -84,7 +84,7 @@ def identify(
     if not isinstance(log, Log):
         with Log(log) as opened:
             return identify(opened, imu=imu, truth=truth, model=model)
-    path, recording = log.path, read_recording(log, imu=imu, truth=truth)
+    path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     remarks: list[str] = []

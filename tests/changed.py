@@ -36,7 +36,7 @@ def tests_of(path: Path) -> list[Path]:
     mirrored = room / f"test_{path.stem}.py"
     if mirrored.is_file():
         return [mirrored]
-    dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     package, _, name = dotted.rpartition(".")
     texts = {test: test.read_text(encoding="utf-8") for test in sorted(room.glob("test_*.py"))}
     return [test for test, text in texts.items() if dotted in text or (f"from {package} import" in text and name in text)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import subprocess
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -84,18 +85,24 @@ def recording() -> Recording:
     )
 
 
-@pytest.fixture
-def source(recording: Recording, tmp_path: Path) -> Path:
-    path = tmp_path / "flight.mcap"
-    write(recording, path)
-    return path
+@pytest.fixture(scope="module")
+def files(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording as flight.mcap, a model m.safetensors, and out.mcap, which the model makes of the log."""
+    folder = tmp_path_factory.mktemp("files")
+    write(recording, folder / "flight.mcap")
+    save(make_model("neural_ode"), folder / "m.safetensors")
+    debias(folder / "flight.mcap", folder / "out.mcap", model=folder / "m.safetensors")
+    return folder
 
 
 @pytest.fixture
-def model_file(tmp_path: Path) -> Path:
-    path = tmp_path / "m.safetensors"
-    save(make_model("neural_ode"), path)
-    return path
+def source(files: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(files / "flight.mcap", tmp_path))
+
+
+@pytest.fixture
+def model_file(files: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(files / "m.safetensors", tmp_path))
 
 
 def messages(path: Path) -> Iterator[tuple[str, str, str, int, int, int, bytes]]:
@@ -138,10 +145,9 @@ def metadata(path: Path) -> list[tuple[str, dict[str, str]]]:
 
 
 @pytest.fixture
-def target(source: Path, model_file: Path, tmp_path: Path) -> Path:
-    path = tmp_path / "out.mcap"
-    debias(source, path, model=model_file)
-    return path
+def target(files: Path, source: Path, model_file: Path, tmp_path: Path) -> Path:
+    """What the model made of the log; both lie beside it."""
+    return Path(shutil.copy(files / "out.mcap", tmp_path))
 
 
 def test_every_original_message_is_unchanged_and_so_is_the_source(source: Path, model_file: Path, tmp_path: Path) -> None:

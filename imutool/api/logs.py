@@ -8,7 +8,7 @@ from pathlib import Path
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
 from imutool.errors import ConfigError, did_you_mean
-from imutool.exporting import ExportReport, euroc, rosbag2, twin
+from imutool.exporting import ExportReport, euroc, rosbag2, simulators
 from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
@@ -18,7 +18,7 @@ from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
-FORMATS = ("euroc", "rosbag2", *twin.FORMATS)
+FORMATS = ("euroc", "rosbag2", *simulators.FORMATS)
 Progress = Callable[[int, int], None]  # bytes done, bytes in all
 NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 
@@ -207,8 +207,8 @@ def export(
     tell: NamedProgress = progress or (lambda done, total, word: None)
     if format == "euroc":
         return euroc.write(source, folder, imu, noise, overwrite, tell)
-    if format in twin.FORMATS and imu is None:
-        return twin.write(source, folder, format, noise, overwrite)
+    if format in simulators.FORMATS and imu is None:
+        return simulators.write(source, folder, format, noise, overwrite)
     if imu is not None or noise is not None:
         what = "a rosbag2 folder holds the whole log" if format == "rosbag2" else "a diagnosis is of one IMU"
         raise ConfigError(what, where="imu, noise" if format == "rosbag2" else "imu", fix="Leave it out")

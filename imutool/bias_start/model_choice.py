@@ -40,7 +40,7 @@ from imutool.log_info.conventions import warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import read_recording
+from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 
 HEAD_S = 60.0  # start of a log that the search for the initial bias reads
@@ -206,7 +206,7 @@ def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Rec
     end_ns = _after(log, topic, HEAD_S)
     samples = _samples(log, topic, survey, end_ns if survey is None else survey.start_ns + nanoseconds(HEAD_S))
     if init.partition(":")[0] == "truth":
-        return read_recording(log, imu=topic, end_ns=end_ns, samples=samples)
+        return longest_recording(read_recordings(log, imu=topic, end_ns=end_ns, samples=samples))
     return Recording(log.path.stem, samples, imu_topic=topic, source=str(log.path))
 
 

@@ -15,12 +15,15 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from imutool.bias.model import GAP_S
-from imutool.cleaning.cleaner import rows
+from imutool.cleaning import rows
 from imutool.errors import ConfigError, LogError
+from imutool.location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.topics import CLEAN_FIX
 from imutool.recording import Imu, Recording, nanoseconds
-from imutool.recording.columns import MOST_GAP_S, jump_warnings, longest_run
+from imutool.recording.columns import MOST_GAP_S, jump_warnings
 
 MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
 LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
@@ -89,12 +92,28 @@ def measured_recording(recording: Recording, *, free_fall: bool = False) -> Reco
 
 def longest_stretch(recording: Recording) -> Recording:
     """Longest part of a recording on one setting of its clock."""
-    t_ns = recording.imu.t_ns[longest_run(recording.imu.t_ns)]
-    if len(t_ns) == len(recording.imu):
-        return recording
-    first_ns, last_ns = int(t_ns[0]), int(t_ns[-1])
-    logger.warning("%s: only its longest stretch on one clock is used, from %d to %d ns", recording.name, first_ns, last_ns)
-    return recording.between(first_ns, last_ns)
+    longest = max(recording.between_jumps(), key=lambda part: len(part.imu))
+    if longest is not recording:
+        first_ns, last_ns = int(longest.imu.t_ns[0]), int(longest.imu.t_ns[-1])
+        logger.warning("%s: only its longest stretch on one clock is used, from %d to %d ns", recording.name, first_ns, last_ns)
+    return longest
+
+
+def read_stretches(path: Location, *, imu: str | None = None, truth: str | None = None) -> list[Recording]:
+    """Recordings of a log, one for each stretch between jumps of its clock.
+
+    They are as `read` gives them, with the names NAME_1, NAME_2 and so on.
+
+    Raises:
+        ConfigError, LogError: as `read`.
+    """
+    with Log(path) as log:
+        parts = [part for whole in read_recordings(log, imu=imu, truth=truth) for part in whole.between_jumps()]
+    found = [part for part in parts if len(part.imu) > 1 and (any(map(len, part.truths.values())) or not part.truths)]
+    if len(found) < len(parts) > 1:
+        logger.warning("%s: %d stretches of its clock hold no poses, and are left out", path, len(parts) - len(found))
+    named = [replace(part, name=f"{part.name}_{n}") for n, part in enumerate(found, 1)]
+    return named if len(parts) > 1 and named else parts[:1]
 
 
 class StretchClock:

@@ -19,10 +19,10 @@ from numpy.random import Generator, SeedSequence, default_rng
 
 from imutool.blind_cases import catalogue, draw
 from imutool.blind_cases.catalogue import NO_LIMIT
+from imutool.blind_cases.detectability import achievable_rms, cramer_rao_bounds, detectability, location
 from imutool.blind_cases.effects import Model, Theta
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter, digest, read_json, seal, unseal
 from imutool.blind_cases.gain import WITHOUT_MISFIT
-from imutool.blind_cases.information import achievable_rms, cramer_rao_bounds, detectability, location
 from imutool.blind_cases.motion import smoother
 from imutool.blind_cases.scene import SIM_SHARE, Scene, place_scene, stamps_ns
 from imutool.blind_cases.score import SCHEMA, Score, score

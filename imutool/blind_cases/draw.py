@@ -21,8 +21,8 @@ from numpy.random import Generator
 
 from imutool.blind_cases import catalogue
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT, clipping
+from imutool.blind_cases.detectability import Detectability, detectable_misfit
 from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta
-from imutool.blind_cases.information import Detectability, detectable_misfit
 from imutool.errors import ConfigError, DataError
 from imutool.noise.datasheet import SHEETS, Noise
 

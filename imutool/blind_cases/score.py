@@ -27,27 +27,14 @@ from imutool.report import Report, Section
 
 SCHEMA, FINDINGS_SCHEMA = "imutool.score/1", "imutool.diagnosis/1"
 IN_EVERY_LOG = {"gyro_bias", "accel_bias"}  # right, but never concealed
-# other names of a parameter in findings
 ALIASES: Mapping[str, tuple[str, ...]] = {
-    **{axis: (f"phi_{axis}", f"r_{axis}", f"{axis}_m") for axis in AXES},
-    "tau": ("tau_s", "offset", "time_constant"),
-    "eps": ("epsilon", "skew"),
-    "t_j": ("t_jump", "time", "t"),
-    "step": ("jump", "offset"),
-    "f_c": ("fc", "cutoff", "cut_off", "f"),
-    "f0": ("f_0", "frequency"),
-    "f": ("f1", "frequency"),
-    "zeta": ("damping",),
-    "g": ("dg", "magnitude", "size"),
-    "gyro": ("gyro_limit", "gyro_lsb", "limit_gyro", "lsb_gyro"),
-    "accel": ("accel_limit", "accel_lsb", "limit_accel", "lsb_accel"),
-    "share_x": ("x",),
-    "share_y": ("y",),
-    "share_z": ("z",),
-    "share": ("fraction",),
-    "std": ("jitter", "sigma"),
-    "lag": ("delay", "tau"),
+    **{axis: (f"phi_{axis}",) for axis in AXES},
+    "t_j": ("t_jump",),
+    "g": ("magnitude",),
+    "gyro": ("gyro_limit", "gyro_lsb"),
+    "accel": ("accel_limit", "accel_lsb"),
 }
+"""Names of a parameter in findings, where a case names it otherwise."""
 
 
 class LocationScore(Section, frozen=True):

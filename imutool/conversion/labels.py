@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
-from imutool.mcap_io.read import RECORD
 from imutool.mcap_io.topics import MESSAGE_POSES
+from imutool.mcap_io.write import RECORD
 from imutool.recording import Recording
 from imutool.recording.message_log import KINDS, MessageLog
 

@@ -40,7 +40,7 @@ from imutool.diagnosis.reference_coverage import (
 from imutool.diagnosis.reference_errors import reference_caveat, reference_errors, turned_reference
 from imutool.diagnosis.result import Diagnosis, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.compared_signals import with_signals
+from imutool.diagnosis.signals import with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location

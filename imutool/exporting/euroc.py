@@ -14,9 +14,9 @@ from imutool.errors import LogError
 from imutool.exporting import ExportReport, Progress
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import VELOCITY_KEY, read
+from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
-from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.recording import Frames, Poses, Recording, Scalars, unit_quaternions

@@ -99,19 +99,12 @@ def log(R: Rotations) -> Vectors:
     return 2.0 * _atan2_over(_squared(v).unsqueeze(-1), w) * v
 
 
-def right_jacobian_inverse(xi: Vectors) -> Rotations:
-    """Inverse right Jacobian J_r^{-1}(xi) = I + [xi]x / 2 + (1/a² - cot(a/2) / (2a)) [xi]x².
-
-    It is defined for |xi| < 2 pi and grows as 2 pi / (2 pi - |xi|) towards this limit; `ode.integrate` checks it.
-    """
-    s = _squared(xi)
-    return _quadratic(xi, torch.full_like(s, 0.5), _half_cot(s))
-
-
 def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
-    """Chart rate dxi/dt = J_r^{-1}(xi) omega_b (paper, eq. 15), without the matrix.
+    """Chart rate dxi/dt = J_r^{-1}(xi) omega_b (paper, eq. 15), with one cross product.
 
-    [xi]x² w = xi (xi . w) - s w, so one cross product is enough.
+    The inverse right Jacobian is J_r^{-1}(xi) = I + [xi]x / 2 + (1/a² - cot(a/2) / (2a)) [xi]x², a = |xi|, and
+    [xi]x² w = xi (xi . w) - a² w. It is defined for a < 2 pi and grows as 2 pi / (2 pi - a) towards this limit;
+    `ode.integrate` checks it.
     """
     s, along = _squared(xi).unsqueeze(-1), (xi * omega_b).sum(dim=-1, keepdim=True)
     half_turn: Tensor = 0.5 * torch.linalg.cross(xi, omega_b)

@@ -20,8 +20,7 @@ from imutool.location import Location
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import UNIT_KEY
-from imutool.mcap_io.topics import DERIVED_KEY, StampCheck, Topic
+from imutool.mcap_io.topics import DERIVED_KEY, UNIT_KEY, StampCheck, Topic
 
 LISTED = 60  # fields named in a message
 MAX_ROW = 64  # numbers of an array that become channels

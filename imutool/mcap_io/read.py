@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt32
@@ -15,18 +15,23 @@ from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, MESSAGE_POSES, SCALARS, StampCheck, check_finite
+from imutool.mcap_io.topics import (
+    DERIVED_KEY,
+    ENCODINGS,
+    MESSAGE_POSES,
+    SCALARS,
+    UNIT_KEY,
+    VELOCITY_KEY,
+    StampCheck,
+    check_finite,
+)
+from imutool.mcap_io.write import own_and_user_metadata
 from imutool.recording import UNIT_QUATERNION_TOLERANCE, Frames, Imu, Poses, Recording, Scalars, unit_quaternions
-from imutool.recording.columns import clock_jumps, jump_warnings
+from imutool.recording.columns import ClockRun, clock_jumps, clock_runs, jump_warnings
 
 logger = logging.getLogger(__name__)
 
 DOUBTFUL = ("estimate", "odometry")  # kinds of poses
-VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
-UNIT_KEY = "unit"  # channel metadata of a scalar
-RECORD = "imutool"  # name of our metadata record
-SHADOWED_KEY = "shadowed"  # in that record: JSON of a recording's own entries under the keys we use
-OWN_KEYS = ("writer", "name", "source", "imu_topic", SHADOWED_KEY)
 
 
 def read(
@@ -36,25 +41,34 @@ def read(
     truth: str | None = None,
     start_ns: int | None = None,
     end_ns: int | None = None,
-    samples: Imu | None = None,
 ) -> Recording:
     """The recording in a log: `read(write(r)) == r`, bit for bit.
+
+    Of a log whose clock was set back it is the longest stretch, and a warning says so (`stretches.read_stretches`: all).
 
     Poses of every pose topic are truths (/tf, by child frame, where there are no others), but not those that are an estimate or
     odometry, unless `truth` names them. Of a log that imutool did not write, the name is that of the file, and Float64 and
     Vector3Stamped topics are scalars; one of these that a recording cannot hold (time going back, NaN) is left out and
-    logged as a warning. `start_ns` and `end_ns` select by log time. With `samples` those are the IMU's, and its messages are
-    not read.
+    logged as a warning. `start_ns` and `end_ns` select by log time.
 
     Raises:
         ConfigError: the file cannot be opened.
         LogError: no IMU or several without `imu`, no such topic, values or stamps no recording can hold, a damaged log.
     """
     with Log(path) as log:
-        return read_recording(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns, samples=samples)
+        return longest_recording(read_recordings(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns))
 
 
-def read_recording(
+def longest_recording(found: Sequence[Recording]) -> Recording:
+    """Longest of the recordings of a log; a warning says which it is."""
+    longest = max(found, key=lambda recording: len(recording.imu))
+    if len(found) > 1:
+        between = f"from {longest.imu.t_ns[0]} to {longest.imu.t_ns[-1]} ns"
+        logger.warning("%s: only the longest stretch of its clock is read, %s, without images", longest.name, between)
+    return longest
+
+
+def read_recordings(
     log: Log,
     *,
     imu: str | None = None,
@@ -64,17 +78,17 @@ def read_recording(
     samples: Imu | None = None,
     derived: bool = True,
     refused: Callable[[str, LogError], None] | None = None,
-) -> Recording:
-    """As `read`, in a log that is open.
+) -> list[Recording]:
+    """Recordings of an open log, one for each stretch in which its clock is not set back.
 
-    With `refused`, poses that a recording cannot hold are left out and `refused` is called with topic and error. Without
-    `derived` the scalars that imutool computed are not read.
+    With `samples` those are the IMU's, and its messages are not read. With `refused`, poses that a recording cannot hold are
+    left out and `refused` is called with topic and error. Without `derived` the scalars that imutool computed are not read.
 
     Raises:
         LogError: as `read`.
     """
     imu_topic = log.topic(log.only_imu() if imu is None else imu, (schemas.IMU,)).name
-    own, metadata = _own_and_user_metadata(log)
+    own, metadata = own_and_user_metadata(log.metadata_records())
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
     scalars = [
@@ -82,24 +96,29 @@ def read_recording(
         for t in log.with_schema(SCALARS)
         if t.name not in velocities and t.message_encoding in ENCODINGS and (derived or DERIVED_KEY not in t.metadata)
     ]
-    columns = _Columns(log, imu_topic, truths, velocities, scalars, refused)
+    used = {name: of for name, of in velocities.items() if of in truths}
+    columns = _Columns(log, imu_topic, truths, used, scalars, refused)
     with log.named():
         topics = columns.topics if samples is None else columns.topics[1:]
         for topic, rows in log.rows(topics, start_ns, end_ns):
             columns.take(topic, rows)
-    return Recording(
-        name=own.get("name", log.path.stem),
-        imu=columns.imu() if samples is None else samples,
-        truths=columns.truths(truth),
-        scalars=columns.scalars(),
-        frames=_frames(log, start_ns, end_ns),
-        metadata=metadata,
-        imu_topic=imu_topic,
-        source=own.get("source", ""),
-        other_poses={
-            t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths
-        },
-    )
+    found = []
+    for run in columns.runs(samples):
+        recording = Recording(
+            name=own.get("name", log.path.stem),
+            imu=columns.imu() if samples is None else samples,
+            truths=columns.truths(truth),
+            scalars=columns.scalars(),
+            frames=_frames(log, start_ns, end_ns),
+            metadata=metadata,
+            imu_topic=imu_topic,
+            source=own.get("source", ""),
+            other_poses={
+                t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths
+            },
+        )
+        found.append(recording if run.alone else recording.between(run.first_ns, run.last_ns))
+    return found
 
 
 def _choose_truths(log: Log, truth: str | None) -> list[str]:
@@ -115,24 +134,19 @@ def _choose_truths(log: Log, truth: str | None) -> list[str]:
     return trees
 
 
+@dataclass
 class _Columns:
     """Collects the columns of every wanted topic in one pass over the log."""
 
-    def __init__(
-        self,
-        log: Log,
-        imu: str,
-        truths: list[str],
-        velocities: Mapping[str, str],
-        scalars: list[str],
-        refused: Callable[[str, LogError], None] | None,
-    ) -> None:
-        self.log, self.imu_topic, self.truth_topics, self.scalar_topics = log, imu, truths, scalars
-        self.velocity_topics = {name: of for name, of in velocities.items() if of in truths}
-        self.clocks: dict[str, StampCheck] = {}
-        self.kept: dict[str, list[tuple[np.ndarray, ...]]] = {}  # columns, by topic
-        self.left_out: set[str] = set()
-        self.refused = refused
+    log: Log
+    imu_topic: str
+    truth_topics: list[str]
+    velocity_topics: Mapping[str, str]  # the poses that each is of
+    scalar_topics: list[str]
+    refused: Callable[[str, LogError], None] | None
+    kept: dict[str, list[tuple[np.ndarray, ...]]] = field(default_factory=dict)  # columns, by topic
+    left_out: set[str] = field(default_factory=set)
+    run: ClockRun = field(init=False)  # the current one of `runs`
 
     @property
     def topics(self) -> list[str]:
@@ -184,21 +198,30 @@ class _Columns:
         stamp_ns: Int64[np.ndarray, " n"],
         *columns: Float64[np.ndarray, "n _"],
     ) -> None:
-        self.clocks.setdefault(name, StampCheck()).check(stamp_ns, sequence)
-        self.kept.setdefault(name, []).append((stamp_ns, *columns))
+        self.kept.setdefault(name, []).append((stamp_ns, sequence, *columns))
+
+    def runs(self, samples: Imu | None) -> Iterator[ClockRun]:
+        """The stretches of the IMU's clock; `columns` are then those of the current one."""
+        parts = self.kept.get(self.imu_topic, []) if samples is None else [(samples.t_ns,)]
+        stamp_ns = np.concatenate([np.zeros(0, np.int64), *(part[0] for part in parts)])
+        for warning in jump_warnings(clock_jumps(stamp_ns)) if samples is None else ():
+            logger.warning("%s %s: %s", self.log.path, self.imu_topic, warning)
+        for run in clock_runs(stamp_ns):
+            self.run = run
+            yield run
 
     def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:
         parts = self.kept.get(name, [])
         if not parts:
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
-        stamp_ns, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return stamp_ns, columns
+        stamp_ns, sequence, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+        rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)
+        StampCheck(count=rows.start).check(stamp_ns[rows], sequence[rows])
+        return stamp_ns[rows], [column[rows] for column in columns]
 
     def imu(self) -> Imu:
         with self.log.named(self.imu_topic):
             stamp_ns, (gyro, accel) = self.columns(self.imu_topic, 3, 3)
-            for warning in jump_warnings(clock_jumps(stamp_ns)):
-                logger.warning("%s %s: %s", self.log.path, self.imu_topic, warning)
             return Imu(stamp_ns, gyro, accel)
 
     def truths(self, wanted: str | None) -> dict[str, Poses]:
@@ -241,7 +264,11 @@ class _Columns:
         for name in self.scalar_topics:
             if name not in self.left_out:
                 described = self.log.topics[name]
-                stamp_ns, (values,) = self.columns(name, SCALARS[described.schema_name])
+                try:
+                    stamp_ns, (values,) = self.columns(name, SCALARS[described.schema_name])
+                except LogError as error:
+                    logger.warning("%s %s is left out: %s", self.log.path, name, error.what)
+                    continue
                 found[name] = Scalars(stamp_ns, values, described.metadata.get(UNIT_KEY, ""))
         return found
 
@@ -271,30 +298,3 @@ def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None
             yield from log.images(topic, start_ns, end_ns)
 
     return each
-
-
-def _own_and_user_metadata(log: Log) -> tuple[dict[str, str], dict[str, dict[str, str]]]:
-    """The writer's notes on the recording, and the recording's own metadata.
-
-    The writer's record is the first `imutool` that names what it shadows; later ones describe what was done to the log.
-    """
-    own: dict[str, str] = {}
-    found: dict[str, dict[str, str]] = {}
-    for name, values in log.metadata_records():
-        entries = values
-        if name == RECORD and SHADOWED_KEY in values and not own:
-            own, shadowed = values, _shadowed(values[SHADOWED_KEY])
-            entries = {k: v for k, v in values.items() if k not in OWN_KEYS} | dict(shadowed or {})
-            if not entries and shadowed is None:
-                continue
-        found.setdefault(name, {}).update(entries)
-    return own, found
-
-
-def _shadowed(text: str) -> Mapping[str, str] | None:
-    """A recording's own entries under our keys; None where it had no record `imutool`."""
-    try:
-        value = json.loads(text)
-    except ValueError:
-        value = None
-    return value if isinstance(value, dict) and all(isinstance(v, str) for v in value.values()) else None

@@ -17,7 +17,7 @@ from imutool.errors import ConfigError, LogError
 from imutool.location import Location
 from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, read_message_indexes
 from imutool.mcap_io.codec import records
-from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC
+from imutool.mcap_io.codec.records import CHUNK_HEAD, FOOTER_SIZE, HEAD, MAGIC
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import check_chunk
@@ -152,6 +152,7 @@ def _check_summary(index: LogIndex, *, complete: bool) -> None:
     start, end = footer.summary_start, source.size - len(MAGIC) - FOOTER_SIZE
     raw, at, groups = source.at(start, end - start), 0, dict[int, tuple[int, int]]()
     found: Counter[int] = Counter()
+    lengths = {block.offset: block.length for block in index.blocks}
     while at < len(raw):
         opcode, length = HEAD.unpack_from(raw, at)
         body, whole = raw[at + HEAD.size : at + HEAD.size + length], HEAD.size + length
@@ -164,7 +165,13 @@ def _check_summary(index: LogIndex, *, complete: bool) -> None:
             groups[opcode] = first, size + whole
             if first + size != start + at:
                 raise LogError(f"the {records.name_of(opcode)} records of the summary lie apart")
-        if opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+        if opcode == Opcode.CHUNK_INDEX:
+            chunk = records.parse_chunk_index(body, start + at)
+            ahead = HEAD.size + CHUNK_HEAD.size + len(chunk.compression) + 8  # bytes of the record before the packed data
+            actual = lengths.get(chunk.chunk_start_offset)
+            if actual != chunk.chunk_length or actual != ahead + chunk.compressed_size:
+                raise LogError(f"the summary lists a chunk at byte {chunk.chunk_start_offset} otherwise than it is")
+        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
             attached = opcode == Opcode.ATTACHMENT_INDEX
             entry = records.parse(AttachmentIndex if attached else MetadataIndex, body, start + at)
             kind = Opcode.ATTACHMENT if attached else Opcode.METADATA

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -21,11 +21,14 @@ from imutool.errors import DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
-from imutool.mcap_io.read import OWN_KEYS, RECORD, SHADOWED_KEY, UNIT_KEY, VELOCITY_KEY
+from imutool.mcap_io.topics import UNIT_KEY, VELOCITY_KEY
 from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording import Frames, Poses, Recording, Scalars
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)
+RECORD = "imutool"  # name of our metadata record
+SHADOWED_KEY = "shadowed"  # in that record: JSON of a recording's own entries under the keys we use
+OWN_KEYS = ("writer", "name", "source", "imu_topic", SHADOWED_KEY)
 WORLD, BODY = "world", "body"
 PACKED_IMAGES = ("png", "jpeg", "jpg", "webp")  # compressing these again costs time and saves nothing
 
@@ -185,3 +188,32 @@ def _image_chunks(channel: int, topic: str, frames: Frames) -> Iterator[Chunk]:
 def _chunk_of(channel: int, parts: list[bytes], times: list[int], offsets: list[int]) -> Chunk:
     channels = np.full(len(parts), channel, np.uint16)
     return Chunk(b"".join(parts), channels, np.array(times, np.int64), np.array(offsets, np.int64))
+
+
+def own_and_user_metadata(
+    records: Iterable[tuple[str, Mapping[str, str]]],
+) -> tuple[Mapping[str, str], dict[str, dict[str, str]]]:
+    """The writer's notes on a recording and its own metadata, from the records of a log.
+
+    The writer's record is the first `imutool` that names what it shadows; later ones describe what was done to the log.
+    """
+    own: Mapping[str, str] = {}
+    found: dict[str, dict[str, str]] = {}
+    for name, values in records:
+        entries = values
+        if name == RECORD and SHADOWED_KEY in values and not own:
+            own, shadowed = values, _shadowed(values[SHADOWED_KEY])
+            entries = {k: v for k, v in values.items() if k not in OWN_KEYS} | dict(shadowed or {})
+            if not entries and shadowed is None:
+                continue
+        found.setdefault(name, {}).update(entries)
+    return own, found
+
+
+def _shadowed(text: str) -> Mapping[str, str] | None:
+    """A recording's own entries under our keys; None where it had no record `imutool`."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = None
+    return value if isinstance(value, dict) and all(isinstance(v, str) for v in value.values()) else None

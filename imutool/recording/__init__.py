@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
 
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from imutool.errors import DataError
 from imutool.geometry import quaternion
-from imutool.recording.columns import Columns
+from imutool.recording.columns import Columns, clock_jumps
 
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
@@ -232,6 +233,12 @@ class Recording:
             scalars={k: v.between(start_ns, end_ns) for k, v in self.scalars.items()},
             frames={},
         )
+
+    def between_jumps(self) -> list[Recording]:
+        """Recordings of the stretches between jumps of the IMU's clock; itself where there is none."""
+        starts = [start_ns for start_ns, _ in clock_jumps(self.imu.t_ns)]
+        edges = [*self.imu.t_ns[:1].tolist(), *starts, *(self.imu.t_ns[-1:] + 1).tolist()]
+        return [self.between(a, b - 1) for a, b in pairwise(edges)] if starts else [self]
 
     def overlap(self) -> Recording:
         """Recording cut to the time that IMU and (first) truth share.

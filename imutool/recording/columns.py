@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int64
@@ -150,9 +151,42 @@ def clock_jumps(t_ns: Int64[np.ndarray, " n"]) -> list[tuple[int, float]]:
 def longest_run(t_ns: Int64[np.ndarray, " n"]) -> slice:
     """Rows of the longest stretch on one setting of the clock, of stamps that increase."""
     starts = np.searchsorted(t_ns, [start_ns for start_ns, _ in clock_jumps(t_ns)])
-    edges = np.concatenate([[0], starts, [len(t_ns)]])
-    longest = int(np.argmax(np.diff(edges)))
-    return slice(int(edges[longest]), int(edges[longest + 1]))
+    return max(_between(starts, len(t_ns)), key=lambda run: run.stop - run.start)
+
+
+class ClockRun(NamedTuple):
+    """Rows of an IMU between two set-backs of its clock, and their first and last stamp."""
+
+    rows: slice
+    first_ns: int
+    last_ns: int
+    alone: bool  # the clock was never set back
+
+    def rows_of(self, t_ns: Int64[np.ndarray, " m"]) -> slice:
+        """Rows of another topic: of several settings of its clock, the one that shares most with this one."""
+        inside = (t_ns >= self.first_ns) & (t_ns <= self.last_ns)
+        return max(_set_back(t_ns), key=lambda run: (int(inside[run].sum()), run.stop - run.start))
+
+
+def clock_runs(t_ns: Int64[np.ndarray, " n"]) -> list[ClockRun]:
+    """Runs between the set-backs of an IMU's clock; one for an IMU without samples."""
+    runs = _set_back(t_ns)
+    if not len(t_ns):
+        return [ClockRun(runs[0], 0, 0, alone=True)]
+    return [ClockRun(run, int(t_ns[run.start]), int(t_ns[run.stop - 1]), alone=len(runs) == 1) for run in runs]
+
+
+def _set_back(t_ns: Int64[np.ndarray, " n"]) -> list[slice]:
+    """Rows between the places where a clock was set back; one stamp that is ahead or late is none of them."""
+    if len(t_ns) < 2 or (step := np.diff(t_ns)).min() > -SET_BACK_NS:
+        return [slice(0, len(t_ns))]
+    stays_back = np.append(t_ns[2:], t_ns[-1:]) < t_ns[:-1]
+    was_right = t_ns[1:] <= np.append(t_ns[1:2], t_ns[:-2])
+    return _between(np.flatnonzero((step <= -SET_BACK_NS) & stays_back & was_right) + 1, len(t_ns))
+
+
+def _between(starts: Int64[np.ndarray, " k"], count: int) -> list[slice]:
+    return [slice(a, b) for a, b in pairwise([0, *starts.tolist(), count])]
 
 
 def jump_warnings(jumps: Sequence[tuple[int, float]]) -> Iterator[str]:

@@ -175,6 +175,25 @@ def attitude_of(motion: IdealMotion, effect: str) -> Float64[np.ndarray, "n 3 3"
     return motion.R_wb
 
 
+class Remembered:
+    """Function of a clock and one number that keeps its last value.
+
+    Derivatives ask for the same again and again.
+    """
+
+    def __init__(self, function: Callable[[Times, float], Float64[np.ndarray, "n ..."]]) -> None:
+        self._function = function
+        self._last: tuple[Times, float, Float64[np.ndarray, "n ..."]] | None = None
+
+    def __call__(self, t_s: Times, x: float) -> Float64[np.ndarray, "n ..."]:
+        """Its value, which is read-only."""
+        last = self._last  # replaced as a whole, so that threads may share it
+        if last is None or last[1] != x or not np.array_equal(last[0], t_s):
+            last = self._last = t_s.copy(), x, self._function(t_s, x)
+            last[2].flags.writeable = False
+        return last[2]
+
+
 def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Residual: samples minus the ideal ones at the same stamps, gyro (rad/s) and accel (m/s²).
 
@@ -217,21 +236,12 @@ class SignalState:
         return self.motion.sample(self.taken_s, self.stamp_s) if self.taken is None else self.taken
 
 
-def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
-    """Samples of a sensor with these effects at some stamps, applied in stage order."""
-    state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
-    for effect, theta in in_stage_order(acting):
-        state = state.through(effect, theta)
-    samples: SensorSamples = state.samples()
-    return samples
-
-
 def simulate_stretches(
     motions: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting
 ) -> SensorSamples:
     """Samples of a sensor with these effects over several stretches of one motion.
 
-    As `simulate_samples`, but clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
+    Clock and sensor know of no stretches: a drift goes on from one to the next, a clock jumps once.
     """
     order = in_stage_order(acting)
     for effect, theta in order:

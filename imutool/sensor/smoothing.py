@@ -111,7 +111,7 @@ class Samples:
         self.knots[DEGREE], self.knots[-DEGREE - 1] = t_s[0], t_s[-1]  # to the last bit, so that both ends are inside
         self.count, self.y, self.weights = pieces + DEGREE, y, weights
         design = BSpline.design_matrix(t_s, self.knots, DEGREE)
-        self.values = design.data.reshape(len(t_s), DEGREE + 1)
+        self.design, self.values = design, design.data.reshape(len(t_s), DEGREE + 1)
         self.first = design.indices.reshape(len(t_s), DEGREE + 1)[:, 0]
         self.normal = self._normal()
         self.centre = np.average(y, axis=0, weights=weights)  # taken out: a world's far origin would cost digits
@@ -169,7 +169,7 @@ class Samples:
 
     def fitted(self, coefficients: Float64[np.ndarray, "c d"]) -> Values:
         """Values of the curve at the samples."""
-        return np.asarray(np.einsum("nk,nkd->nd", self.values, coefficients[self.first[:, None] + np.arange(DEGREE + 1)]))
+        return np.asarray(self.design @ coefficients)
 
     def unlikelihood(self, cutoff_hz: float) -> tuple[float, float]:
         """Minus twice the log restricted likelihood, the noise profiled out; and that noise."""

@@ -1,19 +1,18 @@
 """Calibration: effects that the training logs support, fitted by linear least squares.
 
 Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own.
-Forward selection: an effect is chosen by how well the other logs predict each log's long windows
+Every sensor has scale and misalignment: their prior (`SensorPrior`) shrinks them as far as the motion does not show them.
+Forward selection of the others: an effect is chosen by how well the other logs predict each log's long windows
 (`imutool.training.normal_equations`), and refused where most logs do not agree or chance explains it. A parameter that the
 motion does not show stays at its prior, and is named.
 
-`hybrid` is trained in this order: effects are chosen on the training part and fitted to whole logs, then the neural ODE is
-trained on recordings corrected for them. The model keeps the ODE if it lowers the held-out error of either sensor by
-`LEAST_ODE_GAIN`.
+`hybrid` chooses effects on the training part, fits them to whole logs, and trains the neural ODE on what they leave.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,18 +34,19 @@ from imutool.recording import Imu, Recording, seconds
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
-from imutool.training.closed_form import CORRELATED, widest
+from imutool.training.closed_form import widest
 from imutool.training.fit import Epoch, note
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
-from imutool.training.settings import TrainSettings
+from imutool.training.settings import SensorPrior, TrainSettings
 from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
-REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
 LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
+TINY = 1e-12  # of a loss, whose unit is a window's noise
+LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
+CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
 FOLDS = 3  # parts of a log where there are fewer logs than this
-LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 UNSEEN = 0.9  # of its prior's width: a parameter no narrower was not seen
 
 
@@ -86,19 +86,22 @@ def calibrate(
     part: Part = "train",
     signals: Signals | None = None,
     own_prior: Float[Tensor, " o"] | None = None,
+    sensors: SensorPrior | None = None,
 ) -> Calibration:
     """Fit the effects that the logs support, or those named.
 
     `gyro` is the debiased rate that carries the attitude under the accelerometer, and the gyro's own samples for the gyro.
     `signals` are those of every sample where the logs begin before the pool does, `own_prior` that of each log's nuisances
-    where it is known. Parts of a log do not show how logs differ, and keep the widest.
+    where it is known. Few logs are cut in folds to choose effects on the training part; folds do not show how logs differ, and
+    keep the widest.
 
     Raises:
         DataError: a log without a stretch of truth that is free of gaps.
         ConfigError: a name that no effect on the sensor has.
     """
     effects = catalogue.trained(sensor, names)
-    seen = Seen(folded(pool, part), sensor, signals_of(pool) if signals is None else signals, gyro)
+    cut = folded(pool) if part == "train" else pool
+    seen = Seen(cut, sensor, signals_of(pool) if signals is None else signals, gyro, sensors or SensorPrior())
     if own_prior is None and len(pool.names) < FOLDS:
         own_prior = widest(sensor, pool.t)
     every, gains = linearise(seen, effects, part, own_prior), {}
@@ -123,11 +126,11 @@ def calibrate(
     )
 
 
-def folded(pool: Pool, part: Part) -> Pool:
-    """Pool with each log cut in equal folds where there are too few logs."""
+def folded(pool: Pool) -> Pool:
+    """Pool with the training part of each log cut in folds where logs are few."""
     if len(pool.names) >= FOLDS:
         return pool
-    counts = torch.ones_like(pool.held_out) if part == "all" else pool.held_out == (part == "held_out")
+    counts = ~pool.held_out
     length = torch.bincount(pool.log, weights=counts.to(pool.t)).long()
     before = torch.cumsum(length, 0) - length
     index = (torch.cumsum(counts, 0) - 1 - before[pool.log]).clamp(min=0)  # within the part; the others are not used
@@ -143,7 +146,11 @@ def parameter_columns(effects: Sequence[LinearForm], names: Sequence[str]) -> li
 
 
 def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
-    """Forward selection, by the gain on other logs; stops where the best gain is small."""
+    """Forward selection, by the gain on other logs; then scale and misalignment join.
+
+    It stops where the best gain is small. A curve imitates a scale, and where logs turn one way only nothing tells them apart:
+    then only a scale with evidence of its own joins.
+    """
     gains: dict[str, float] = {}
     loss = problem.predicted([])
     while True:
@@ -151,13 +158,21 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
         tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
         helped = {name: new for name, new in tried.items() if bool((new < loss).sum() > 0.5 * len(loss))}
         agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
-        if not agreed:
-            return gains
-        best = min(agreed, key=lambda name: float(agreed[name].sum()))
-        gain = 1 - float(agreed[best].sum() / loss.sum())
+        best = max(agreed, key=lambda name: _gain(agreed[name], loss), default="")
+        gain = _gain(agreed[best], loss) if best else 0.0
         if gain < LEAST_GAIN:
-            return gains
+            break
         gains[best], loss = gain, agreed[best]
+    imitated = {CONTAINED[name] for name in gains if name in CONTAINED}
+    for name in (form.name for form in effects if form.name in LINEAR[form.sensor] and form.name not in {*gains, *imitated}):
+        new = problem.predicted(parameter_columns(effects, [*gains, name]))
+        gains[name], loss = _gain(new, loss), new
+    return gains
+
+
+def _gain(new: Float[Tensor, " logs"], loss: Float[Tensor, " logs"]) -> float:
+    """Share of the loss taken off, by the geometric mean over logs: a log that nothing explains does not outvote the others."""
+    return 1 - float((new.clamp_min(TINY) / loss.clamp_min(TINY)).log().mean().exp())
 
 
 def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Sequence[str]) -> bool:
@@ -171,7 +186,7 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Seque
     theta, covariance = problem.solve(columns)
     own = [k for k, column in enumerate(columns) if column in parameter_columns(effects, names[-1:])]
     last, block = theta[columns][own], covariance[own][:, own]
-    wald = CORRELATED / REPEATED * float(last @ torch.linalg.solve(block, last))
+    wald = problem.design_effect * float(last @ torch.linalg.solve(block, last))
     shown = float((1 - block.diagonal() * problem.prior[columns][own]).sum())
     return wald > float(chi2.isf(BY_CHANCE / len(effects), max(shown, 1.0)))
 
@@ -208,15 +223,16 @@ class PhysicsFirst:
         gyro = pool.gyro
         for sensor in SENSORS:
             report(note(f"looking for effects on the {sensor}"))
-            chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals)
-            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals, chosen.problem.own_prior)
+            chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals, None, settings.sensors)
+            own_prior = chosen.problem.own_prior
+            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals, own_prior, settings.sensors)
             of_choice = ("gains", "forms", "problem", "named")
             fits[sensor] = replace(whole, **{name: getattr(chosen, name) for name in of_choice})
             model.take(sensor, fits[sensor].effects, fits[sensor].theta, fits[sensor].covariance)
             if sensor == "gyro":
                 error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)
                 gyro = pool.gyro - error - fits[sensor].rest[pool.log]
-        return cls(model, fits, _without(model, recordings))
+        return cls(model, fits, [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings])
 
     def ode_settings(self, settings: TrainSettings) -> TrainSettings:
         """Settings of the ODE's own training."""
@@ -253,12 +269,6 @@ def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
     return words, tuple(name for name in names if name not in taken)
 
 
-def helps(before: dict[Sensor, float], after: dict[Sensor, float]) -> bool:
-    """Whether a descent lowers one held-out error enough and does not raise the other."""
-    gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
-    return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN
-
-
 def config_of(settings: TrainSettings) -> Config:
     """Model settings, their effects checked.
 
@@ -284,17 +294,6 @@ def _signals(imu: Imu, rate_hz: float) -> Signals:
     return SignalFilter(rate_hz)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
 
 
-def _without(model: hybrid.Network, recordings: Sequence[Recording]) -> list[Recording]:
-    """Recordings corrected for the model's effects."""
-    return [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings]
-
-
 def _corrected(model: hybrid.Network, imu: Imu) -> Imu:
     signals = _signals(imu, model.rate_hz)
     return Imu(imu.t_ns, imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals))
-
-
-def described(fits: dict[Sensor, Calibration]) -> Iterator[tuple[str, dict[str, object]]]:
-    """Entries of a model card: effects, gains on logs left out of the fit, unseen parameters."""
-    for sensor, fitted in fits.items():
-        yield sensor, {"effects": list(fitted.effects), "gains": dict(fitted.gains), "unseen": list(fitted.unseen)}

@@ -31,14 +31,13 @@ from imutool.errors import DataError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.recording import Imu, Poses, Recording, nanoseconds
-from imutool.training.calibration import Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.calibration import LINEAR, Calibration, effects_beyond_chance, parameter_columns
 from imutool.training.segments import Pool
 from imutool.training.statistics import turn_on_prior
 from imutool.units import SENSORS, Sensor
 
 STARTS = ("auto", "smooth", "truth")
 CANDIDATES = ("constant", "linear", "effects")  # from the simplest
-LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 LEAST_GAIN = 0.03  # of the error, for a candidate to be worth its parameters
 LEAST_ERROR = 1e-6  # ° or m/s
 LONGEST_S = 120.0  # of a log that is scored

@@ -23,24 +23,17 @@ from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
 from imutool.sensor.linear_form import LinearForm, patterns
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import CORRELATED, median_per_log, nuisance_jacobian, shown_by_logs, widest
+from imutool.training.closed_form import median_per_log, nuisance_jacobian, shown_by_logs, widest
 from imutool.training.segments import Part, Pool, Windows
+from imutool.training.settings import SensorPrior
 from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
 MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
-# Deviations of the priors, in the parameters' units, where they are not the plausible sizes of the diagnosis, which looks for
-# faults: training calibrates a sensor that works, and what it did not see of a drift or a nonlinearity has to stay near zero.
-PRIOR_STD: Mapping[str, float] = {
-    "accel_bias_drift": 0.1,
-    "accel_scale": 0.1,
-    "clock_offset": 0.01,
-    "gyro_bias_drift": 2e-3,
-    "gyro_g_sensitivity": 1e-3,
-    "gyro_quadratic": 0.02,
-}
+REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
+SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -59,6 +52,10 @@ class Equations:
 
     def __add__(self, other: Equations) -> Equations:
         return Equations(self.H + other.H, self.g + other.g, self.c + other.c)
+
+    def times(self, factor: float) -> Equations:
+        """The same losses, each multiplied by a factor."""
+        return Equations(factor * self.H, factor * self.g, factor * self.c)
 
     def moved(self, d_theta: Float[Tensor, " p"]) -> Equations:
         """The same losses about another point, moved in theta."""
@@ -82,6 +79,7 @@ class Problem:
     own: Float[Tensor, "logs o"]
     prior: Float[Tensor, " p"]  # one over the plausible variance of each parameter
     own_prior: Float[Tensor, " o"]
+    design_effect: float  # by which the losses are divided
     free: int  # of a log's own unknowns: those without a prior when the log is predicted
     fit: Equations
     judged: Equations  # what a solution is judged by
@@ -132,20 +130,26 @@ class Problem:
         return fit.H[:, p:, p:] + torch.diag(self.own_prior), fit.g[:, p:] + self.own_prior * self.own
 
 
-def prior_std(effect: LinearForm) -> Float64[np.ndarray, " p"]:
+def design_effect(pool: Pool) -> float:
+    """Kish's design effect 1 + (n - 1) rho of errors that n logs share."""
+    return 1.0 + SHARED * (len(pool.spans_ns) - 1)
+
+
+def prior_std(effect: LinearForm, sensors: SensorPrior | None = None) -> Float64[np.ndarray, " p"]:
     """Standard deviation of the prior of each parameter, which is about zero."""
-    same = PRIOR_STD.get(effect.name)
+    same: float | None = getattr(sensors or SensorPrior(), effect.name, None)
     return effect.plausible if same is None else np.full(len(effect.parameters), same)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Samples of one sensor in a pool: signals, and the gyro for an accelerometer's attitude."""
+    """Samples of one sensor in a pool: signals, gyro under an accelerometer, prior over sensors."""
 
     pool: Pool
     sensor: Sensor
     signals: Signals
     gyro: Float[Tensor, "n 3"]
+    sensors: SensorPrior
 
     @property
     def free(self) -> int:
@@ -171,7 +175,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
         DataError: a log without a window that is free of gaps.
     """
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
-    std = np.concatenate([np.zeros(0), *(prior_std(effect) for effect in effects)])
+    std = np.concatenate([np.zeros(0), *(prior_std(effect, seen.sensors) for effect in effects)])
     prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, len(width))
@@ -187,7 +191,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
-        problem = Problem(theta, own, prior, width, seen.free, fit, judged)
+        problem = Problem(theta, own, prior, width, design_effect(seen.pool), seen.free, fit, judged)
         if step < len(sets) + 1:
             theta = problem.solve(range(len(prior))).theta
             own = problem.own_at(theta)
@@ -203,7 +207,7 @@ def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
     pool, sets = seen.pool, []
     for length_s in WINDOW_S[seen.sensor]:
         n = pool.samples(length_s)
-        first = pool.starts(n, part, hop=max(1, n // 2))
+        first = pool.starts(n, part, hop=max(1, n // 2), ends_only=True)
         if len(first):
             evenly = first[:: max(1, -(-len(first) * n // MAX_SAMPLES))]
             sets.append(WindowSet(evenly, n, length_s >= JUDGED_FROM_S[seen.sensor]))
@@ -244,7 +248,8 @@ def _equations(
         by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
         residuals.append(e)
         slopes.append(torch.cat([by_theta, A.sum(1), by_nuisance], dim=2))
-    return _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], shorter)
+    equations, usual = _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], shorter)
+    return equations.times(1.0 / design_effect(pool)), usual
 
 
 def _residual(
@@ -274,7 +279,7 @@ def _summed(
     size, logs = e.norm(dim=1), len(shorter)
     usual = median_per_log(size, log, shorter)
     delta = HUBER_MEDIANS * usual[log]
-    weight = huber_weight(size, delta) * 3 / delta**2 / CORRELATED
+    weight = huber_weight(size, delta) * 3 / delta**2 / REPEATED
     parts = [log == i for i in range(logs)]
     H = torch.stack([torch.einsum("m,mij,mik->jk", weight[m], J[m], J[m]) for m in parts])
     g = torch.stack([torch.einsum("m,mij,mi->j", weight[m], J[m], e[m]) for m in parts])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,18 @@ from imutool import __version__, registry
 from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
-from imutool.bias_start.stretches import measured_recording
+from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
 from imutool.inertial.windows import rotation_residual
 from imutool.log_info.conventions import warn_of_recordings
-from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
-from imutool.training.calibration import PhysicsFirst, config_of, described, helps
+from imutool.training.calibration import LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import LINEAR, compare, simpler_effects
+from imutool.training.left_out import compare, simpler_effects
 from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
@@ -38,6 +37,7 @@ logger = logging.getLogger(__name__)
 LEAST_S = 10.0  # of truth without gaps, in all logs together
 LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
 WINDOW_S = 1.0
+LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
 WORST_MISS = 0.5  # of a log's largest turns; a scale error of a tenth misses by a tenth
 
 
@@ -84,13 +84,13 @@ def train(
         raise ConfigError(f"{method} has no steps to go on with", where="resume", fix="Train it without `resume`")
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
-    recordings = [measured_recording(read(log, imu=imu, truth=truth)) for log in logs]
+    parts = [(log, measured_recording(part)) for log in logs for part in read_stretches(log, imu=imu, truth=truth)]
+    recordings = [part for _, part in parts]
     warn_of_recordings(recordings)
     for recording in (recording for recording in recordings if recording.truth_caveat):
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
-    say = progress or (lambda epoch: None)
-    descent = _Descent(kept, resume, device, say)
+    descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
     if method == hybrid.Model.method:
         model, about = _physics_first(recordings, chosen, descent)
     elif method == linear.Model.method:
@@ -99,7 +99,7 @@ def train(
         training = descent(recordings, method, chosen)
         model, about = training.model, {"held_out": _held_out(training), **_turn_on(training)}
     model.card = {
-        **_card(method, chosen, recordings, logs),
+        **_card(method, chosen, parts),
         **about,
         **{key: _shared(recordings, key) for key in ("sensor", "dataset")},
     }
@@ -164,7 +164,18 @@ def _physics_first(
         kept = ode if helps(without.done, ode.done) else without
     model = physics.finish(kept.model)
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
-    return model, about | {"compared": held_out, "physics": dict(described(physics.fits))} | compared
+    return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
+
+
+def helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
+    """Whether a descent lowers one held-out error enough and does not raise the other."""
+    gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
+    return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN
+
+
+def _described(fits: Mapping[Sensor, Calibration]) -> dict[str, Any]:
+    """Entries of a model card: effects, gains on logs left out of the fit, unseen parameters."""
+    return {s: {"effects": list(f.effects), "gains": dict(f.gains), "unseen": list(f.unseen)} for s, f in fits.items()}
 
 
 def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent) -> tuple[BiasNetwork, dict[str, Any]]:
@@ -199,17 +210,14 @@ def _turn_on(training: Training) -> dict[str, Any]:
     return training.turn_on.card()
 
 
-def _card(method: str, settings: TrainSettings, recordings: Sequence[Recording], logs: Sequence[Path]) -> dict[str, Any]:
+def _card(method: str, settings: TrainSettings, parts: Sequence[tuple[Path, Recording]]) -> dict[str, Any]:
     """Everything needed to repeat the training."""
     return {
         "imutool": __version__,
         "torch": torch.__version__,
         "method": method,
         "training": plain(settings),
-        "logs": [
-            {"name": r.name, "file": p.name, "sha256": sha256(p), "poses": _kind(r)}
-            for r, p in zip(recordings, logs, strict=True)
-        ],
+        "logs": [{"name": r.name, "file": p.name, "sha256": sha256(p), "poses": _kind(r)} for p, r in parts],
     }
 
 

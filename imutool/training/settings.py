@@ -46,6 +46,25 @@ class PoseFloors(Settings, frozen=True):
         return known.get(kind, (LEAST_RESIDUAL, LEAST_RESIDUAL))
 
 
+class SensorPrior(Settings, frozen=True):
+    """Prior over sensors: standard deviations of an effect's parameters, about zero.
+
+    From data sheets: MPU-6050 (PS-MPU-6000A 3.4) for consumer sensors, ADIS16448 for industrial ones. What they were judged by
+    is in docs/accuracy.md. Units stand beside each. An effect that is not named here has its plausible size.
+    """
+
+    gyro_scale: Positive = 0.05  # -: MPU-6050 ±3 %; a choice, wider because TUM-VI's BMI160 has 10 %
+    gyro_misalignment: Positive = 0.02  # -: MPU-6050 ±2 % across axes, and a degree between poses and sensor
+    gyro_g_sensitivity: Positive = 2e-4  # rad/s per m/s²: MPU-6050 0.1 °/s/g; ADIS16448 0.015 °/s/g
+    gyro_quadratic: Positive = 1e-3  # s/rad: MPU-6050 0.2 % of a full scale of 250 °/s
+    gyro_bias_drift: Positive = 2e-3  # rad/s: a choice
+    accel_scale: Positive = 0.03  # -: MPU-6050 ±3 %
+    accel_misalignment: Positive = 0.02  # -: MPU-6050 ±2 %, and a degree as above
+    accel_quadratic: Positive = 1e-3  # s²/m: MPU-6050 0.5 % of a full scale of 2 g
+    accel_bias_drift: Positive = 0.1  # m/s²: a choice
+    clock_offset: Positive = 0.01  # s: a choice
+
+
 class TrainSettings(Settings, frozen=True):
     """How to train; `model` holds the settings of the method.
 
@@ -67,6 +86,7 @@ class TrainSettings(Settings, frozen=True):
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
     pose_floors: PoseFloors = PoseFloors()
+    sensors: SensorPrior = SensorPrior()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
 
 

@@ -22,8 +22,8 @@ from numpy.random import Generator, default_rng
 from scipy.interpolate import make_interp_spline
 
 from imutool.blind_cases import case_log, catalogue, write_case
+from imutool.blind_cases.detectability import achievable_rms, location
 from imutool.blind_cases.envelope import ConcealedEffect, ConcealedTruth, TrueParameter
-from imutool.blind_cases.information import achievable_rms, location
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, stamps_ns
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Scalars
 

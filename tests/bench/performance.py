@@ -3,7 +3,9 @@
 A line a command: CPU and wall seconds of the whole process, the least of `--rounds` after one round that does not count, and
 the ratio of its CPU time to that of a peer in the same run. Peers: python importing what a command cannot do without, `cp` of
 the log, a shell loop of `cp`. The small log is a made-up flight of 90 s with true poses; the large one has images and IMU
-messages in every chunk (`tests/bench/rewrite.py`); many are logs of 2 MB of that kind (`tests/bench/fleet.py`).
+messages in every chunk (`tests/bench/rewrite.py`); many are logs of 2 MB of that kind (`tests/bench/fleet.py`). Diagnosis and
+training run once: of the flight beside its simulation, and of each of `--recordings LOG...` alone and beside its simulation;
+one training of all of them (on EuRoC: MH_01, MH_03, MH_05, V1_02, V2_01, V2_03).
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +28,7 @@ from imutool.sensor.made_up_flight import flight
 
 IMUTOOL = str(Path(sys.executable).with_name("imutool"))
 MODEL = "euroc-adis16448-hybrid"
-PARTS = ("start", "small", "large", "many")
+PARTS = ("start", "small", "large", "many", "diagnose", "train")
 TERMINAL = [sys.executable, "-c", "import typer, rich"]
 NUMERIC = [sys.executable, "-c", "import numpy, scipy.signal"]
 
@@ -38,6 +40,7 @@ class Row(NamedTuple):
     words: list[str]
     peer: str
     outputs: tuple[Path, ...] = ()
+    once: bool = False  # so long that one run says enough
 
 
 def start() -> Iterator[Row]:
@@ -51,8 +54,7 @@ def small(folder: Path) -> Iterator[Row]:
     log, out, sim = folder / "flight.mcap", folder / "out.mcap", folder / "sim.mcap"
     page, found = folder / "page.html", folder / "found"
     write(flight(2, duration_s=90.0), log)
-    simulate = ["simulate", log, sim, "--noise", "adis16448", "--seed", "1", "-q"]
-    subprocess.run([IMUTOOL, *map(str, simulate)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    simulate = simulated(log, sim)
     lines: list[tuple[str, list[object], tuple[Path, ...]]] = [
         ("info", ["info", log], ()),
         ("clean", ["clean", log, out], (out,)),
@@ -67,6 +69,32 @@ def small(folder: Path) -> Iterator[Row]:
     yield Row("numpy, scipy.signal", NUMERIC, "numpy, scipy.signal")
     for name, words, outputs in lines:
         yield Row(name, [IMUTOOL, *map(str, words)], "numpy, scipy.signal", outputs)
+
+
+def simulated(log: Path, sim: Path) -> list[object]:
+    """The words of a simulation along a log's poses, which is made."""
+    words: list[object] = ["simulate", log, sim, "--noise", "adis16448", "--seed", "1", "-q", "--overwrite"]
+    subprocess.run([IMUTOOL, *map(str, words)], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return words
+
+
+def diagnosed(folder: Path, recordings: Sequence[Path]) -> Iterator[Row]:
+    """Diagnoses without files: pairs, and recordings alone."""
+    log, sim = folder / "flight.mcap", folder / "sim.mcap"
+    write(flight(2, duration_s=90.0), log)
+    for path in (log, *recordings):
+        simulated(path, sim)
+        yield Row(f"diagnose {path.stem}, a pair", [IMUTOOL, "diagnose", str(path), "--sim", str(sim), "-q"], "", once=True)
+    for path in recordings:
+        yield Row(f"diagnose {path.stem} alone", [IMUTOOL, "diagnose", str(path), "-q"], "", once=True)
+
+
+def trained(folder: Path, recordings: Sequence[Path]) -> Iterator[Row]:
+    """One training."""
+    out = folder / "model.safetensors"
+    words = [IMUTOOL, "train", *map(str, recordings), "-o", str(out), "--method", "hybrid", "-q"]
+    if recordings:
+        yield Row(f"train hybrid, {len(recordings)} logs", words, "", (out,), once=True)
 
 
 def large(folder: Path, gb: float) -> Iterator[Row]:
@@ -99,7 +127,7 @@ def many(folder: Path, logs: int, mb: float) -> Iterator[Row]:
 def taken(row: Row, rounds: int) -> rewrite.Spent:
     """The least of each figure over rounds; the first run fills the caches."""
     runs = []
-    for count in range(rounds + 1):
+    for count in range(int(row.once), 2 if row.once else rounds + 1):
         for path in row.outputs:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
         spent = rewrite.timed(row.words)
@@ -118,6 +146,9 @@ def main() -> None:
     parser.add_argument("--mb", type=float, default=2.0, help="size of each")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--in", dest="folder", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument(
+        "--recordings", nargs="*", type=Path, default=(), metavar="LOG", help="logs with poses, to diagnose and train on"
+    )
     parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
     args = parser.parse_args()
     print(f"{args.rounds} rounds in {args.folder}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
@@ -129,14 +160,17 @@ def main() -> None:
             "small": lambda: small(folder),
             "large": lambda: large(folder, args.gb),
             "many": lambda: many(folder, args.logs, args.mb),
+            "diagnose": lambda: diagnosed(folder, args.recordings),
+            "train": lambda: trained(folder, args.recordings),
         }
         for part in args.only:
             print(part)
             peer = 1.0
             for row in parts[part]():
                 spent = taken(row, args.rounds)
-                peer = spent.cpu if row.name.startswith(row.peer) else peer
-                print(f"  {row.name:32}{spent.cpu:8.2f}{spent.wall:9.2f}{spent.cpu / peer:12.2f}  {row.peer}", flush=True)
+                peer = spent.cpu if row.peer and row.name.startswith(row.peer) else peer
+                ratio = f"{spent.cpu / peer:12.2f}  {row.peer}" if row.peer else ""
+                print(f"  {row.name:32}{spent.cpu:8.2f}{spent.wall:9.2f}{ratio}", flush=True)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.blind_cases import LONGEST_S, POSE_NOISE, draw, plan
+from imutool.blind_cases.detectability import DECIMATION, Detectability, with_catalogue
 from imutool.blind_cases.effects import Six, Stage
 from imutool.blind_cases.envelope import ConcealedTruth
-from imutool.blind_cases.information import DECIMATION, Detectability, with_catalogue
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, Scene
 from imutool.errors import DataError
 from imutool.mcap_io.read import read

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from support.imu_defects import batch_of, with_values, write_log
 
 from imutool.bias import static
@@ -16,13 +17,18 @@ from imutool.bias.io import load
 from imutool.bias.model import BiasModel
 from imutool.bias_start.correction import OnlineDebiaser, apply_with_std
 from imutool.bias_start.initial_bias import tracked_from_prior
-from imutool.bias_start.stretches import Sieve, StretchClock, measured
+from imutool.bias_start.stretches import Sieve, StretchClock, measured, read_stretches
 from imutool.debiasing import DebiasedBlock, DebiasReport, debias
 from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.evaluation import evaluate
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
-from imutool.recording import Imu
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Recording
 from imutool.recording.columns import MOST_GAP_S
 from imutool.sensor.made_up_flight import flight
+from imutool.training.run import train
 
 MODELS = Path(__file__).parents[2] / "models"
 METHODS = ("linear", "neural_ode", "hybrid", "conv")
@@ -177,6 +183,77 @@ def test_a_jump_is_in_report_and_metadata(batch: ImuBatch, tmp_path: Path, imuto
     (imu,) = json.loads((tmp_path / "r.json").read_text())["imus"].values()
     assert imu["left_out"] == {"zero_force": 60}
     assert imu["stretches"][0]["step_s"] == pytest.approx(YEARS, abs=1.0)
+
+
+@pytest.fixture
+def clock_was_set(tmp_path: Path) -> Callable[[float], tuple[Recording, Path]]:
+    """A flight of 24 s with true poses, and its log whose clock was set by so many seconds in the middle."""
+
+    def made(step_s: float) -> tuple[Recording, Path]:
+        whole, path = flight(4, duration_s=24.0, still_s=3.0), tmp_path / "set.mcap"
+        middle = int(whole.imu.t_ns[len(whole.imu) // 2])
+        imu, truth = whole.imu, whole.truth
+        with path.open("wb") as file:
+            writer = Writer(file, chunk_size=4000)
+            writer.start("ros2")
+            rows = [(int(t), "/imu0", k) for k, t in enumerate(imu.t_ns)] + [
+                (int(t), "/pose", k) for k, t in enumerate(truth.t_ns)
+            ]
+            kinds = {"/imu0": schemas.IMU, "/pose": schemas.POSE}
+            ids = {
+                topic: writer.register_channel(
+                    topic, "cdr", writer.register_schema(kind, "ros2msg", schemas.definition(kind).encode())
+                )
+                for topic, kind in kinds.items()
+            }
+            for t, topic, k in sorted(rows):
+                t_ns = np.array([t + (round(step_s * 1e9) if t >= middle else 0)])
+                part = slice(k, k + 1)
+                payload = (
+                    encode_imu(t_ns, imu.gyro[part], imu.accel[part], "imu")
+                    if topic == "/imu0"
+                    else encode_pose(t_ns, truth.p_wb[part], truth.q_wb_wxyz[part], "world")
+                )
+                writer.add_message(ids[topic], int(t_ns[0]), payload.tobytes(), int(t_ns[0]), k)
+            writer.finish()
+        return whole, path
+
+    return made
+
+
+@pytest.mark.parametrize("step_s", [1e7, -6.0, -1e7])
+def test_each_stretch_of_a_clock_that_was_set_is_evaluated(
+    clock_was_set: Callable[[float], tuple[Recording, Path]], caplog: pytest.LogCaptureFixture, step_s: float
+) -> None:
+    """A clock set back ended `evaluate`; over one set forward it integrated the years of the jump."""
+    whole, path = clock_was_set(step_s)
+    first, second = read_stretches(path)
+    count, middle = len(whole.imu), len(whole.imu) // 2
+    assert (first.name, second.name) == ("set_1", "set_2")
+    assert (len(first.imu), len(second.imu)) == (middle, count - middle)
+    np.testing.assert_array_equal(second.imu.gyro, whole.imu.gyro[middle:])
+    np.testing.assert_array_equal(second.imu.t_ns, whole.imu.t_ns[middle:] + round(step_s * 1e9))
+    for part, cut in ((first, slice(0, middle)), (second, slice(middle, count))):
+        times = whole.imu.t_ns[cut]
+        own = whole.truth.between(int(times[0]), int(times[-1]))
+        assert len(own) <= len(part.truth) <= len(own) + 1  # a pose behind the last sample
+        np.testing.assert_array_equal(part.truth.p_wb[: len(own)], own.p_wb)
+    results = evaluate(path)
+    assert [result["log"] for result in results] == ["set_1", "set_2"]
+    assert all(result["duration_s"] < 13.0 and result["ape_m"] < 1000.0 for result in results)
+    assert "the clock jumps by" in caplog.text
+
+
+def test_a_log_whose_clock_was_set_back_is_read_as_its_longest_stretch(
+    clock_was_set: Callable[[float], tuple[Recording, Path]], caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    _, path = clock_was_set(-6.0)
+    first, second = read_stretches(path)
+    found = read(path)
+    assert found.imu == max(first, second, key=lambda part: len(part.imu)).imu
+    assert "only the longest stretch of its clock is read" in caplog.text
+    debias(path, tmp_path / "out.mcap", model="euroc-adis16448-hybrid", init="truth", force=True)
+    train([path], tmp_path / "m.safetensors", method="linear")
 
 
 def test_the_clock_equals_the_stamps_until_it_jumps() -> None:

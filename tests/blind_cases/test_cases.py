@@ -22,10 +22,10 @@ from support.report_schema import assert_valid
 
 from imutool.blind_cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, catalogue, conceal, draw, open_case
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT
+from imutool.blind_cases.detectability import FALSE_ALARM, cramer_rao_bounds, detectability, detectable_misfit
 from imutool.blind_cases.draw import draw_parameters
 from imutool.blind_cases.effects import ACCEL, EARTH_RAD_S, GYRO, Reading, first_order, spring_mount
 from imutool.blind_cases.envelope import to_truth, unseal
-from imutool.blind_cases.information import FALSE_ALARM, cramer_rao_bounds, detectability, detectable_misfit
 from imutool.blind_cases.motion import Kinematics, smoother
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, Scene, place_scene
 from imutool.blind_cases.score import score
@@ -735,7 +735,7 @@ def test_nothing_where_nothing_is_and_a_bias_is_no_news() -> None:
 
 def test_a_driver_must_be_the_right_one() -> None:
     truth = _truth(_concealed("driven", "gyro", "/motor/current", gain=0.1, lag=0.2))
-    field = _finding("driven", "gyro", "/motor/current.data", gain=(0.1, 0.01), delay=(0.2, 0.1))
+    field = _finding("driven", "gyro", "/motor/current.data", gain=(0.1, 0.01), lag=(0.2, 0.1))
     out = scored(truth, _findings([field]))
     assert out["right"]
     assert [row["parameter"] for row in out["parameters"]] == ["gain", "lag"]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.imu_defects import batch_of, cut, late, pick, repeated, with_values
 
-from imutool.cleaning.cleaner import Cleaner
+from imutool.cleaning import Cleaner
 from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.rule import CleaningSettings, every
 from imutool.cleaning.samples import BLOCK, blocks, padded

@@ -20,8 +20,8 @@ from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose, encode_vector3
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import VELOCITY_KEY, read
-from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.read import read
+from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
 from imutool.mcap_io.write import Series, chunks, write
 from imutool.mcap_io.writer import LogWriter
 from imutool.recording import Imu, Recording

@@ -9,11 +9,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.planted import simulate_samples
 
 from imutool import registry
 from imutool.errors import ConfigError, DataError
 from imutool.sensor import catalogue
-from imutool.sensor.effect import Effect, Stage, distort, simulate_samples
+from imutool.sensor.effect import Effect, Stage, distort
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import SLOW_S
 

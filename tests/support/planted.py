@@ -14,9 +14,9 @@ from imutool.diagnosis.estimation.whitening import WhitenedImu, Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
-from imutool.sensor.effect import Effect, simulate_samples
+from imutool.sensor.effect import Acting, Effect, SignalState, in_stage_order
 from imutool.sensor.made_up_flight import FlightSettings, trajectory
-from imutool.sensor.samples import IdealMotion
+from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
 RATE_HZ, DURATION_S = 100.0, 24.0
 START_NS = 1_700_000_000_000_000_000
@@ -79,6 +79,15 @@ def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
 def catalogue() -> tuple[Effect, ...]:
     """All that a fit can find without another channel of the log."""
     return tuple(one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in SHOWN_BY_SAMPLES)
+
+
+def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:
+    """Samples of a sensor with these effects at some stamps, applied in stage order."""
+    state = SignalState(motion, np.asarray(stamp_s, dtype=np.float64), stamp_s)
+    for effect, theta in in_stage_order(acting):
+        state = state.through(effect, theta)
+    samples: SensorSamples = state.samples()
+    return samples
 
 
 def ideal(felt: IdealMotion, chosen: Chosen = (), stamp_s: np.ndarray | None = None) -> np.ndarray:

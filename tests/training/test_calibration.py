@@ -14,9 +14,10 @@ from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
-from imutool.training.calibration import FOLDS, Calibration, calibrate, folded
-from imutool.training.normal_equations import prior_std
+from imutool.training.calibration import FOLDS, LINEAR, Calibration, calibrate, folded
+from imutool.training.normal_equations import design_effect, prior_std
 from imutool.training.segments import Pool
+from imutool.training.settings import SensorPrior
 from imutool.units import Sensor
 
 MakeRecording = Callable[..., Recording]
@@ -72,6 +73,11 @@ def found(
     return calibrate(pool, sensor, pool.gyro if sensor == "gyro" else true_gyro, names)
 
 
+def of_effects(names: Sequence[str], sensor: Sensor) -> list[tuple[str, str]]:
+    """Effect and parameter of each entry of theta."""
+    return [(form.name, parameter.name) for form in catalogue.trained(sensor, names) for parameter in form.parameters]
+
+
 def z_scores(calibration: Calibration, theta: np.ndarray) -> np.ndarray:
     z: np.ndarray = (calibration.theta.numpy() - theta) / calibration.covariance.diagonal().sqrt().numpy()
     return z
@@ -81,10 +87,11 @@ def z_scores(calibration: Calibration, theta: np.ndarray) -> np.ndarray:
 def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recording], sensor: Sensor, name: str) -> None:
     effects = catalogue.trained(sensor, [name])
     calibration = found(flights, sensor, effects)
-    assert calibration.effects == (name,)
-    assert list(calibration.gains) == [name]
+    assert set(calibration.effects) == {name, *LINEAR[sensor]}
+    assert next(iter(calibration.gains)) == name
     assert calibration.gains[name] > LEAST_GAIN.get(name, 0.3)
-    z = z_scores(calibration, planted_theta(effects))
+    planted = dict(zip(of_effects([name], sensor), planted_theta(effects), strict=True))
+    z = z_scores(calibration, np.array([planted.get(key, 0.0) for key in of_effects(calibration.effects, sensor)]))
     assert np.abs(z).max() < SURE, z
     assert calibration.unseen == ()
 
@@ -94,18 +101,22 @@ def test_a_clock_that_all_flights_share_is_found(perfect: MakeRecording, first: 
     """3 ms: logs that agree share it, though each may have a clock of its own."""
     effects = catalogue.trained("gyro", ["clock_offset"])
     calibration = found([perfect(first + k, **FLIGHT) for k in range(3)], "gyro", effects)
-    assert calibration.effects == ("clock_offset",)
+    assert next(iter(calibration.gains)) == "clock_offset"
+    assert set(calibration.effects) == {"clock_offset", *LINEAR["gyro"]}
     assert float(calibration.theta[0]) == pytest.approx(planted_theta(effects)[0], rel=0.05)
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 @pytest.mark.parametrize("first", OTHERS)
-def test_where_nothing_is_planted_nothing_is_found(perfect: MakeRecording, sensor: Sensor, first: int) -> None:
+def test_where_nothing_is_planted_scale_and_misalignment_are_near_zero_and_nothing_else_is_found(
+    perfect: MakeRecording, sensor: Sensor, first: int
+) -> None:
     calibration = found([perfect(first + k, **FLIGHT) for k in range(3)], sensor, ())
-    assert calibration.effects == ()
-    assert calibration.gains == {}
-    assert calibration.theta.shape == (0,)
-    assert calibration.covariance.shape == (0, 0)
+    assert calibration.effects == LINEAR[sensor]
+    assert max(calibration.gains.values()) < 0.06
+    prior = np.concatenate([prior_std(form) for form in catalogue.trained(sensor, LINEAR[sensor])])
+    assert np.abs(calibration.theta.numpy()).max() < 0.1 * prior.min()
+    assert np.abs(z_scores(calibration, np.zeros(9))).max() < SURE
 
 
 def test_effects_planted_together_are_told_apart(flights: list[Recording]) -> None:
@@ -138,18 +149,39 @@ def test_a_rest_bias_of_its_own_is_found_for_every_log(flights: list[Recording])
 
 def test_two_logs_are_cut_into_parts_that_predict_one_another(flights: list[Recording]) -> None:
     calibration = found(flights[:2], "gyro", catalogue.trained("gyro", ["gyro_scale"]))
-    assert calibration.effects == ("gyro_scale",)
+    assert next(iter(calibration.gains)) == "gyro_scale"
+    assert set(calibration.effects) == set(LINEAR["gyro"])
     assert calibration.rest.shape == (2, 3)
     pool = Pool.of(flights[:2])
-    for part, used in (("train", ~pool.held_out), ("held_out", pool.held_out), ("all", pool.held_out | True)):
-        parts = folded(pool, part)  # type: ignore[arg-type]  # one of three words
-        assert len(parts.names) == 2 * FOLDS
-        assert torch.equal(parts.log // FOLDS, pool.log)
-        assert bool((torch.diff(parts.log) >= 0).all())
-        counts = torch.bincount(parts.log[used], minlength=2 * FOLDS)
-        assert int(counts.max() - counts.min()) <= 1, part
+    parts = folded(pool)
+    assert len(parts.names) == 2 * FOLDS
+    assert torch.equal(parts.log // FOLDS, pool.log)
+    assert bool((torch.diff(parts.log) >= 0).all())
+    counts = torch.bincount(parts.log[~pool.held_out], minlength=2 * FOLDS)
+    assert int(counts.max() - counts.min()) <= 1
     whole = Pool.of(flights)
-    assert folded(whole, "train") is whole
+    assert folded(whole) is whole
+
+
+def test_a_minute_keeps_what_it_does_not_show_near_what_sensors_are_like(flights: list[Recording]) -> None:
+    """Turning about one axis shows its scale; the other axes read noise alone, and their scale stays within the prior."""
+    effects = catalogue.trained("gyro", LINEAR["gyro"])
+    theta, rows = planted_theta(effects), of_effects(LINEAR["gyro"], "gyro")
+    pool = Pool.of([measured(planar(flights[0]), effects, theta, 0)])
+    for sensors in (SensorPrior(), SensorPrior(gyro_scale=0.01)):
+        found_theta = calibrate(pool, "gyro", pool.gyro, LINEAR["gyro"], "all", sensors=sensors).theta.numpy()
+        for axis in "xy":
+            assert abs(found_theta[rows.index(("gyro_scale", axis))]) < 2.0 * sensors.gyro_scale
+        z = rows.index(("gyro_scale", "z"))
+        assert found_theta[z] == pytest.approx(theta[z], rel=0.05)
+
+
+def test_logs_of_one_setup_share_errors_so_that_each_more_of_them_says_less(flights: list[Recording]) -> None:
+    one, three = Pool.of(flights[:1]), Pool.of(flights)
+    assert design_effect(one) == 1.0
+    assert 1.0 < design_effect(three) < 3.0
+    std = [calibrate(pool, "gyro", pool.gyro, LINEAR["gyro"], "all").covariance.diagonal().sqrt() for pool in (one, three)]
+    assert bool((std[1] < std[0]).all())
 
 
 def planar(recording: Recording) -> Recording:
@@ -173,10 +205,8 @@ def test_what_a_planar_motion_cannot_show_stays_at_its_prior_and_is_named(flight
     calibration = found([planar(flight) for flight in flights], "gyro", effects, ["gyro_misalignment"])
     never = {f"gyro_misalignment.{pair}" for pair in ("xy", "yx")}
     assert never <= set(calibration.unseen) <= never | {f"gyro_misalignment.{pair}" for pair in ("zx", "zy")}
-    theta, plausible = planted_theta(effects), effects[0].plausible
-    for parameter, value, planted, width in zip(
-        effects[0].parameters, calibration.theta.numpy(), theta, plausible, strict=True
-    ):
+    theta, widths = planted_theta(effects), prior_std(effects[0])
+    for parameter, value, planted, width in zip(effects[0].parameters, calibration.theta.numpy(), theta, widths, strict=True):
         if parameter.name in ("xz", "yz"):  # what turning about z adds to the others
             assert abs(value - planted) < 0.1 * abs(planted), parameter.name
         else:

@@ -35,7 +35,7 @@ def problem(data: Data, theta: torch.Tensor, own: torch.Tensor, free: int = OWN)
         g.append(J.T @ e)
         c.append(e @ e)
     equations = Equations(torch.stack(H), torch.stack(g), torch.stack(c))
-    return Problem(theta, own, PRIOR, OWN_PRIOR, free, equations, equations)
+    return Problem(theta, own, PRIOR, OWN_PRIOR, 1.0, free, equations, equations)
 
 
 def at_once(data: Data, columns: list[int], logs: list[int]) -> tuple[torch.Tensor, torch.Tensor]:

@@ -21,10 +21,10 @@ from imutool.errors import ConfigError, DataError, LogError, ModelError, Numeric
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
-from imutool.training.calibration import config_of, helps, settings_for
+from imutool.training.calibration import config_of, settings_for
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objective import WindowEndObjective
-from imutool.training.run import checkpoint_path, train
+from imutool.training.run import checkpoint_path, helps, train
 from imutool.training.settings import settings_of
 from imutool.units import Sensor
 

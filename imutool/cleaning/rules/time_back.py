@@ -143,8 +143,16 @@ class NonMonotonic(Rule):
         if self._other.count:
             share = self._other.count / whole.messages
             what = "samples from before or after the clock was set, apart from the rest by more than a pause explains"
+            many = share > whole.settings.max_invalid_share
             yield Finding(
-                "time_back", "error", what, **self._other.where(), values={"share": share}, action="dropped", confidence=0.8
+                "time_back",
+                "error",
+                what,
+                **self._other.where(),
+                values={"share": share},
+                action="dropped",
+                confidence=0.8,
+                distrust="its clock was set; imutool debias without --clean keeps each stretch" if many else "",
             )
 
 

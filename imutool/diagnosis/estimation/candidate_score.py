@@ -52,18 +52,23 @@ class Selection:
 
 
 class _Axis(NamedTuple):
-    """White rows of one axis of a log that are fitted, zero elsewhere, orthogonal to the bias."""
+    """White rows of one axis of a log, at the samples that are fitted alone, orthogonal to the bias."""
 
-    counts: Float64[np.ndarray, " m"]  # 1 for rows that are fitted
-    bias: Float64[np.ndarray, " m"]  # a constant behind the filter, of length 1
+    fitted: Int64[np.ndarray, " n"]
+    bias: Float64[np.ndarray, " n"]  # a constant behind the filter, of length 1
     where: Int64[np.ndarray, " q"]
-    A: Float64[np.ndarray, "q m"]
-    r: Float64[np.ndarray, " m"]
+    A: Float[np.ndarray, "q n"]
+    r: Float[np.ndarray, " n"]
 
-    def free(self, x: Float64[np.ndarray, "*k m"]) -> Float64[np.ndarray, "*k m"]:
+    def free(self, x: Float64[np.ndarray, "*k m"]) -> Float64[np.ndarray, "*k n"]:
         """Rows less their projection on the bias."""
-        x = x * self.counts
-        return np.asarray(x - (x @ self.bias)[..., None] * self.bias)
+        x = x.take(self.fitted, axis=-1)
+        x -= (x @ self.bias)[..., None] * self.bias
+        return x
+
+    def short(self) -> _Axis:
+        """The same in half of the memory."""
+        return self._replace(A=self.A.astype(np.float32), r=self.r.astype(np.float32))
 
 
 class _Linear(NamedTuple):
@@ -89,18 +94,18 @@ class CandidateScore:
         q = sum(len(theta) for _, theta in now.chosen)
         self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
         for number, (log, forward) in enumerate(zip(logs, now.passes, strict=True)):
-            counts, residual = log.rows("fitted").astype(float), log.residual(forward.expected)
-            everything = np.ones(len(counts), bool)
+            mask, residual = log.rows("fitted"), log.residual(forward.expected)
+            fitted = np.flatnonzero(mask)
             for k in range(log.pair.columns):
-                bias = log.constants[:, k] * counts
-                where, A = now.jacobians.on_axis(number, k, everything)
-                axis = _Axis(counts, direction(bias), where, A, residual[:, k])
+                where, A = now.jacobians.on_axis(number, k, np.ones(len(mask), bool))
+                axis = _Axis(fitted, direction(log.constants[fitted, k]), where, A, residual[:, k])
                 axis = axis._replace(A=axis.free(A), r=axis.free(residual[:, k]))
                 self.axes.append(axis)
                 self.N[np.ix_(where, where)] += axis.A @ axis.A.T
                 self.g[where] += axis.A @ axis.r
                 self.total += float(axis.r @ axis.r)
         self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
+        self.short = [axis.short() for axis in self.axes]
 
     def linear(self, effect: Effect, start: Theta) -> _Linear:
         """Derivatives of a candidate beside the fit, and what its start adds."""
@@ -110,9 +115,10 @@ class CandidateScore:
             with_it = forward if effect.linear else ForwardPass(log.pair, (*self.now.chosen, (effect, start)), forward)
             B, added = effect_jacobian(log.whiten, with_it, effect), with_it.added(forward)
             for column in range(log.pair.columns):
-                axis, js = self.axes[log.pair.columns * k + column], np.flatnonzero(B.on[column] & moves)
-                if len(js) or column in added:
-                    b, more = axis.free(B.white[column, js]), None
+                axis, on = self.axes[log.pair.columns * k + column], B.on(column)
+                on = on[moves[B.parameters[on]]]
+                if len(on) or column in added:
+                    js, b, more = B.parameters[on], axis.free(B.rows[on]), None
                     N[np.ix_(js, js)] += b @ b.T
                     if column in added:
                         more = axis.free(log.whiten.rows(added[column][None], np.array([column]))[0])
@@ -134,8 +140,9 @@ class CandidateScore:
                 total += float(r @ r - axis.r @ axis.r)
                 g_a[axis.where] += axis.A @ (r - axis.r)
             if len(js):
-                N_ab[np.ix_(axis.where, js)] += axis.A @ b.T
-                g_b[js] += b @ r
+                like = self.short[k] if b.dtype == np.float32 else axis
+                N_ab[np.ix_(axis.where, js)] += like.A @ b.T
+                g_b[js] += b @ (like.r if added is None else r)
         _, std = priors(((effect, linear.start),), self.now.settings)
         solved = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
         S, g = linear.N + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]

@@ -156,6 +156,7 @@ class _Problem:
 
     def __init__(self, logs: Sequence[WhitenedLog], begun: Chosen, part: str) -> None:
         self.logs, self.masks = logs, [log.rows(part) for log in logs]
+        self.constants = [np.stack([x[mask] for x in log.constants.T]) for log, mask in zip(logs, self.masks, strict=True)]
         self.settings = logs[0].pair.settings.fit
         self.mean, self.std = priors(begun, self.settings)
 
@@ -166,9 +167,11 @@ class _Problem:
         total = float((((free_of(chosen) - self.mean) / self.std) ** 2).sum()) if len(self.mean) else 0.0
         bias = np.zeros((len(self.logs), self.logs[0].pair.columns))
         for k, (log, residual, mask) in enumerate(zip(self.logs, residuals, self.masks, strict=True)):
-            constant, r, prior = log.constants[mask], residual[mask], log.pair.bias_std
-            bias[k] = (constant * r).sum(0) / ((constant * constant).sum(0) + 1.0 / prior**2)
-            total += float(((r - constant * bias[k]) ** 2).sum() + ((bias[k] / prior) ** 2).sum())
+            for axis, (constant, prior) in enumerate(zip(self.constants[k], log.pair.bias_std, strict=True)):
+                r = residual[:, axis][mask]
+                bias[k, axis] = b = constant @ r / (constant @ constant + 1.0 / prior**2)
+                r -= constant * b
+                total += float(r @ r + (b / prior) ** 2)
         return _State(chosen, passes, residuals, bias, total)
 
     def step(self, jacobians: Jacobians, now: _State) -> Theta:
@@ -191,11 +194,10 @@ class _Problem:
     def as_predicted(self, jacobians: Jacobians, before: _State, after: _State, step: Theta) -> bool:
         """Whether a step changed the residuals as the Jacobians predict, so that they are kept."""
         missed = length = 0.0
-        for k, (log, mask) in enumerate(zip(self.logs, self.masks, strict=True)):
-            change, constant = (before.residuals[k] - after.residuals[k])[mask], log.constants[mask]
-            for axis in range(log.pair.columns):
-                predicted, bias = jacobians.along(k, axis, step, mask), direction(constant[:, axis])
-                off = change[:, axis] - predicted
+        for k, mask in enumerate(self.masks):
+            for axis, constant in enumerate(self.constants[k]):
+                predicted, bias = jacobians.along(k, axis, step, mask), direction(constant)
+                off = (before.residuals[k][:, axis] - after.residuals[k][:, axis])[mask] - predicted
                 missed += float(off @ off - (off @ bias) ** 2)
                 length += float(predicted @ predicted - (predicted @ bias) ** 2)
         return missed <= self.settings.jacobian_error**2 * max(length, 1.0)
@@ -289,11 +291,10 @@ def _normal(
     for k, (log, mask) in enumerate(zip(problem.logs, problem.masks, strict=True)):
         for axis in range(log.pair.columns):
             where, A = jacobians.on_axis(k, axis, mask)
-            constant, at = log.constants[mask, axis], p + log.pair.columns * k + axis
+            constant, at = problem.constants[k][axis], p + log.pair.columns * k + axis
             N[np.ix_(where, where)] += A @ A.T
-            N[where, at] += A @ constant
-            N[at, where] += A @ constant
-            N[at, at] += constant @ constant + 1.0 / log.pair.bias_std[axis] ** 2
+            N[where, at] = N[at, where] = A @ constant
+            N[at, at] = constant @ constant + 1.0 / log.pair.bias_std[axis] ** 2
             if residuals is not None:
-                g[where] += A @ (residuals[k][mask, axis] - constant * bias[k, axis])
+                g[where] += A @ (residuals[k][:, axis][mask] - constant * bias[k, axis])
     return N, g

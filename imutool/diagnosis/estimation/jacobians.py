@@ -65,15 +65,14 @@ class ForwardPass:
         x, before = free(effect, theta), self._states[place]
         for j, parameter in enumerate(effect.parameters):
             h = step_of(parameter)
-            moved = x.copy()
-            moved[j] += h
-            state = before.through(effect, bound(effect, moved))
+            only_j = np.arange(len(x)) == j  # the others stay to the last bit: their rounding would look like a derivative
+            state = before.through(effect, np.where(only_j, bound(effect, x + h), theta))
             for other, values in behind:
                 state = state.through(other, values)
             for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
                 if then is not now:
-                    rows = np.subtract(then.T, now.T, order="C") / h
-                    yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())
+                    rows = np.subtract(then.T, now.T, order="C")
+                    yield from ((first + k, j, row / h) for k, row in enumerate(rows) if row.any())
 
 
 def _shared(a: list[tuple[Effect, Theta]], b: list[tuple[Effect, Theta]]) -> int:
@@ -109,21 +108,28 @@ def step_of(parameter: Parameter) -> float:
 
 
 class EffectJacobian(NamedTuple):
-    """Jacobian of one effect on one log, white, by axis and parameter; `on` marks nonzero rows."""
+    """Nonzero white rows of the Jacobian of one effect on one log.
 
-    white: Float64[np.ndarray, "k p n"]
-    on: Bool[np.ndarray, "k p"]
+    Each has its axis and its parameter.
+    """
+
+    rows: Float64[np.ndarray, "r n"]
+    axes: Int64[np.ndarray, " r"]
+    parameters: Int64[np.ndarray, " r"]
+    width: int  # the number of the effect's parameters
+
+    def on(self, axis: int) -> Int64[np.ndarray, " q"]:
+        """Rows of an axis, in the order of the parameters."""
+        return np.asarray(np.flatnonzero(self.axes == axis))
 
 
 def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect) -> EffectJacobian:
     """Jacobian of an effect in a forward pass, or of a linear one outside it."""
-    shape = forward.pair.columns, len(effect.parameters)
-    white, on = np.zeros((*shape, len(range(0, len(forward.pair.stamp_s), whiten.every)))), np.zeros(shape, bool)
     entries = list(forward.derivatives(effect))
-    if entries:
-        axes, js = np.array([axis for axis, _, _ in entries]), np.array([j for _, j, _ in entries])
-        white[axes, js], on[axes, js] = whiten.rows(np.stack([row for _, _, row in entries]), axes), True
-    return EffectJacobian(white, on)
+    axes, js = (np.array([entry[k] for entry in entries], np.int64) for k in (0, 1))
+    width, length = len(effect.parameters), len(forward.pair.stamp_s)
+    rows = np.stack([row for _, _, row in entries]) if entries else np.zeros((0, length))
+    return EffectJacobian(whiten.rows(rows, axes), axes, js, width)
 
 
 class Jacobians:
@@ -155,10 +161,10 @@ class Jacobians:
         where, rows, first = [np.zeros(0, np.int64)], [], 0
         for jacobians in self._by_effect.values():
             jacobian = jacobians[log]
-            js = np.flatnonzero(jacobian.on[axis])
-            where.append(first + js)
-            rows += [jacobian.white[axis, j][mask] for j in js]
-            first += jacobian.white.shape[1]
+            on = jacobian.on(axis)
+            where.append(first + jacobian.parameters[on])
+            rows += [jacobian.rows[k][mask] for k in on]
+            first += jacobian.width
         return np.concatenate(where), np.stack(rows) if rows else np.zeros((0, int(mask.sum())))
 
     def along(self, log: int, axis: int, step: Theta, mask: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:

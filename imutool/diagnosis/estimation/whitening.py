@@ -89,10 +89,8 @@ class Whitener:
         slow = np.ascontiguousarray(x) if self.band is None else self.band.rows(x)
         taps = (self.filters / self.std[:, None])[axes]
         out = np.empty_like(slow)
-        for white, of, row in zip(out, taps, slow, strict=True):  # while a row lies in the cache: lfilter takes twice as long
-            np.multiply(row, of[0], out=white)
-            for lag in range(1, len(of)):
-                white[lag:] += of[lag] * row[:-lag]
+        for white, of, row in zip(out, taps, slow, strict=True):  # numpy's loop for few taps takes half the time of lfilter
+            white[:] = np.convolve(row, of)[: len(row)]
         if self.counts is not None:
             out[~self.counts.T[axes]] = 0.0
         return out
@@ -143,7 +141,8 @@ class WhitenedLog:
 
     def residual(self, expected: Float64[np.ndarray, "m k"]) -> Float64[np.ndarray, "n k"]:
         """White residuals, bias included."""
-        return self.whiten(self.pair.real - expected)
+        rows = np.subtract(self.pair.real.T, expected.T, order="C")
+        return np.asarray(self.whiten.rows(rows, np.arange(len(rows))).T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, each_axis, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
@@ -15,9 +15,10 @@ START_TAU_S = (10.0, 30.0, 100.0)
 
 def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
     """Warm-up of either sensor: A, then tau (s)."""
+    course_of = Remembered(_course)
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-        added = _course(samples.stamp_s, float(theta[3]))[:, None] * theta[:3]
+        added = course_of(samples.stamp_s, float(theta[3]))[:, None] * theta[:3]
         return samples.with_added(sensor, added)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex128, Float64
@@ -34,21 +36,41 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     if math.isinf(cutoff_hz[0]):
         return motion
     a = 2.0 * math.pi * float(cutoff_hz[0]) / motion.rate_hz  # rad a sample
-    denominator = np.array([1.0, -math.exp(-a)])
-    both = filtered(np.concatenate([motion.gyro, motion.accel, motion.alpha], axis=1), a / (1j * OMEGA + a), denominator)
+    both = filtered(np.concatenate([motion.gyro, motion.accel, motion.alpha], axis=1), _first_order(a))
     return replace(motion, gyro=both[:, :3], accel=both[:, 3:6], alpha=both[:, 6:])
 
 
-def filtered(
-    x: Float64[np.ndarray, "n k"], gain: Complex128[np.ndarray, " w"], denominator: Float64[np.ndarray, " d"]
-) -> Float64[np.ndarray, "n k"]:
-    """Columns behind a filter of gain 1 at rest, held constant beyond the ends.
+class Filter(NamedTuple):
+    """Filter of samples N / D in powers of 1/z.
 
-    gain: H at the frequencies `OMEGA`; denominator: D in powers of 1/z.
+    The first tap of N is for the sample `AHEAD` samples later.
     """
-    taps = _taps(gain * (WAVES[:, AHEAD : AHEAD + len(denominator)] @ denominator))
+
+    taps: Float64[np.ndarray, " _"]
+    denominator: Float64[np.ndarray, " d"]
+
+    @classmethod
+    def of(cls, gain: Complex128[np.ndarray, " w"], denominator: Float64[np.ndarray, " d"]) -> Filter:
+        """Filter of gain H at the frequencies `OMEGA`, with these poles.
+
+        To be kept: two designs differ in the last bits, and a derivative would take that for an effect.
+        """
+        return cls(_taps(gain * (WAVES[:, AHEAD : AHEAD + len(denominator)] @ denominator)), denominator)
+
+
+@lru_cache(maxsize=64)
+def _first_order(a: float) -> Filter:
+    return Filter.of(a / (1j * OMEGA + a), np.array([1.0, -math.exp(-a)]))
+
+
+def filtered(x: Float64[np.ndarray, "n k"], by: Filter) -> Float64[np.ndarray, "n k"]:
+    """Columns behind a filter of gain 1 at rest, held constant beyond the ends."""
     from_first = np.concatenate([x, np.repeat(x[-1:], AHEAD, axis=0)]) - x[0]
-    y: Float64[np.ndarray, "n k"] = lfilter(taps, denominator, from_first, axis=0)[AHEAD:] + x[0]
+    driven, half = np.zeros_like(from_first), len(by.taps) // 2
+    for out, column in zip(driven.T, np.ascontiguousarray(from_first.T), strict=True):
+        for first, few in ((0, by.taps[:half]), (half, by.taps[half:])):  # numpy is quick for up to 11 taps
+            out[first:] += np.convolve(column, few)[: len(column) - first]
+    y: Float64[np.ndarray, "n k"] = lfilter([1.0], by.denominator, driven, axis=0)[AHEAD:] + x[0]
     return y
 
 

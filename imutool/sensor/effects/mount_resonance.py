@@ -5,11 +5,12 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, starts_at
-from imutool.sensor.effects.low_pass import OMEGA, filtered
+from imutool.sensor.effects.low_pass import OMEGA, Filter, filtered
 from imutool.sensor.samples import IdealMotion
 
 START_HZ = (4.0, 8.0, 15.0, 30.0, 50.0)
@@ -23,14 +24,18 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     share = theta[2:]
     if not share.any():
         return motion
-    zeta = float(theta[1])
-    a = 2.0 * math.pi * float(theta[0]) / motion.rate_hz  # rad a sample
+    by = _spring(2.0 * math.pi * float(theta[0]) / motion.rate_hz, float(theta[1]))
+    return replace(motion, accel=motion.accel + share * (filtered(motion.accel, by) - motion.accel))
+
+
+@lru_cache(maxsize=64)
+def _spring(a: float, zeta: float) -> Filter:
+    """H for w0 of `a` rad a sample."""
     pole = cmath.exp(a * (-zeta + cmath.sqrt(zeta**2 - 1.0)))
     other = cmath.exp(a * (-zeta - cmath.sqrt(zeta**2 - 1.0)))
-    denominator = np.array([1.0, -(pole + other).real, (pole * other).real])
     s = 1j * OMEGA
-    through = (2.0 * zeta * a * s + a**2) / (s**2 + 2.0 * zeta * a * s + a**2)
-    return replace(motion, accel=motion.accel + share * (filtered(motion.accel, through, denominator) - motion.accel))
+    gain = (2.0 * zeta * a * s + a**2) / (s**2 + 2.0 * zeta * a * s + a**2)
+    return Filter.of(gain, np.array([1.0, -(pole + other).real, (pole * other).real]))
 
 
 EFFECT = Effect(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from imutool.inertial.stationary import white_noise
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
+from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 
 LEAST_HZ = 3.0  # slower is motion, drift or another effect, and no vibration
@@ -22,9 +22,12 @@ def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "
     return np.stack([np.sin(phase), np.cos(phase)], axis=1)
 
 
+waves_of = Remembered(_waves)
+
+
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
-    waves = _waves(motion.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
+    waves = waves_of(motion.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
     return replace(motion, accel=motion.accel + waves[:, :3], gyro=motion.gyro + waves[:, 3:])
 
 

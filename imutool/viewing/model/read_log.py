@@ -16,7 +16,7 @@ from imutool.location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import read_recording
+from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY
@@ -101,8 +101,8 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
         biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)
-        rest = read_recording(
-            log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
+        rest = longest_recording(
+            read_recordings(log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused)
         )
         metadata = log.metadata_records()
         if isinstance(log, RecoveredLog):

@@ -143,13 +143,20 @@ def build(
         name=recording.name,
         start_ns=start_ns,
         end_ns=end_ns,
-        truth=None if truth is None else truth.between(start_ns, end_ns),
+        truth=None if truth is None else _within(truth, start_ns, end_ns),
         true_bias=_true_bias(recording),
         traces=traces,
         notes=(*of_paths, *_decimation_note(imu), *notes, *of_events),
         alignment=align,
         events=shown,
     )
+
+
+def _within(truth: Poses, start_ns: int, end_ns: int) -> Poses:
+    """Poses in the time of the samples; where none is, as with few samples left, the two around it."""
+    first, last = np.searchsorted(truth.t_ns, [start_ns, end_ns + 1])
+    rows: Poses = truth.rows(slice(int(first), int(last)) if last > first else slice(max(0, int(first) - 1), int(last) + 1))
+    return rows
 
 
 def _true_bias(recording: Recording) -> Mapping[str, Scalars]:

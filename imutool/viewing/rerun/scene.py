@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import layout
-from imutool.viewing.rerun import source as other_topics
+from imutool.viewing.rerun import layout, other_topics
 from imutool.viewing.rerun.entities import errors, paths, report, signals
 from imutool.viewing.rerun.plots import diagonal_m
 from imutool.viewing.rerun.sdk import Scope, recording_name, require_rerun, rrd_bytes, scopes, stream_of_logs

@@ -10,7 +10,7 @@ import numpy as np
 from imutool.units import AXES, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
-from imutool.viewing.rerun import sdk, source
+from imutool.viewing.rerun import other_topics, sdk
 from imutool.viewing.rerun.entities import errors, signals
 from imutool.viewing.rerun.entities.styles import BACKGROUND, color_name, color_of
 from imutool.viewing.rerun.plots import error_axis_limit, plot, signed_range, unsigned_range, whole_time_axis
@@ -236,7 +236,7 @@ def _report(scope: Scope) -> View:
 def _cameras(data: RunData, scope: Scope) -> View | None:
     import rerun.blueprint as rrb
 
-    cameras = source.plan_import(data, scope).cameras
+    cameras = other_topics.plan_import(data, scope).cameras
     shown = [rrb.Spatial2DView(origin=camera, name=camera.removeprefix("/")) for camera in cameras]
     return rrb.Grid(*shown, name="Cameras") if shown else None
 

@@ -158,15 +158,18 @@ class _Session:
 
     def _count(self, found: Sample) -> None:
         step_ns = found.stamp_ns - self._last_ns
-        if not self._samples:
-            self._begin_ns = found.stamp_ns
+        usual = not self._samples or 0 < step_ns <= GAP_S * 1e9
+        jumps = [] if usual else clock_jumps(np.array([self._last_ns, found.stamp_ns]))
+        if not self._samples or jumps:
+            self._begin_ns += found.stamp_ns - self._last_ns  # a jump takes no time
+            self._gaps += len(jumps)
+            for warning in jump_warnings(jumps):
+                logger.warning("%s", warning)
         elif step_ns <= 0:
             self._out_of_order += 1
         elif step_ns > GAP_S * 1e9:
             self._gaps += 1
-            for warning in jump_warnings(clock_jumps(np.array([self._last_ns, found.stamp_ns]))):
-                logger.warning("%s", warning)
-        self._last_ns = max(self._last_ns, found.stamp_ns)
+        self._last_ns = found.stamp_ns if jumps else max(self._last_ns, found.stamp_ns)
         self._samples += 1
 
     def _start(self, batches: _Batches) -> None:

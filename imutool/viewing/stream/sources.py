@@ -15,8 +15,10 @@ from urllib.parse import urlsplit
 
 import msgspec
 
+from imutool.cleaning import raw_batches
 from imutool.errors import ConfigError, LogError, not_installed
 from imutool.location import to_location
+from imutool.recording.columns import MOST_GAP_S
 from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
 EXPECTED = "a log, stdin, udp://HOST:PORT, zenoh://[HOST:PORT]/KEY or rosbridge://HOST:PORT/TOPIC"
@@ -59,7 +61,7 @@ def _source(name: str, malformed: Malformed, imu: str | None, speed: float) -> S
 
 
 def _replay(name: str, imu: str | None, speed: float) -> Samples:
-    """Samples of a log at its own speed, times `speed`."""
+    """Samples of a log at its own speed, times `speed`; a jump of its clock takes no time."""
     from imutool.mcap_io.log import Log
 
     log = Log(to_location(name))
@@ -71,13 +73,13 @@ def _replay(name: str, imu: str | None, speed: float) -> Samples:
     def samples() -> Generator[Sample | None]:
         with log:
             yield None
-            began, first_ns = time.perf_counter(), None
-            for batch in log.imu_batches(imu or topics[0]):
+            due_s, last_ns = time.perf_counter(), None
+            for batch in raw_batches(log, imu or topics[0]):
                 for stamp_ns, gyro, accel in zip(
                     batch.stamp_ns.tolist(), batch.gyro.tolist(), batch.accel.tolist(), strict=True
                 ):
-                    first_ns = stamp_ns if first_ns is None else first_ns
-                    due_s = began + (stamp_ns - first_ns) * 1e-9 / speed
+                    step_s = 0.0 if last_ns is None else (stamp_ns - last_ns) * 1e-9
+                    due_s, last_ns = due_s + (step_s if 0.0 < step_s <= MOST_GAP_S else 0.0) / speed, stamp_ns
                     if (wait_s := due_s - time.perf_counter()) > 0.0:
                         time.sleep(wait_s)
                     yield Sample(stamp_ns, tuple(gyro), tuple(accel), due_s)

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import firwin
 from support import planted
+from support.planted import simulate_samples
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, step_of
 from imutool.diagnosis.estimation.whitening import Band, Whitener
-from imutool.sensor.effect import Effect, Stage, Theta, simulate_samples
+from imutool.sensor.effect import Effect, Stage, Theta
 
 ROUNDED = 1e-6  # of the largest derivative: differences of numbers to sixteen digits, over steps of a thousandth
 AROUND = {  # effects of every stage, so that each is asked with others before and behind it
@@ -69,8 +70,18 @@ def test_the_jacobian_of_a_linear_effect_needs_no_pass_through_it(pair: Pair, ph
     noise = Whitener(np.ones((6, 1)), planted.NOISE)
     beside = effect_jacobian(noise, ForwardPass(pair, others), physics)
     there = effect_jacobian(noise, ForwardPass(pair, (*others, (physics, physics.null_value.astype(float)))), physics)
-    np.testing.assert_array_equal(beside.on, there.on)
-    np.testing.assert_allclose(beside.white, there.white, rtol=1e-12)
+    np.testing.assert_array_equal(beside.axes, there.axes)
+    np.testing.assert_array_equal(beside.parameters, there.parameters)
+    np.testing.assert_allclose(beside.rows, there.rows, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mount_resonance", "gyro_bias_drift", "accel_bias_drift", "vibration"])
+def test_an_axis_that_a_parameter_leaves_alone_has_no_row_of_rounding(pair: Pair, name: str) -> None:
+    physics = next(one for one in planted.catalogue() if one.name == name)
+    theta = 0.37 * physics.plausible
+    slope = effect_jacobian(Whitener(np.ones((6, 1)), np.ones(6)), ForwardPass(pair, ((physics, theta),)), physics)
+    of_one_axis = [j for j, parameter in enumerate(physics.parameters) if not parameter.positive]
+    assert [int((slope.parameters == j).sum()) for j in of_one_axis] == [1] * len(of_one_axis)
 
 
 def test_a_pass_continued_from_another_reads_what_a_new_one_reads(pair: Pair) -> None:
@@ -97,8 +108,11 @@ def test_a_step_along_jacobians_is_the_sum_of_their_rows(pair: Pair, band: Band 
     assert slopes.fresh
     rows = np.ones(len(pair.stamp_s[:: whiten.every]), bool)
     step = np.random.default_rng(3).normal(size=sum(len(theta) for _, theta in chosen))
-    blocks = [effect_jacobian(whiten, ForwardPass(pair, chosen), physics).white for physics, _ in chosen]
-    whole = np.concatenate(blocks, axis=1)
+    whole, first = np.zeros((6, len(step), len(rows))), 0
+    for physics, _ in chosen:
+        slope = effect_jacobian(whiten, ForwardPass(pair, chosen), physics)
+        whole[slope.axes, first + slope.parameters] = slope.rows
+        first += slope.width
     for axis in range(6):
         np.testing.assert_allclose(slopes.along(0, axis, step, rows), step @ whole[axis], atol=1e-9 * np.abs(whole).max())
 

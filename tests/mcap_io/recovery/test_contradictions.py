@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from support import log_damage
 
 from imutool.errors import LogError
@@ -177,6 +178,27 @@ def test_a_chunk_of_zeros_is_refused_before_it_is_followed(tmp_path: Path) -> No
     path.write_bytes(MAGIC + HEAD.pack(1, 8) + bytes(8) + HEAD.pack(6, len(body)) + body)
     with RecoveredLog(path) as log:
         assert "opcode 0" in log.losses.entries[0].reason
+
+
+@pytest.mark.parametrize("field", ["offset", "packed size"])
+def test_a_summary_with_wrong_places_of_chunks_is_never_copied(
+    foreign: Foreign, flight: Messages, tmp_path: Path, field: str
+) -> None:
+    """The log itself is intact, and everybody else goes by its summary."""
+    path = foreign(flight[:200], chunk_size=3_000)
+    raw = bytearray(path.read_bytes())
+    start, position = struct.unpack_from("<Q", raw, len(raw) - 28)[0], 0
+    position = start
+    while raw[position] != Opcode.FOOTER:
+        length = struct.unpack_from("<Q", raw, position + 1)[0]
+        if raw[position] == Opcode.CHUNK_INDEX:
+            at = position + 9 + (16 if field == "offset" else length - 16)
+            raw[at : at + 8] = (int.from_bytes(raw[at : at + 8], "little") + 7).to_bytes(8, "little")
+        position += 9 + length
+    raw[-12:-8] = zlib.crc32(bytes(raw[start:-12])).to_bytes(4, "little")
+    path.write_bytes(bytes(raw))
+    repair(path, tmp_path / "out.mcap")
+    assert Counter(by_mcap(tmp_path / "out.mcap")) == Counter((m[0], *m[2:]) for m in flight[:200])
 
 
 def test_the_data_section_must_end_where_the_summary_begins(foreign: Foreign, flight: Messages) -> None:

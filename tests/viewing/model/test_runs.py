@@ -26,7 +26,8 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model.events import FINDINGS
-from imutool.viewing.model.runs import MAX_ENTRIES, MAX_VALUE_LENGTH, load, provenance
+from imutool.viewing.model.run_data import Run
+from imutool.viewing.model.runs import MAX_ENTRIES, MAX_VALUE_LENGTH, build, load, provenance
 
 LAST_BITS = 1e-12  # rad/s and m/s²: the bias in blocks and in one go
 
@@ -254,3 +255,16 @@ def test_what_others_wrote_into_a_log_is_bounded(made: Recording, log: Path) -> 
     assert max(map(len, [*told, *told.values()])) <= MAX_VALUE_LENGTH
     assert f"{1000 - MAX_ENTRIES} entries" in told.values()
     assert not any(key.startswith("other") for key in told)
+
+
+def test_of_samples_between_two_poses_the_poses_around_them_are_shown(made: Recording) -> None:
+    """A log of which next to nothing is measured: the pictures had no point of the truth, and ended with a ValueError."""
+    start_ns, end_ns = made.truth.t_ns[1000], made.truth.t_ns[1003]
+    imu = made.imu.between(int(start_ns) + 1, int(end_ns) - 1)
+    truth = made.truth.rows(np.isin(np.arange(len(made.truth)), (998, 999, 1000, 1003, 1004, 1005)))
+    data = build(
+        replace(made, imu=imu, truths={next(iter(made.truths)): truth}),
+        [Run("raw", imu, np.zeros((len(imu), 3)), np.zeros((len(imu), 3)))],
+    )
+    assert data.truth is not None
+    assert data.truth.t_ns.tolist() == [start_ns, end_ns]

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from support import saved_rrd
 
-from imutool.cleaning.cleaner import rows
+from imutool.cleaning import rows
 from imutool.debiasing import BlockCallback, DebiasedBlock, debias
 from imutool.errors import ConfigError
 from imutool.mcap_io.write import write

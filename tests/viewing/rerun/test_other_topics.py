@@ -17,7 +17,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.runs import load
-from imutool.viewing.rerun import layout, source
+from imutool.viewing.rerun import layout, other_topics
 
 CAMERA = "/cam0/image_raw/compressed"
 BLOB = "EncodedImage:blob"
@@ -129,7 +129,7 @@ def test_without_the_source_nothing_of_it_is_there(data: RunData, tmp_path: Path
 def test_a_log_too_large_for_a_viewer_is_left_out_and_said(
     data: RunData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(source, "SOURCE_LIMIT", 1000)
+    monkeypatch.setattr(other_topics, "SOURCE_LIMIT", 1000)
     found = saved_rrd.read(saved_rrd.written([data], tmp_path / "large.rrd"))
     assert CAMERA not in found
     assert "The log's other topics are not shown" in report(found)
@@ -164,9 +164,9 @@ def test_of_a_damaged_log_what_lies_before_the_damage_is_shown(data: RunData, re
 def test_another_clock_in_the_headers_is_not_taken_for_the_imus(data: RunData) -> None:
     log_ns = np.arange(data.start_ns, data.start_ns + 10 * TENTH, TENTH, dtype=np.int64)
     shifted = np.arange(10, dtype=np.int64) * TENTH  # since boot, say
-    np.testing.assert_array_equal(source.elapsed_ns(shifted, log_ns, data), log_ns - data.start_ns)
-    np.testing.assert_array_equal(source.elapsed_ns(log_ns + 3, log_ns, data), log_ns + 3 - data.start_ns)
-    np.testing.assert_array_equal(source.elapsed_ns(None, log_ns, data), log_ns - data.start_ns)
+    np.testing.assert_array_equal(other_topics.elapsed_ns(shifted, log_ns, data), log_ns - data.start_ns)
+    np.testing.assert_array_equal(other_topics.elapsed_ns(log_ns + 3, log_ns, data), log_ns + 3 - data.start_ns)
+    np.testing.assert_array_equal(other_topics.elapsed_ns(None, log_ns, data), log_ns - data.start_ns)
 
 
 def test_several_logs_keep_their_topics_apart_and_their_transforms_out(data: RunData, tmp_path: Path) -> None:
