@@ -86,7 +86,7 @@ def test_a_mass_on_springs_does_more_than_its_model_says() -> None:
     ("name", "poses", "hidden"), [("mount_resonance", True, True), ("clock_skew", True, False), ("low_pass", False, False)]
 )
 def test_a_filter_beside_a_clock_of_poses_is_what_the_clock_leaves(name: str, poses: bool, hidden: bool) -> None:
-    """EuRoC V2_03: the clock of its poses drifts to and fro; a jump takes 71 % of the misfit, and a resonance took 2 %."""
+    """The clock of poses drifts to and fro, and a filter fits what one jump of it leaves."""
     assert below_model_error({"clock_jump": 71.0, name: 2.0}, SETTINGS, denoised=False, poses=poses) == (
         {name} if hidden else set()
     )
