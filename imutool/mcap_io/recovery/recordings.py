@@ -192,7 +192,7 @@ class Recordings:
         agree = [
             self._now.agrees([r]) for _, r in found if isinstance(r, Channel) and (Opcode.CHANNEL, r.id) in self._now.proven
         ]
-        other = self._new(found[0][0]) if agree and 2 * sum(agree) <= len(agree) else None
+        other = self._new(found[0][0], headless=True) if agree and 2 * sum(agree) <= len(agree) else None
         for offset, record in found:
             if not self._now.agrees([record]):
                 what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {offset}"
