@@ -90,6 +90,9 @@ class Recordings:
         for found in self._early:
             self._verify(found, self.of(found.block))
         self._name_logs([found.block for found in blocks])
+        alike = [f.block for f in blocks if not (f.evidence or self.of(f.block).anonymous or f.block.offset in self.unproven)]
+        if count := sum(sum((block.counts or {}).values()) for block in alike):
+            self.losses.add_harmless(f"{count} messages behind damage are of this log by nothing but their channel ids")
 
     def _complete(self, blocks: Sequence[ScannedBlock]) -> None:
         """Completes what a summary says by what the chunks are that it lists."""

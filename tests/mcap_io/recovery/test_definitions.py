@@ -112,6 +112,7 @@ def test_chunks_written_in_another_way_are_not_on_the_topics_of_the_log_before_t
     mine.write_bytes(mine.read_bytes()[: a[1][1]] + b"\0" * 5 + other.read_bytes()[b[2][0] : b[4][1]])
     report = repair(mine, tmp_path / "out.mcap")
     assert report.messages == {"/mine": 2 if told else 5}
+    assert any("3 messages behind damage are of this log by nothing but" in what for what in report.losses.harmless) != told
     assert report.losses.topics == ({"(channel 1, not defined)": 3} if told else {})
 
 
