@@ -400,13 +400,13 @@ def judged(path: Path, target: Path, originals: tuple[Original, Original], damag
         yield f"{missed.total()} of {len(must)} proven messages are missing, {losses.unproven} are told as unproven: {lines}"
     if not losses.unchecked and max(Counter(found).values(), default=1) > 1:
         yield f"messages come twice: {lines}"
-    first = originals[0]
+    first, flipped = originals[0], set(damages) == {flip}
     if (
         set(damages) <= set(ALONE)
         and first.chunked
-        and len(first.summary) > SHORTEST_SUMMARY
+        and (len(first.summary) > SHORTEST_SUMMARY or flipped)
         and first.messages - Counter(found)
-        and losses.intact
+        and (losses.intact or (flipped and not losses))  # what is gone with its entry in the summary, nobody can miss
     ):
         yield f"{(first.messages - Counter(found)).total()} messages are missing, and nothing is told"
     yield from _repaired(path, target, found)

@@ -168,8 +168,7 @@ class _Search:
 
     def exchanged(self, now: Fit) -> Fit:
         """Fit with an effect replaced by another of the catalogue that explains more."""
-        few = len(now.chosen) - len(self.always) <= self.settings.exchanged_effects
-        for k in self.removable(now) if few else ():
+        for k in self.removable(now) if len(now.chosen) - len(self.always) <= self.settings.exchanged_effects else ():
             others, mine = (*now.chosen[:k], *now.chosen[k + 1 :]), now.chosen[k][0]
             without = fit(self.logs, others, iterations=2, near=now)
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
@@ -189,6 +188,9 @@ class _Search:
 
     def simplified(self, now: Fit) -> Fit:
         """Fit with the simpler of two effects that the logs hardly tell apart."""
+        for key in [effect.key for effect, _ in now.chosen if effect.kind == "unknown"]:
+            rivals = self._rivals(now.keys.index(key), now).values()  # a name that leaves no more says more
+            now = next((trial for trial in rivals if trial.objective < now.objective), now)
         return self._without_arms(self._without_low_pass(now))
 
     def _without_low_pass(self, now: Fit) -> Fit:
@@ -196,13 +198,12 @@ class _Search:
         offset = next((e for e in self.named if e.name == "clock_offset" and e.key not in now.keys), None)
         for k, (effect, theta) in enumerate(now.chosen):
             if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, self.logs, self.settings):
-                delay_s = -1.0 / (2.0 * np.pi * theta)  # of a first order far below its cut-off
-                return fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :], (offset, delay_s)), near=now)
+                delayed = offset, -1.0 / (2.0 * np.pi * theta)  # a first order far below its cut-off
+                return fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
         return now
 
     def _without_arms(self, now: Fit) -> Fit:
         """Fit with a lever arm instead of a size effect of three equal arms, and the rest if it is significant."""
-        # where a part of nine is implausible these are not three equal arms
         arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
         lever = [effect for effect in self.named if effect.name == "lever_arm" and effect.key not in now.keys]
         if not arms or not lever:
@@ -243,7 +244,7 @@ class _Search:
             verdicts = self._beyond_model_error(tests)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
-                selected = [replace(verdict, similar=self._similar(first + k, now)) for k, verdict in enumerate(verdicts)]
+                selected = [replace(verdict, similar=tuple(self._rivals(first + k, now))) for k, verdict in enumerate(verdicts)]
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
                 return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried, first)
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
@@ -255,19 +256,18 @@ class _Search:
             return None
         return scatter(self.logs, found, found.part, self.settings.robust_block_s)
 
-    def _similar(self, k: int, now: Fit) -> tuple[str, ...]:
-        """Similar effects of the catalogue: they leave about as little (Akaike's criterion)."""
+    def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
+        """Fits with another effect of the catalogue in the place of one, that leave about as little (Akaike's criterion)."""
         share, rivals = self.settings.rival_share, self.settings.rivals
-        others = (*now.chosen[:k], *now.chosen[k + 1 :])
+        others, found = (*now.chosen[:k], *now.chosen[k + 1 :]), dict[str, Fit]()
         without = fit(self.logs, others, iterations=2, near=now)
-        gain, names = without.objective - now.objective, []
+        gain, aic = without.objective - now.objective, now.objective + 2 * len(now.chosen[k][1])
         for _, effect, start, promised in self.candidates.ranked(without, self.named, rivals)[:rivals]:
             if effect.key != now.chosen[k][0].key and promised > share * gain:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - share * gain)
-                aic = now.objective + 2 * len(now.chosen[k][1])
                 if trial.objective + 2 * len(start) < aic + self.settings.clearly_better:
-                    names.append(effect.name)
-        return tuple(dict.fromkeys(names))
+                    found.setdefault(effect.name, trial)
+        return found
 
     def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit, scattered: Scatter | None) -> SelectedEffect:
         effect, theta = whole.chosen[k]

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from imutool.mcap_io.blocks import MessageBlock
@@ -36,7 +37,8 @@ def really_lost(scan: Scan, blocks: list[MessageBlock], summaries: list[Summary]
     for gap in scan.gaps:
         before = int(np.searchsorted(starts, gap.offset, "right")) - 1
         inside_log = gap.end < scan.limit or scan.data_ends
-        if gap.length and inside_log and before >= 0 and gap.end <= sizes[int(starts[before])]:
+        behind = int(starts[before]) if before >= 0 else -1
+        if gap.length and inside_log and gap.end <= sizes.get(behind, 0) and _may_be_index(gap, places[behind], blocks, scan):
             losses.add_harmless(f"a message index at byte {gap.offset} is damaged; a new one can be made")
             continue
         if not gap.length and gap.indexes and all((channel, n) in where for channel, n, _, _ in gap.indexes):
@@ -60,6 +62,13 @@ def really_lost(scan: Scan, blocks: list[MessageBlock], summaries: list[Summary]
         )
         _count(gap, entries)
         yield gap
+
+
+def _may_be_index(gap: Gap, block: MessageBlock, blocks: list[MessageBlock], scan: Scan) -> bool:
+    """Whether message indexes of the block may have stood in a gap behind it, rather than a small chunk."""
+    opcode = scan.source.at(gap.offset, 1)[0]
+    lacks = not (block.counts or {}).keys() <= block.indexes.keys()
+    return lacks and (opcode == Opcode.MESSAGE_INDEX or (opcode != Opcode.CHUNK and any(each.indexes for each in blocks)))
 
 
 def _missing(summary: Summary, scan: Scan) -> Iterator[ChunkIndex]:

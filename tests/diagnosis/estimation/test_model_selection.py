@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from support import planted
 from support.seeds import seeds
 
+from imutool.diagnosis.estimation import model_selection
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
@@ -276,3 +277,13 @@ def test_three_arms_that_agree_are_a_lever_arm_and_the_rest_a_size_effect(arms_m
     arm = found.selected[0]
     assert abs(arm.theta[2] - 1e-3 * arms_mm[2]) < 0.02
     assert np.abs(arm.theta[:2]).max() < 0.02
+
+
+def test_a_name_that_leaves_no_more_takes_the_place_of_a_term() -> None:
+    """On level ground five of six misalignments are noise, and one term alone costs less by BIC; the physics is the same."""
+    pair = planted.pair(planted.planar(), {"accel_misalignment": [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]})
+    log, named = planted.weighed(pair), planted.catalogue()
+    term = next(effect for effect in unnamed.terms(unnamed.like([pair])) if effect.equation == "accel.y += c f_x")
+    known, settings = Candidates([log], (*named, term)), pair.settings.search
+    search = model_selection._Search([log], named, (term,), (), fit([log], ()).objective, settings, lambda text: None, known)
+    assert list(search.simplified(fit([log], ((term, np.zeros(1)),))).keys) == ["accel_misalignment"]

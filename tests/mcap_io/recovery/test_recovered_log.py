@@ -376,6 +376,23 @@ def test_one_damaged_chunk_among_small_ones_that_are_read_together(foreign: Fore
         list(strict.rows(["/a", "/b"]))
 
 
+@pytest.mark.parametrize("layout", ["zstd", "no-index"], indirect=True)
+def test_a_small_chunk_that_is_damaged_is_no_message_index_of_the_one_before_it(
+    foreign: Foreign, tmp_path: Path, layout: str
+) -> None:
+    """Told as a damaged message index it was, where the chunk before it would have had one as long."""
+    path = foreign([(*m[:5], b"z" * 20) for m in some(1, 300)], layout, chunk_size=3000)
+    each = blocks(path)
+    assert each[2].length < 16 * 40  # bytes of a message index of its messages
+    flip(path, each[2].offset + each[2].length - 9)
+    with RecoveredLog(path) as log:
+        log.check()
+        (lost,) = log.losses.entries
+        assert lost.offset == each[2].offset
+        assert len(content(log)) < 300
+    assert bool(lost.counts) == (layout == "zstd")
+
+
 def test_damaged_stretches_are_kept_where_no_reader_takes_them_for_messages(
     foreign: Foreign, flight: Messages, tmp_path: Path
 ) -> None:
