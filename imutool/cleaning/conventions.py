@@ -23,6 +23,7 @@ from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, force_in_world, turning
 from imutool.cleaning.unit_evidence import RATES
+from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
 
 SURE = 3.0  # standard errors of the log likelihood ratio
@@ -209,20 +210,18 @@ def _carried(
 
     A signed permutation P of a rate turns the rotation: exp(P w) = P exp(det(P) w) P^T.
     """
-    from scipy.spatial.transform import Rotation
-
-    turns: dict[tuple[str, bool], Rotation] = {}
+    turns: dict[tuple[str, bool], Float64[np.ndarray, "w 4"]] = {}
     for unit in {unit for unit, _ in readings}:
         for sign in (1.0, -1.0):
-            R = Rotation.identity(len(rate))
+            q = quaternion.exp(np.zeros((len(rate), 3)))
             for k in range(WINDOW):
-                R = R * Rotation.from_rotvec(sign * RATES[unit] * STEP_S * rate[:, k])
-            turns[unit, sign > 0] = R
+                q = quaternion.multiply(q, quaternion.exp(sign * RATES[unit] * STEP_S * rate[:, k]))
+            turns[unit, sign > 0] = q
     errors = []
     for unit, matrix in readings:
         P = matrix / RATES[unit]
-        R = turns[unit, bool(np.linalg.det(P) > 0)]
-        errors.append(np.linalg.norm(R.apply(last @ P) @ P.T - first, axis=1))
+        q = turns[unit, bool(np.linalg.det(P) > 0)]
+        errors.append(np.linalg.norm(quaternion.rotate(q, last @ P) @ P.T - first, axis=1))
     return np.stack(errors)
 
 
@@ -270,7 +269,7 @@ def _accel_against_poses(
 
     a_w + g up = R_wb axes f. Without acceleration (axes, up) and (-axes, -up) fit alike; then neither is told.
     """
-    at_ns, R, a_w = force_in_world(truth)
+    at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
     if len(use) < FEWEST_BLOCKS:
         return None, None
@@ -281,7 +280,7 @@ def _accel_against_poses(
         agreed = np.linalg.det(gyro.axes) * gyro.axes @ relative.axes.T * np.linalg.det(relative.axes)
         every = np.stack([agreed, -agreed])
     readings = [(P, up) for P in every for up in ups]
-    turned = {k: R[use].apply(f @ P.T) for k, P in enumerate(every)}
+    turned = {k: quaternion.rotate(q_wb[use], f @ P.T) for k, P in enumerate(every)}
     errors = np.stack(
         [np.linalg.norm(a_w[use] + GRAVITY_M_S2 * up - turned[k], axis=1) for k in range(len(every)) for up in ups]
     )
@@ -289,7 +288,7 @@ def _accel_against_poses(
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
         return None, None
     P, up = readings[choice.best]
-    as_is = float(np.sqrt(np.median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - R[use].apply(f)) ** 2, axis=1))))
+    as_is = float(np.sqrt(np.median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_up = all((up == other).all() for _, other in alike)
     one_axes = all((other == P).all() for other, _ in alike)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
+from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import TF
 from imutool.mcap_io.log import Log
 from imutool.recording import Poses, Recording, seconds
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
-
 
 FEWEST = 3  # poses that show an acceleration
 
@@ -91,18 +88,21 @@ def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarra
 
 def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
     """Angular rate (rad/s, body frame) between neighbouring poses, with start and end (ns)."""
-    from scipy.spatial.transform import Rotation
-
-    R = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)
+    q_wb = quaternion.unit(truth.q_wb_wxyz)
     dt = seconds(truth.t_ns[1:], int(truth.t_ns[0])) - seconds(truth.t_ns[:-1], int(truth.t_ns[0]))
-    return truth.t_ns[:-1], truth.t_ns[1:], (R[:-1].inv() * R[1:]).as_rotvec() / dt[:, None]
+    return (
+        truth.t_ns[:-1],
+        truth.t_ns[1:],
+        quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-1]), q_wb[1:])) / dt[:, None],
+    )
 
 
-def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Rotation, Float64[np.ndarray, "m 3"]]:
-    """Time, orientation and acceleration (m/s², world) at inner poses, by second differences."""
-    from scipy.spatial.transform import Rotation
+def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 3"]]:
+    """Time, orientation q_wb (wxyz) and acceleration (m/s², world) at inner poses.
 
+    By second differences.
+    """
     t_s = seconds(truth.t_ns, int(truth.t_ns[0]))
     v_w = np.diff(truth.p_wb, axis=0) / np.diff(t_s)[:, None]
     a_w = 2.0 * np.diff(v_w, axis=0) / (t_s[2:] - t_s[:-2])[:, None]
-    return truth.t_ns[1:-1], Rotation.from_quat(truth.q_wb_wxyz[1:-1], scalar_first=True), a_w
+    return truth.t_ns[1:-1], quaternion.unit(truth.q_wb_wxyz[1:-1]), a_w

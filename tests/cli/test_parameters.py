@@ -13,6 +13,8 @@ from imutool import cli
 from imutool.cli import overview
 from imutool.cli.parameters import error_with_flags, flags, with_flags
 from imutool.errors import ConfigError
+from imutool.mcap_io.write import write
+from imutool.sensor.made_up_flight import flight
 
 COMMANDS = typer.main.get_command(cli.load()).commands  # type: ignore[attr-defined]
 
@@ -33,6 +35,16 @@ def test_help_and_a_command_import_what_they_need() -> None:
     for words, modules in (("'--help'", []), ("'debias', 'missing.mcap', 'out.mcap', '-q'", ["numpy", "typer"])):
         done = subprocess.run([sys.executable, "-c", seen.replace("WORDS", words)], capture_output=True, text=True, check=True)
         assert done.stdout.splitlines()[-1] == str(modules)
+
+
+def test_debias_of_a_log_with_poses_does_without_scipy(tmp_path: Path) -> None:
+    write(flight(2, duration_s=20.0), tmp_path / "flight.mcap")
+    words = ["imutool", "debias", str(tmp_path / "flight.mcap"), str(tmp_path / "out.mcap"), "-q", "--force"]
+    seen = f"import sys; sys.argv = {[*words, '--model', 'euroc-adis16448-linear']}; from imutool.cli import main\n"
+    seen += "try: main()\nexcept SystemExit: pass\nprint(sorted({'scipy', 'torch'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, check=True)
+    assert (tmp_path / "out.mcap").exists()
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:

@@ -90,6 +90,9 @@ class Recordings:
         for found in self._early:
             self._verify(found, self.of(found.block))
         self._name_logs([found.block for found in blocks])
+        alike = [f.block for f in blocks if not (f.evidence or self.of(f.block).anonymous or f.block.offset in self.unproven)]
+        if count := sum(sum((block.counts or {}).values()) for block in alike):
+            self.losses.add_harmless(f"{count} messages behind damage are of this log by nothing but their channel ids")
 
     def _complete(self, blocks: Sequence[ScannedBlock]) -> None:
         """Completes what a summary says by what the chunks are that it lists."""
@@ -192,7 +195,7 @@ class Recordings:
         agree = [
             self._now.agrees([r]) for _, r in found if isinstance(r, Channel) and (Opcode.CHANNEL, r.id) in self._now.proven
         ]
-        other = self._new(found[0][0]) if agree and 2 * sum(agree) <= len(agree) else None
+        other = self._new(found[0][0], headless=True) if agree and 2 * sum(agree) <= len(agree) else None
         for offset, record in found:
             if not self._now.agrees([record]):
                 what = f"{type(record).__name__.lower()} {record.id} has two definitions, the second at byte {offset}"

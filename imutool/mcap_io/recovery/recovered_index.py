@@ -93,10 +93,9 @@ class RecoveredIndex(LogIndex):
                 size = entry.uncompressed_size if entry else head.size
                 if head[:3] != (block.start_ns, block.end_ns, size) or head.compression != block.compression:
                     raise LogError(f"the summary lists the chunk at byte {block.offset} otherwise than it is")
-                key = hash(head)
-                if head.crc and key in seen:
+                if head.crc and hash(head) in seen:
                     raise LogError(f"the chunk at byte {block.offset} may repeat another")
-                seen.add(key)
+                seen.add(hash(head))
 
     @property
     def header_bytes(self) -> bytes:
@@ -129,6 +128,8 @@ class RecoveredIndex(LogIndex):
         crc = 0 if block.compression is None else CHUNK_HEAD.unpack_from(raw, HEAD.size)[3]
         if not crc and len(found.heads) and not self.proven:
             self.losses.unchecked_in[block.offset] = len(found.heads)
+        if self._ready and not crc and not set(found.heads["channel"].tolist()) <= self.channels.keys():
+            raise LogError(f"the chunk at byte {block.offset} has messages of channels that no record defines")
         return self._readable(block, found) if self.by_records else found
 
     def entries(self, block: MessageBlock, channel: int) -> UInt64[np.ndarray, "n 2"]:

@@ -112,6 +112,7 @@ def test_chunks_written_in_another_way_are_not_on_the_topics_of_the_log_before_t
     mine.write_bytes(mine.read_bytes()[: a[1][1]] + b"\0" * 5 + other.read_bytes()[b[2][0] : b[4][1]])
     report = repair(mine, tmp_path / "out.mcap")
     assert report.messages == {"/mine": 2 if told else 5}
+    assert any("3 messages behind damage are of this log by nothing but" in what for what in report.losses.harmless) != told
     assert report.losses.topics == ({"(channel 1, not defined)": 3} if told else {})
 
 
@@ -129,3 +130,16 @@ def test_a_log_that_may_have_lost_a_definition_stays_among_those_a_chunk_may_be_
     assert report.messages == {"/mine": 1, "/other": 1, "/two": 2}
     assert report.losses.topics == {"(/mine or /other)": 1, "(channel 2, not defined)": 1}
     assert report.losses.unproven == 1
+
+
+def test_definitions_of_another_log_behind_its_chunks_leave_open_whose_these_are(foreign: Foreign, tmp_path: Path) -> None:
+    """A log over the end of another that was written the same way: its messages were on the topics of the first one."""
+    first = foreign([text("/mine", 100 + i) for i in range(3)], chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/other", 1000 + i) for i in range(5)], chunk_size=CHUNK_SIZE, name="second")
+    a, b, other = stretches(first), stretches(second), second.read_bytes()
+    tail = other[b[2][0] : b[4][1]] + summary_of(second)[:-60]  # without a footer, no CRC proves the summary
+    first.write_bytes(first.read_bytes()[: a[1][1]] + b"\0" * 5 + tail)
+    report = repair(first, tmp_path / "out.mcap")
+    assert report.messages == {"/mine": 2}
+    assert report.losses.unproven == 3
+    assert report.losses.topics == {"(/mine or /other)": 3}

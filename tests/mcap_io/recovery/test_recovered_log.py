@@ -19,6 +19,7 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
@@ -391,6 +392,19 @@ def test_a_small_chunk_that_is_damaged_is_no_message_index_of_the_one_before_it(
         assert lost.offset == each[2].offset
         assert len(content(log)) < 300
     assert bool(lost.counts) == (layout == "zstd")
+
+
+def test_a_channel_id_that_changed_where_no_crc_covers_it_is_lost_and_told(foreign: Foreign, tmp_path: Path) -> None:
+    """`repair` ended with a KeyError."""
+    path = foreign(some(1, 40), "plain", chunk_size=300)
+    raw, at = bytearray(path.read_bytes()), blocks(path)[3].offset
+    raw[at + 33 : at + 37] = bytes(4)  # its CRC
+    assert raw[at + 49] == Opcode.MESSAGE
+    raw[at + 58] ^= 16
+    path.write_bytes(bytes(raw))
+    report = repair(path, tmp_path / "out.mcap")
+    assert sum(report.messages.values()) == 39
+    assert sum(report.losses.topics.values()) == 1
 
 
 def test_damaged_stretches_are_kept_where_no_reader_takes_them_for_messages(
