@@ -25,7 +25,7 @@ from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.bias_start.prior_width import BiasPrior
+from imutool.bias_start.prior_width import BiasPrior, supported_std
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
@@ -35,6 +35,7 @@ UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sens
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds
 MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 MOST_DEVIATIONS = 5.0  # between the log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
+MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
 MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
 TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
@@ -76,10 +77,13 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)
     found = _evidence(model, samples, prior)
+    supported = supported_std(prior.std, prior.least_std, found.difference, DEPENDENT**2 * found.variance)
+    prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
     none = None
-    if _deviations(found, prior).max() > MOST_DEVIATIONS or found.surprising > MOST_SURPRISING:
+    most = np.full(6, MOST_DEVIATIONS) if prior.least_std is None else MOST_OF_GUESS
+    if (_deviations(found, prior) > most).any() or found.surprising > MOST_SURPRISING:
         none = _evidence(static.Model(), samples, BiasPrior(np.zeros(6), UNKNOWN_STD, prior.ground_std, prior.walk))
-    contradictions = [] if none is None else _contradictions(found, prior, none)
+    contradictions = [] if none is None else _contradictions(found, prior, none, most)
     if none is not None and contradictions:
         worse = _worse_than_none(model, samples, start, found, prior, none)
         if worse:
@@ -154,12 +158,12 @@ def _shown_std(found: _Evidence, prior: BiasPrior) -> Vector6:
     return np.asarray(np.sqrt(prior.std**2 + DEPENDENT**2 * found.variance + AT_REST_STD**2))
 
 
-def _contradictions(found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:
+def _contradictions(found: _Evidence, prior: BiasPrior, none: _Evidence, most: Vector6) -> list[str]:
     """Sentences on what in a log contradicts a prior and the correction, unless no model does better."""
     sentences, deviations = [], _deviations(found, prior)
     for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
         axis = int(np.argmax(deviations[columns])) + columns.start
-        if deviations[axis] > MOST_DEVIATIONS:
+        if deviations[axis] > most[axis]:
             sentences.append(
                 f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the training"
                 f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another switching-on"
