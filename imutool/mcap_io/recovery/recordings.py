@@ -238,10 +238,9 @@ class Recordings:
             candidates = [found for found in copies if self._evidence(found) == best]
             kept, pool = candidates[0], [self.of(found.block) for found in candidates]
             kept.block.recording = self.each.index(self._by_content(kept, set(kept.block.counts or {}), pool))
-            for found in copies:
-                if found is not kept:
-                    found.block.lost = True
-                    self.losses.add_harmless(f"the chunk at byte {found.block.offset} repeats the one at byte {kept.block.offset}")
+            for other in (found.block for found in copies if found is not kept):
+                other.lost = True
+                self.losses.add_harmless(f"the chunk at byte {other.offset} repeats the one at byte {kept.block.offset}")
 
     def _evidence(self, found: ScannedBlock) -> tuple[bool, int]:
         """How well it is known what the messages of a block are."""
