@@ -232,7 +232,7 @@ class Recordings:
         often = Counter((found.key, found.crc) for found in chunks)
         equal: dict[object, list[ScannedBlock]] = {}
         for found in (found for found in chunks if often[found.key, found.crc] > 1):
-            equal.setdefault((found.crc, sha256(self.found_in(found.block).data).digest()), []).append(found)
+            equal.setdefault((found.crc, sha256(self.found_in(found.block).data.tobytes()).digest()), []).append(found)
         for copies in equal.values():
             best = max(map(self._evidence, copies))
             candidates = [found for found in copies if self._evidence(found) == best]
