@@ -51,6 +51,7 @@ class BagReport:
             "stretches_not_listed": self.lost - len(self.losses),
             "mended": [] if self.was_indexed else ["the bag had no index: it was rebuilt"],
             "unproven_messages": 0,
+            "assumed_messages": 0,
             "unchecked_messages": 0,
             "unchecked_definitions": [],
         }

@@ -224,9 +224,13 @@ def test_a_log_cut_in_its_summary_is_debiased_in_its_encoding(imutool, tmp_path)
     assert len(read(tmp_path / "d.mcap", imu="/robot/imu/debiased").imu) == COUNT
 
 
-def test_a_cut_log_is_refused_and_repair_is_named(convert, tmp_path):
-    log = write_log(tmp_path / "in.mcap", "json")
-    log.write_bytes(log.read_bytes()[:20_000])
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
+def test_a_damaged_log_is_refused_and_repair_is_named(convert, tmp_path, damage):
+    """A bit flipped in a chunk that its CRC covers ended in a traceback."""
+    log = write_log(tmp_path / "in.mcap", "protobuf")
+    raw = bytearray(log.read_bytes())
+    raw[raw.index(b"zstd") + 3000] ^= 4
+    log.write_bytes(raw[:20_000] if damage == "cut" else raw)
     done = convert(log, tmp_path / "out.mcap")
     assert done.returncode == 4
     assert "imutool repair" in done.stderr

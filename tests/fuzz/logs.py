@@ -370,6 +370,7 @@ def problems(rng: random.Random, folder: Path) -> Iterator[str]:
     if rng.randrange(COMMAND_EVERY) == 0:
         for words in (("info", "log.mcap", "--json", "info.json"), ("repair", "log.mcap", "out.mcap", "--overwrite", "-q")):
             yield from outside_contract(command(folder, *words), (0, 3, 5))
+        yield from outside_contract(command(folder, "convert", "log.mcap", "converted.mcap", "-q"), (0, 3, 4))
     if path.read_bytes() != raw:
         yield f"{name}: the input changed"
 

@@ -63,7 +63,9 @@ def _contents(
     try:
         found = messages.parse(contents, offset)
     except LogError as error:
-        raise UnreadableError(error.what) if head.crc else error from error
+        if head.crc:
+            raise UnreadableError(error.what) from error
+        raise  # `raise error from error` would be a cycle that keeps the contents: no collector runs in a scan
     if not head.crc and not is_consistent(raw, offset, known):
         raise LogError(f"the head of the chunk at byte {offset} is damaged, and it has no CRC to tell by")
     if not head.crc and not is_boundary(offset + len(raw)):

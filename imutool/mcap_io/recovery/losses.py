@@ -52,6 +52,7 @@ class Losses:
     bytes: int = 0
     unchecked_topics: list[str] = field(default_factory=list)  # topics whose definition no CRC covers
     unproven: int = 0  # messages of which two definitions are possible
+    assumed: int = 0  # messages behind damage that nothing but their channel ids gives to their topics
     unchecked_in: dict[int, int] = field(default_factory=dict)  # messages without CRC, by the offset of their stretch
 
     def __bool__(self) -> bool:
@@ -60,7 +61,7 @@ class Losses:
     @property
     def intact(self) -> bool:
         """Whether nothing was lost and nothing had to be rebuilt."""
-        return not self.entries and not self.harmless
+        return not (self.entries or self.harmless or self.assumed)
 
     @property
     def unchecked(self) -> int:
@@ -106,6 +107,7 @@ class Losses:
             "stretches_not_listed": self.unlisted,
             "mended": list(self.harmless),
             "unproven_messages": self.unproven,
+            "assumed_messages": self.assumed,
             "unchecked_messages": self.unchecked,
             "unchecked_definitions": list(self.unchecked_topics),
         }
@@ -128,7 +130,9 @@ def describe(losses: Mapping[str, Any]) -> list[str]:
 
 
 def unchecked(losses: Mapping[str, Any]) -> Iterator[str]:
-    """What no CRC covers, in words."""
+    """What nothing proves, in words."""
+    if losses.get("assumed_messages"):
+        yield f"{losses['assumed_messages']} messages behind damage are on their topics by nothing but their channel ids"
     if losses["unchecked_messages"]:
         yield f"{losses['unchecked_messages']} messages lie where no CRC covers them"
     if losses["unchecked_definitions"]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from hashlib import sha256
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
@@ -91,8 +92,7 @@ class Recordings:
             self._verify(found, self.of(found.block))
         self._name_logs([found.block for found in blocks])
         alike = [f.block for f in blocks if not (f.evidence or self.of(f.block).anonymous or f.block.offset in self.unproven)]
-        if count := sum(sum((block.counts or {}).values()) for block in alike):
-            self.losses.add_harmless(f"{count} messages behind damage are of this log by nothing but their channel ids")
+        self.losses.assumed = sum(sum((block.counts or {}).values()) for block in alike)
 
     def _complete(self, blocks: Sequence[ScannedBlock]) -> None:
         """Completes what a summary says by what the chunks are that it lists."""
@@ -227,21 +227,20 @@ class Recordings:
         return recording.fits(channel, lambda: self.found_in(block))
 
     def drop_copies(self, blocks: Sequence[ScannedBlock]) -> None:
-        """Keeps of equal chunks the one whose recording is best known."""
-        kept: dict[object, ScannedBlock] = {}
-        for found in blocks:
-            if found.block.compression is None or not found.block.counts:
-                continue
-            before = kept.setdefault((found.key, found.crc), found)
-            if before is not found and self._contents(before) == self._contents(found):
-                better, worse = sorted((before, found), key=self._evidence, reverse=True)
-                kept[found.key, found.crc], worse.block.lost = better, True
-                self.losses.add_harmless(
-                    f"the chunk at byte {worse.block.offset} repeats the one at byte {better.block.offset}"
-                )
-
-    def _contents(self, found: ScannedBlock) -> bytes:
-        return self.found_in(found.block).data.tobytes()
+        """Keeps of equal chunks the one whose recording is best known; equally well known ones may be of any of theirs."""
+        chunks = [found for found in blocks if found.block.compression is not None and found.block.counts]
+        often = Counter((found.key, found.crc) for found in chunks)
+        equal: dict[object, list[ScannedBlock]] = {}
+        for found in (found for found in chunks if often[found.key, found.crc] > 1):
+            equal.setdefault((found.crc, sha256(self.found_in(found.block).data.tobytes()).digest()), []).append(found)
+        for copies in equal.values():
+            best = max(map(self._evidence, copies))
+            candidates = [found for found in copies if self._evidence(found) == best]
+            kept, pool = candidates[0], [self.of(found.block) for found in candidates]
+            kept.block.recording = self.each.index(self._by_content(kept, set(kept.block.counts or {}), pool))
+            for other in (found.block for found in copies if found is not kept):
+                other.lost = True
+                self.losses.add_harmless(f"the chunk at byte {other.offset} repeats the one at byte {kept.block.offset}")
 
     def _evidence(self, found: ScannedBlock) -> tuple[bool, int]:
         """How well it is known what the messages of a block are."""

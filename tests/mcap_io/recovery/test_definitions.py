@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import struct
 import time
+import tracemalloc
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +38,25 @@ def test_the_definitions_of_a_damaged_chunk_that_unpacks_to_zeros_take_no_time()
     began = time.process_time()
     assert list(find_definitions(b"damaged head" + packed)) == []
     assert time.process_time() - began < 1.0
+
+
+@pytest.mark.parametrize("proven", [True, False])
+def test_the_memory_for_chunks_that_unpack_to_zeros_is_that_of_one(foreign: Foreign, tmp_path: Path, proven: bool) -> None:
+    """Each stayed in memory once: 1.6 GB for six of 250 MiB, which are 48 kB of a file."""
+    log = foreign([text("/mine", 100 + i) for i in range(3)], chunk_size=CHUNK_SIZE, name="log")
+    whole, raw, zeros = stretches(log), log.read_bytes(), bytes(8 << 20)
+    packed = zstandard.ZstdCompressor(level=1).compress(zeros)
+    head = struct.pack("<QQQII", 100, 101, len(zeros), zlib.crc32(zeros) * proven, 4) + b"zstd" + struct.pack("<Q", len(packed))
+    chunk = struct.pack("<BQ", 6, len(head + packed)) + head + packed
+    log.write_bytes(raw[: whole[0][1]] + 12 * chunk + raw[whole[1][0] :])
+    tracemalloc.start()
+    try:
+        report = repair(log, tmp_path / "out.mcap")
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert report.messages == {"/mine": 3}
+    assert most < 3 * len(zeros)
 
 
 def test_a_summary_that_follows_a_part_of_itself_says_whose_the_chunks_are(foreign: Foreign, tmp_path: Path) -> None:
@@ -112,7 +133,7 @@ def test_chunks_written_in_another_way_are_not_on_the_topics_of_the_log_before_t
     mine.write_bytes(mine.read_bytes()[: a[1][1]] + b"\0" * 5 + other.read_bytes()[b[2][0] : b[4][1]])
     report = repair(mine, tmp_path / "out.mcap")
     assert report.messages == {"/mine": 2 if told else 5}
-    assert any("3 messages behind damage are of this log by nothing but" in what for what in report.losses.harmless) != told
+    assert report.losses.assumed == (0 if told else 3)
     assert report.losses.topics == ({"(channel 1, not defined)": 3} if told else {})
 
 
@@ -143,3 +164,18 @@ def test_definitions_of_another_log_behind_its_chunks_leave_open_whose_these_are
     assert report.messages == {"/mine": 2}
     assert report.losses.unproven == 3
     assert report.losses.topics == {"(/mine or /other)": 3}
+
+
+def test_a_chunk_in_two_logs_whose_definitions_differ_is_unproven(foreign: Foreign, tmp_path: Path) -> None:
+    """It came back on the topic of the log that stood first in the file."""
+    first = foreign([text("/mine", 100 + i) for i in range(3)], chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/other", 1000 + i) for i in range(3)], chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, other = stretches(first), stretches(second), first.read_bytes(), second.read_bytes()
+    chunk = other[b[1][0] : b[1][1]]
+    own = raw[a[1][0] : a[1][1]]
+    data = chunk * 2 + own  # twice in the first log, once in its own
+    first.write_bytes(raw[: a[0][1]] + data + raw[a[2][0] : a[2][1]] + other[: b[2][1]])
+    report = repair(first, tmp_path / "out.mcap")
+    assert by_mcap(tmp_path / "out.mcap") == [m for each in (*a, b[0], b[2]) for m in each[2]]
+    assert report.losses.unproven == 1
+    assert report.losses.topics == {"(/mine or /other)": 1}
