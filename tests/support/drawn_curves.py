@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -116,9 +117,21 @@ def pictures(viewer: Any, blueprint: Any, log: Any, duration_s: float, most: int
     found = {}
     for views in islice(faces(blueprint), most):
         viewer.lay_out(blueprint)
-        viewer.client.set_time("elapsed", duration=duration_s, play_state="paused")
+        _to_the_end(viewer, duration_s)
         found |= dict(zip([view.id for view in views], viewer.pictures([view.id for view in views]), strict=True))
     return found
+
+
+def _to_the_end(viewer: Any, duration_s: float) -> None:
+    """Moves the cursor; a busy viewer knows of no timeline until it has read what was sent."""
+    for waits_left in reversed(range(20)):
+        try:
+            viewer.client.set_time("elapsed", duration=duration_s, play_state="paused")
+            return
+        except ConnectionError:
+            if not waits_left:
+                raise
+            time.sleep(0.5)
 
 
 def unseen(view: Any, picture: np.ndarray, curves: Sequence[Curve]) -> list[str]:
