@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as save_bytes
 
 from imutool import registry
-from imutool.bias.model import BiasModel
+from imutool.bias.model import BiasModel, check_card
 from imutool.config import build, plain
 from imutool.errors import ImutoolError, ModelError, did_you_mean
 from imutool.mcap_io.storage.target import Target
@@ -281,6 +281,7 @@ def _header(raw: Mapping[str, str], path: Path) -> _Header:
             raise ValueError(f"rate_hz {rate_hz}")
         if not isinstance(settings, dict) or not isinstance(card, dict):
             raise ValueError("settings and card are tables")
+        check_card(card)
         return _Header(raw["method"], rate_hz, settings, card)
     except KeyError as error:
         raise ModelError(f"has an invalid header (no {error})", where=path) from error

@@ -14,6 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 
@@ -21,6 +22,7 @@ from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
 COLUMNS = {"gyro": slice(0, 3), "accel": slice(3, 6)}  # of a vector of six
+MOST_BIAS = 1e6  # rad/s and m/s²: more is no bias
 STATISTICS = ("prior_mean", "prior_std", "truth_std", "rest_std", "walk_std", "noise_std")
 
 GAP_S = 1.0  # a longer step of the stamps begins a new stretch: filters of the samples start anew, and no drift is integrated
@@ -218,3 +220,33 @@ class _Stretches:
 def matrices() -> Shapes:
     """Shapes of the matrix W of each sensor."""
     return {f"W.{sensor}": (3, 3) for sensor in SENSORS}
+
+
+class _Session(msgspec.Struct):
+    start_ns: int
+    end_ns: int
+    mean: tuple[float, float, float, float, float, float]
+    std: tuple[float, float, float, float, float, float]
+
+
+class _Priors(msgspec.Struct):
+    """Entries of a card that starts compute with."""
+
+    sessions: list[_Session] = []
+    turn_on_least_std: tuple[float, float, float, float, float, float] | None = None
+
+
+def check_card(card: Mapping[str, Any]) -> None:
+    """Refuse a card from an unknown source whose priors no sensor has.
+
+    Raises:
+        ValueError: another type, a negative or huge standard deviation, a huge mean, or no number.
+    """
+    try:
+        found = msgspec.convert(card, _Priors)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from error
+    widths = [session.std for session in found.sessions] + [found.turn_on_least_std] * (found.turn_on_least_std is not None)
+    numbers = np.array([*widths, *(session.mean for session in found.sessions)], float).reshape(-1, 6)
+    if not (np.abs(numbers) <= MOST_BIAS).all() or (numbers[: len(widths)] < 0.0).any():
+        raise ValueError("the card has an impossible prior")

@@ -34,6 +34,7 @@ PACKED = ("sensor_msgs/msg/CompressedImage",)  # compressing these again costs t
 ROS_NAMES = {"f4": "float32", "f8": "float64", "b1": "bool"} | {
     f"{sign}{size}": f"{name}{8 * size}" for sign, name in (("i", "int"), ("u", "uint")) for size in (1, 2, 4, 8)
 }
+LATEST_NS = 2**63 - 1  # of 64 bits with a sign, as numpy counts
 MOST_JUMPS = 1000  # of the clock, that are counted
 ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind them
 
@@ -137,8 +138,8 @@ class _Stream:
         for topic, log_time, publish_time, payload in self._source.messages():
             if (number := self._channels.get(topic)) is None:
                 number = self._define(topic, payload)
-            if log_time < 0:
-                raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="no time before 1970")
+            if not 0 <= log_time <= LATEST_NS:
+                raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="a time from 1970 to 2262")
             if last is not None and abs(log_time - last) > longest and len(jumps) < MOST_JUMPS:
                 jumps.append((log_time, (log_time - last) * 1e-9))
             last = log_time

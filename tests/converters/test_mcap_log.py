@@ -235,3 +235,19 @@ def test_a_damaged_log_is_refused_and_repair_is_named(convert, tmp_path, damage)
     assert done.returncode == 4
     assert "imutool repair" in done.stderr
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_time_beyond_64_bits_with_a_sign_is_refused(convert, tmp_path):
+    source = tmp_path / "far.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("robot.Text", "jsonschema", b"{}")
+        channel = writer.register_channel("/text", "json", schema)
+        for log_time in (START_NS, 2**63):
+            writer.add_message(channel, log_time, b"{}", log_time)
+        writer.finish()
+    done = convert(source, tmp_path / "out.mcap")
+    assert done.returncode == 4, done.stderr
+    assert "expected a time from 1970 to 2262" in done.stderr
+    assert not (tmp_path / "out.mcap").exists()
