@@ -230,7 +230,7 @@ class _Session(msgspec.Struct):
 
 
 class _Priors(msgspec.Struct):
-    """Entries of a card that starts compute with."""
+    """Entries of a card from which the start of a log is computed."""
 
     sessions: list[_Session] = []
     turn_on_least_std: tuple[float, float, float, float, float, float] | None = None

@@ -1,7 +1,7 @@
 """Calibration: effects that the training logs support, fitted by linear least squares.
 
 Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own.
-Every sensor has scale and misalignment: their prior (`SensorPrior`) shrinks them as far as the motion does not show them.
+Scale and misalignment need no evidence: their prior (`SensorPrior`) shrinks them as far as the motion does not show them.
 Forward selection of the others: an effect is chosen by how well the other logs predict each log's long windows
 (`imutool.training.normal_equations`), and refused where most logs do not agree or chance explains it. A parameter that the
 motion does not show stays at its prior, and is named.

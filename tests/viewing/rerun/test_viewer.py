@@ -96,8 +96,7 @@ def test_the_real_viewer_that_finds_no_window_is_noticed_though_it_listened(
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":987")  # which nobody serves
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(viewer.Viewer.trouble, "__defaults__", (viewer.START_TIMEOUT_S,))  # on a busy machine it dies late
-    assert refused([data]) < 2 * viewer.START_TIMEOUT_S, "the wait ends when the viewer dies, and before Rerun's 40 s"
+    assert refused([data]) < NO_WAIT_S
     said = viewer.show([data]).said
     assert said.startswith("The viewer stopped at once")
     assert "Saved flight_3.rrd" in said
