@@ -70,7 +70,10 @@ class Grown(NamedTuple):
 
 
 def grown(motion: Motion, windows: list[slice], stated: BiasCovariance, noise: Vector6, pose_std: Vector6) -> Grown:
-    """Errors over windows, with the lean of the truth's world fitted to all of them and taken off."""
+    """Errors at the ends of windows and their covariance.
+
+    The lean of the truth's world is fitted to all of them together and taken off.
+    """
     parts = [_integrated(motion, rows) for rows in windows]
     if not parts:
         return Grown(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 6, 6)))
@@ -129,7 +132,7 @@ def _by_lean(
 def pose_errors(motion: Motion, noise: Vector6) -> Vector6:
     """Standard deviation of the poses' own errors: attitude (rad), velocity (m/s).
 
-    From the difference of two neighbouring windows of `LAG_S`, in which a constant bias cancels: six variances of a pose, and
+    The same for all axes, from the difference of two neighbouring windows of `LAG_S`, in which a constant bias cancels: six variances of a pose, and
     twice the white noise of the samples. Errors that last for seconds do not show. NaN where a log is too short.
     """
     pairs = motion.windows(LAG_S)
@@ -140,9 +143,8 @@ def pose_errors(motion: Motion, noise: Vector6) -> Vector6:
     change = np.stack([known[k + 1].error - known[k].error for k in follows])
     white = 2.0 * np.stack([((known[k].by_bias * noise) ** 2).sum(axis=(0, 2)) for k in follows]).mean(axis=0)
     square = (change**2).mean(axis=0) - white
-    attitude = np.maximum(square[:3], 0.0) / 6.0
+    attitude = max(float(square[:3].mean()), 0.0) / 6.0
     # the attitude of each start leans its window's force: what that adds to the velocity is no error of the velocity
-    by_attitude = np.stack([known[k].by_pose[3:, :3] for k in follows])
-    leaned = 2.0 * np.einsum("mij,j->mi", by_attitude**2, attitude).mean(axis=0)
-    velocity = np.maximum(square[3:] - leaned, 0.0) / 6.0
-    return np.sqrt(np.concatenate([attitude, velocity]))
+    leaned = 2.0 * attitude * float(np.mean([(known[k].by_pose[3:, :3] ** 2).sum(axis=1) for k in follows]))
+    velocity = max(float(square[3:].mean()) - leaned, 0.0) / 6.0
+    return np.sqrt(np.repeat([attitude, velocity], 3))
