@@ -132,8 +132,9 @@ def _by_lean(
 def pose_errors(motion: Motion, noise: Vector6) -> Vector6:
     """Standard deviation of the poses' own errors: attitude (rad), velocity (m/s).
 
-    The same for all axes, from the difference of two neighbouring windows of `LAG_S`, in which a constant bias cancels: six variances of a pose, and
-    twice the white noise of the samples. Errors that last for seconds do not show. NaN where a log is too short.
+    They are the same for all axes, and come from the difference of two neighbouring windows of `LAG_S`, in which a constant
+    bias cancels: six variances of a pose, and twice the white noise of the samples. Errors that last for seconds do not show.
+    NaN where a log is too short.
     """
     pairs = motion.windows(LAG_S)
     known = [_integrated(motion, rows) for rows in pairs]
