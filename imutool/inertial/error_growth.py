@@ -148,4 +148,4 @@ def pose_errors(motion: Motion, noise: Vector6) -> Vector6:
     # the attitude of each start leans its window's force: what that adds to the velocity is no error of the velocity
     leaned = 2.0 * attitude * float(np.mean([(known[k].by_pose[3:, :3] ** 2).sum(axis=1) for k in follows]))
     velocity = max(float(square[3:].mean()) - leaned, 0.0) / 6.0
-    return np.sqrt(np.repeat([attitude, velocity], 3))
+    return np.repeat(np.sqrt([attitude, velocity]), 3)

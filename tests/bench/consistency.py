@@ -59,7 +59,7 @@ SHARES = (0.68, 0.95, 0.997)
 STARTS = ("truth", "auto", "smooth")
 WINDOWS_S = (1.0, 5.0, 15.0)
 RECOMPUTED = "/ground_truth_recomputed/pose"
-TRAINING, TESTS = 4, 2
+TRAINING, TESTS = 4, 3
 
 Judgement = tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 3"]]
 
@@ -120,8 +120,8 @@ def made_up(sensors: int) -> Iterator[Case]:
             walk_rad_s2_rthz=10.0 ** rng.uniform(-5.5, -4.3),
             mount_rad=0.0,
             clock_s=0.0,
-            rest_s=float(rng.choice([0.0, 10.0])),
-            duration_s=100.0,
+            rest_s=float(rng.choice([0.0, 8.0])),
+            duration_s=60.0,
         )
         first = 100 * seed
         model = learned_from([log(first + k, first, kind) for k in range(TRAINING)])
