@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float64
 
 from imutool.bias.model import COLUMNS, Vector6
 from imutool.inertial import inertial_filter
@@ -35,7 +36,10 @@ class BiasPrior:
     least_std: Vector6 | None = None
 
     def supported(self, state: State, elapsed_s: float) -> State:
-        """State of a filter that began with `std`, for the width that the log supports until now."""
+        """State of a filter that began with `std`, for the width that the log supports until now.
+
+        Its covariance counts that this width is not known.
+        """
         if self.least_std is None:
             return state
         walked = self.walk**2 * elapsed_s
@@ -44,7 +48,25 @@ class BiasPrior:
         narrow = np.minimum(
             supported_std(self.std, self.least_std, difference, variance) ** 2 + walked, wide * (1.0 - SAME_WIDTH)
         )
-        return inertial_filter.update(state, BIAS_ROWS, state.bias - self.mean, narrow * wide / (wide - narrow))
+        known = inertial_filter.update(state, BIAS_ROWS, state.bias - self.mean, narrow * wide / (wide - narrow))
+        unknown = np.ones(inertial_filter.SIZE)
+        unknown[inertial_filter.BIAS] = np.sqrt(self._share_of_width(difference, variance, narrow))
+        return replace(known, P=known.P * np.outer(unknown, unknown))
+
+    def _share_of_width(self, difference: Vector6, variance: Vector6, narrow: Vector6) -> Vector6:
+        """Variance of the bias over all widths that the log allows, by that for the width of variance `narrow`; 1 or more.
+
+        Each width w shows the mean d g and the variance w^2 (1 - g) with g = w^2 / (w^2 + v).
+        """
+        assert self.least_std is not None
+        std, out = widened(self.std, difference, variance), np.ones(6)
+        for columns in COLUMNS.values():
+            width, weight = _possible_widths(std, self.least_std, difference, variance, columns)
+            square, d, v = width**2, difference[columns], variance[columns]
+            gain, usual_gain = square / (square + v), narrow[columns] / (narrow[columns] + v)
+            spread = square * (1.0 - gain) + (d * (gain - usual_gain)) ** 2
+            out[columns] = np.maximum(weight @ spread / (narrow[columns] * (1.0 - usual_gain)), 1.0)
+        return out
 
 
 def shown_bias(state: State, mean: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
@@ -70,17 +92,25 @@ def supported_std(std: Vector6, least_std: Vector6 | None, difference: Vector6, 
     std = widened(std, difference, variance)
     if least_std is None:
         return std
-    share = np.linspace(0.0, 1.0, WIDTHS)[:, None]
     for columns in COLUMNS.values():
-        shown = columns.start + np.flatnonzero(np.isfinite(variance[columns]))
-        least = np.minimum(least_std, std)
-        width = least ** (1.0 - share) * std**share
-        expected = width[:, shown] ** 2 + variance[shown]
-        log_likelihood = -0.5 * (difference[shown] ** 2 / expected + np.log(expected)).sum(axis=1)
-        weight = np.exp(log_likelihood - log_likelihood.max())
-        mean_share = float(weight @ share[:, 0] / weight.sum())
-        std[columns] = least[columns] ** (1.0 - mean_share) * std[columns] ** mean_share
+        width, weight = _possible_widths(std, least_std, difference, variance, columns)
+        std[columns] = np.exp(weight @ np.log(width))
     return std
+
+
+def _possible_widths(
+    std: Vector6, least_std: Vector6, difference: Vector6, variance: Vector6, columns: slice
+) -> tuple[Float64[np.ndarray, "widths 3"], Float64[np.ndarray, " widths"]]:
+    """Widths of a sensor's prior from the least to the most, and their probabilities given what the log shows."""
+    share = np.linspace(0.0, 1.0, WIDTHS)[:, None]
+    most = std[columns]
+    width = np.minimum(least_std[columns], most) ** (1.0 - share) * most**share
+    d, v = difference[columns], variance[columns]
+    shown = np.isfinite(v)
+    expected = width[:, shown] ** 2 + v[shown]
+    log_likelihood = -0.5 * (d[shown] ** 2 / expected + np.log(expected)).sum(axis=1)
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    return width, weight / weight.sum()
 
 
 def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
