@@ -61,14 +61,15 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
         again = itertools.islice(filter_blocks(model, [relative_samples(imu)], before), len(rest_blocks))
         rest_blocks = _first_stop(model, stop, before) or list(again)
-    state = before.supported(rest_blocks[-1].step.after, end_s)
-    std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
+    last = [rest_blocks[-1].step.after] * 2
+    (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
+    std = np.sqrt(np.diag(P))  # in motion, where the bias is used
     noise = white_noise(u)
     source = f"{end_s - rest_blocks[0].start_s:.1f} s at rest from 0.0 s on"
     if model.card:
         source = f"{source}, {training_source(model)}"
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
-    return InitialBias(state.rest_bias(True), std, how, noise, follows=before, hold_s=end_s)
+    return InitialBias(rest, std, how, noise, follows=before, hold_s=end_s)
 
 
 def _first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:
