@@ -23,6 +23,7 @@ class Switchings(Settings, frozen=True, kw_only=True):
     misalignment_rad: float = 0.002
     mount_rad: float = np.radians(0.5)  # marker frame against sensor, from log to log
     clock_s: float = 0.004  # clock of the poses, from log to log
+    truth_noise: float = 1e-3  # rad and m of a pose
     noise_rad_s_rthz: float = 2e-4
     walk_rad_s2_rthz: float = 1e-5
     rest_s: float = 20.0
@@ -44,8 +45,8 @@ def log(seed: int, switching: int, kind: Switchings | None = None) -> Recording:
         sensor_seed=kind.sensor_seed,
         gyro=msgspec.structs.replace(GYRO, **sensor, **noise),
         accel=msgspec.structs.replace(ACCEL, **sensor),
-        truth_noise_rad=1e-3,
-        truth_noise_m=1e-3,
+        truth_noise_rad=kind.truth_noise,
+        truth_noise_m=kind.truth_noise,
     )
     once, own = np.random.default_rng([switching, 1]), np.random.default_rng([seed, 2])
     bias = np.concatenate([kind.turn_on_rad_s * once.normal(size=3), kind.turn_on_m_s2 * once.normal(size=3)])
