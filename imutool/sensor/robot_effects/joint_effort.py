@@ -48,7 +48,7 @@ class _Friction:
         sign = np.clip(velocity / self.steep, -1.0, 1.0)
         force = theta[0] * sign * (self._near_rest(velocity, theta) if len(theta) > 1 else 1.0)
         if self.command:
-            rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(LEAST_REST))
+            rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(LEAST_REST, bool))
             held = np.clip(s.channel(self.command) - s.y[:, self.joint], -np.abs(theta[0]), np.abs(theta[0]))
             force = np.where(rests, held, force)
         return s.with_added(self.joint, force)
@@ -58,9 +58,9 @@ class _Friction:
 
 
 def with_stiction(effect: Effect) -> Effect:
-    """Coulomb friction that holds a joint at rest with any force up to its level; another effect as it is.
+    """Coulomb friction that holds a joint at rest; any other effect as it is.
 
-    At rest the force is what the command leaves over (eq. 3 of the survey), so that only a sliding joint shows the level. It
+    At rest the force is what the command leaves over, up to the level (eq. 3 of the survey): sliding alone shows the level. It
     follows the recording there, and can therefore not be searched for.
     """
     if effect.name != "coulomb_friction" or not isinstance(effect.forward, _Friction):
