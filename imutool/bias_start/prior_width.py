@@ -21,6 +21,9 @@ SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width o
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
+Rows6 = Float64[np.ndarray, "*batch 6"]
+
+
 @dataclass(frozen=True)
 class BiasPrior:
     """Prior of a run's biases.
@@ -42,7 +45,7 @@ class BiasPrior:
     ) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, "m 6 6"]]:
         """Rest biases and covariances of a filter that began with `std`.
 
-        They are those for the width that the log supports until each time.
+        They are those for the width that the log supports until each time; the covariance counts that this width is not known.
         """
         bias, ground = (np.array([getattr(state, part) for state in states]) for part in ("bias", "ground"))
         P = np.array([state.P[BIASES, BIASES] for state in states])
@@ -55,9 +58,28 @@ class BiasPrior:
             K, P = inertial_filter.gain(P, BIAS_ROWS, narrow * wide / (wide - narrow))
             moved = (K @ (bias - self.mean)[..., None])[..., 0]
             bias, ground = bias - moved[:, :6], ground - moved[:, 6:]
+            wider = np.ones((len(P), P.shape[1]))
+            wider[:, :6] = np.sqrt(self._share_of_width(difference, variance, narrow))
+            P = P * wider[:, :, None] * wider[:, None, :]
         both = P[:, :6, :6] + P[:, :6, 6:] + P[:, 6:, :6] + P[:, 6:, 6:]
         at_rest = resting[:, None, None]
         return np.where(at_rest[..., 0], bias + ground, bias), np.where(at_rest, both, P[:, :6, :6])
+
+    def _share_of_width(self, difference: Rows6, variance: Rows6, narrow: Rows6) -> Rows6:
+        """Variance of the bias over all widths that the log allows, by that for the width of variance `narrow`; 1 or more.
+
+        Each width w shows the mean d g and the variance w^2 (1 - g) with g = w^2 / (w^2 + v).
+        """
+        assert self.least_std is not None
+        std, out = widened(self.std, difference, variance), np.ones_like(difference)
+        for columns in COLUMNS.values():
+            width, weight = _possible_widths(std, self.least_std, difference, variance, columns)
+            square, d, v = width**2, difference[:, None, columns], variance[:, None, columns]
+            usual = narrow[:, None, columns]
+            gain, usual_gain = square / (square + v), usual / (usual + v)
+            spread = square * (1.0 - gain) + (d * (gain - usual_gain)) ** 2
+            out[:, columns] = np.maximum((weight * spread / (usual * (1.0 - usual_gain))).sum(axis=1), 1.0)
+        return out
 
 
 def shown_bias(
@@ -94,14 +116,23 @@ def supported_std(
     if least_std is None:
         return out
     for columns in COLUMNS.values():
-        most, square, noise = out[..., columns], difference[..., None, columns] ** 2, variance[..., None, columns]
-        least, shown = np.minimum(least_std[columns], most), np.isfinite(noise)
-        expected = (least[..., None, :] ** (1.0 - SHARES) * most[..., None, :] ** SHARES) ** 2 + np.where(shown, noise, 1.0)
-        log_likelihood = -0.5 * np.where(shown, square / expected + np.log(expected), 0.0).sum(axis=-1)
-        weight = np.exp(log_likelihood - log_likelihood.max(axis=-1, keepdims=True))
-        mean_share = (weight * SHARES[:, 0]).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)
-        out[..., columns] = least ** (1.0 - mean_share) * most**mean_share
+        _, weight = _possible_widths(out, least_std, difference, variance, columns)
+        most, mean_share = out[..., columns], (weight * SHARES).sum(axis=-2)
+        out[..., columns] = np.minimum(least_std[columns], most) ** (1.0 - mean_share) * most**mean_share
     return out
+
+
+def _possible_widths(
+    std: Rows6, least_std: Vector6, difference: Rows6, variance: Rows6, columns: slice
+) -> tuple[Float64[np.ndarray, "*batch widths 3"], Float64[np.ndarray, "*batch widths 1"]]:
+    """Widths of a sensor's prior from the least to the most, and their probabilities given what the log shows."""
+    most, square, noise = std[..., None, columns], difference[..., None, columns] ** 2, variance[..., None, columns]
+    shown = np.isfinite(noise)
+    width = np.minimum(least_std[columns], most) ** (1.0 - SHARES) * most**SHARES
+    expected = width**2 + np.where(shown, noise, 1.0)
+    log_likelihood = -0.5 * np.where(shown, square / expected + np.log(expected), 0.0).sum(axis=-1, keepdims=True)
+    weight = np.exp(log_likelihood - log_likelihood.max(axis=-2, keepdims=True))
+    return width, weight / weight.sum(axis=-2, keepdims=True)
 
 
 def widened(

@@ -13,6 +13,8 @@ chi-square's. The coverage is the share of windows within the ellipsoids that sh
 `--left-out` each log is judged by the closed form of all others. `--made-up` draws sensors, each with its own size of errors
 and noise, learns each from `TRAINING` logs of one switching-on, and judges it by the exact poses of `TESTS` logs of others:
 here the poses have no error, and there are windows enough to see a few points. V1_01 is compared with its recomputed truth.
+With `--factor` a second coverage stands beside the first: each log's covariance of the bias times a factor by which the other
+logs' 68 % ellipsoids hold 68 % of their windows (split conformal prediction, with the logs as the sample).
 
 The calibration's share of a window's covariance is that of the slope: its unknowns are the same at every sample, and what goes
 with the motion mostly cancels over 15 s, which the samples' covariances one by one do not show. What a measurement is worth is
@@ -61,7 +63,21 @@ WINDOWS_S = (1.0, 5.0, 15.0)
 RECOMPUTED = "/ground_truth_recomputed/pose"
 TRAINING, TESTS = 4, 3
 
-Judgement = tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 3"]]
+MOST_FACTOR, PRIOR_LOGS = 16.0, 3  # of a covariance; n logs of three axes show the factor's logarithm to sqrt(2 / 3n)
+BISECTIONS = 40
+
+
+class Judgement(NamedTuple):
+    """Errors of a log's windows, and their covariance: the bias's part, and that of noise, poses and measurement."""
+
+    error: Float64[np.ndarray, "m 3"]
+    bias: Float64[np.ndarray, "m 3 3"]
+    other: Float64[np.ndarray, "m 3 3"]
+
+    def squares(self, factor: float | Float64[np.ndarray, "m 1 1"] = 1.0) -> Float64[np.ndarray, " m"]:
+        """Normalised squares of the errors, with a factor on the bias's part."""
+        P = factor * self.bias + self.other
+        return np.asarray(np.einsum("mi,mi->m", self.error, np.linalg.solve(P, self.error[..., None])[..., 0]))
 
 
 class Case(NamedTuple):
@@ -82,6 +98,7 @@ def main() -> None:
     which.add_argument("--made-up", type=int, metavar="SENSORS")
     parser.add_argument("--start", action="append", choices=STARTS)
     parser.add_argument("--each-log", action="store_true")
+    parser.add_argument("--factor", action="store_true")
     options = parser.parse_args()
     found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
     starts = options.start or STARTS
@@ -90,12 +107,12 @@ def main() -> None:
         for start in starts:
             for quantity, one in judged(case, start):
                 found[start, quantity].append(one)
-                if options.each_log and len(one[0]):
+                if options.each_log and len(one.error):
                     print(f"{start:7}{quantity:16}{case.recording.name:24}", told([one]), flush=True)
     for start in starts:
         for (of, quantity), logs in found.items():
             if of == start:
-                print(f"{start:7}{quantity:16}{'all':24}", told(logs))
+                print(f"{start:7}{quantity:16}{'all':24}", told(logs), with_factor(logs) if options.factor else "")
 
 
 def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
@@ -118,6 +135,7 @@ def made_up(sensors: int) -> Iterator[Case]:
             misalignment_rad=10.0 ** rng.uniform(-3.0, -1.7),
             noise_rad_s_rthz=10.0 ** rng.uniform(-4.3, -3.3),
             walk_rad_s2_rthz=10.0 ** rng.uniform(-5.5, -4.3),
+            room_m=10.0 ** rng.uniform(-0.7, 0.3),
             mount_rad=0.0,
             clock_s=0.0,
             rest_s=float(rng.choice([0.0, 8.0])),
@@ -155,9 +173,8 @@ def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
     yield "bias", rest_bias(model, begun, one, from_s, recording)
     for length_s in WINDOWS_S:
         grown = one.errors(length_s, from_s)
-        P = grown.bias + grown.other
-        yield f"attitude {length_s:g} s", (grown.error[:, :3], P[:, :3, :3])
-        yield f"velocity {length_s:g} s", (grown.error[:, 3:], P[:, 3:, 3:])
+        for name, axes in (("attitude", slice(0, 3)), ("velocity", slice(3, 6))):
+            yield f"{name} {length_s:g} s", Judgement(grown.error[:, axes], *(P[:, axes, axes] for P in grown[1:]))
 
 
 def rest_bias(model: BiasModel, begun: InitialBias, one: Judged, from_s: float, recording: Recording) -> Judgement:
@@ -168,8 +185,8 @@ def rest_bias(model: BiasModel, begun: InitialBias, one: Judged, from_s: float, 
     for rows in one.motion.windows(TRUTH_S, from_s):
         T = slope_of(one.motion, rows, S)
         errors.append(gyro_offset(one.motion, rows))
-        covariances.append(one.stated.rest[rows, :3, :3].mean(axis=0) + T @ T.T + measured)
-    return np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3))
+        covariances.append(one.stated.rest[rows, :3, :3].mean(axis=0) + T @ T.T)
+    return Judgement(np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.tile(measured, (len(errors), 1, 1)))
 
 
 def gyro_offset(motion: Motion, rows: slice) -> Float64[np.ndarray, "3"]:
@@ -203,14 +220,52 @@ def measured_variance(model: BiasModel, one: Judged, recording: Recording) -> Fl
 
 def told(logs: list[Judgement]) -> str:
     """The figures of `support.nees` in a line."""
-    e, P = (np.concatenate(parts) for parts in zip(*logs, strict=True))
-    if not len(e):
+    error, bias, other = (np.concatenate(parts) for parts in zip(*logs, strict=True))
+    if not len(error):
         return "no window"
-    found = consistency(e, P)
+    found = consistency(error, bias + other)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
-    squares = np.einsum("mi,mij,mj->m", e, np.linalg.inv(P), e)
-    covered = " / ".join(f"{100 * (squares <= chi2.ppf(share, 3)).mean():.0f}" for share in SHARES)
-    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered} %"
+    covered = coverage(np.concatenate([log.squares() for log in logs]))
+    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered}"
+
+
+def coverage(squares: Float64[np.ndarray, " m"]) -> str:
+    """Shares of windows within the ellipsoids of `SHARES`."""
+    return " / ".join(f"{100 * (squares <= chi2.ppf(share, 3)).mean():.0f}" for share in SHARES) + " %"
+
+
+def with_factor(logs: list[Judgement]) -> str:
+    """Coverage with each log's covariance times the factor that the other logs ask for."""
+    logs = [log for log in logs if len(log.error)]
+    if len(logs) < 2:
+        return ""
+    needed = [needed_factors(log) for log in logs]
+    factors = [factor_of([n for n in needed if n is not own]) for own in needed]
+    squares = np.concatenate([log.squares(factor) for log, factor in zip(logs, factors, strict=True)])
+    return f" with a factor of {np.exp(np.mean(np.log(factors))):.2f}: {coverage(squares)}"
+
+
+def needed_factors(log: Judgement) -> Float64[np.ndarray, " m"]:
+    """Factor on the bias's covariance that puts each window on its ellipsoid of `SHARES[0]`, by bisection of its logarithm."""
+    low, high = np.full(len(log.error), -np.log(MOST_FACTOR)), np.full(len(log.error), np.log(MOST_FACTOR))
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        outside = log.squares(np.exp(middle)[:, None, None]) > chi2.ppf(SHARES[0], 3)
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    return np.asarray(np.exp(0.5 * (low + high)))
+
+
+def factor_of(needed: list[Float64[np.ndarray, " _"]]) -> float:
+    """Conformal quantile of what the windows of n logs need, each log with the same weight.
+
+    The share asked for is n + 1 to n larger, since the next log is none of these. The logarithm of the factor has a prior of
+    about 0.5 around zero: that of n logs counts n / (n + `PRIOR_LOGS`).
+    """
+    weight = np.concatenate([np.full(len(of_log), 1.0 / len(of_log)) for of_log in needed]) / len(needed)
+    ordered = np.argsort(values := np.concatenate(needed))
+    level = min(SHARES[0] * (1.0 + 1.0 / len(needed)), 1.0)
+    row = min(int(np.searchsorted(np.cumsum(weight[ordered]), level - 1e-9)), len(values) - 1)
+    return float(values[ordered[row]] ** (len(needed) / (len(needed) + PRIOR_LOGS)))
 
 
 if __name__ == "__main__":
