@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
 
+from imutool.array_types import Float64, Int64, UInt8
 from imutool.errors import DataError
 from imutool.mcap_io.codec.schemas import (
     ACCEL,
