@@ -1,6 +1,7 @@
 """Array types of annotations, with jaxtyping for type checkers and tests only.
 
-Elsewhere nobody looks at them, and a type is the bare array. jaxtyping takes 65 ms of CPU to import, a fifth of the start of a command: it imports unittest.mock, and that asyncio.
+Elsewhere nobody looks at them, and a type is the bare array. jaxtyping takes 65 ms of CPU to import, a sixth of the start of a
+command: it imports unittest.mock, and that asyncio.
 """
 
 from __future__ import annotations

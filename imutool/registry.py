@@ -37,7 +37,7 @@ def names(group: str) -> list[str]:
 
 
 def entry_points(*, group: str) -> Iterable[EntryPoint]:
-    """Entry points of a group; the import takes 15 ms, and most commands ask for nothing from outside."""
+    """Entry points of a group; most commands ask for none, and the import takes 15 ms."""
     from importlib.metadata import entry_points as installed
 
     return installed(group=group)
