@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected

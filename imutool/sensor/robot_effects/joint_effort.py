@@ -18,9 +18,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.ndimage import binary_opening
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.joint_dynamics import chain_columns, mass_coefficients
 from imutool.sensor.robot_effects.scale import Scale
