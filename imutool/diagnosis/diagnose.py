@@ -88,6 +88,30 @@ def diagnose(
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     warn_of_recordings(recordings)
+    others = [topic for topic in topics if topic != first] if len(reals) == 1 and first in topics else []
+    if others and sim is None and not recordings[0].truths:
+        diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
+    else:
+        told = [log.remark for log in logs_read if log.remark]
+        diagnosis = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings)
+    if others and first is not None:
+        diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
+    report(4, 4, "")
+    return diagnosis
+
+
+def _beside_reference(
+    recordings: Sequence[Recording],
+    reals: Sequence[Location],
+    sim: Location | None,
+    imu: str | None,
+    truth: str | None,
+    signals: Sequence[str],
+    told: Sequence[str],
+    report: Tell,
+    settings: DiagnoseSettings,
+) -> Diagnosis:
+    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read."""
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
@@ -114,23 +138,19 @@ def diagnose(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     caveat = reference_caveat(recordings) if simulated is None else ""
-    tried = tuple(dict.fromkeys(log.remark for log in logs_read if log.remark))
-    diagnosis = _with_reference(diagnosis, wrong, wrong_at, (*another, *left_out, *diagnosis.remarks, *tried), caveat)
-    if len(topics) > 1 and len(reals) == 1 and first in topics:
-        report(3, 4, "the other IMUs")
-        diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, topics, settings)
+    remarks = (*another, *left_out, *diagnosis.remarks, *dict.fromkeys(told))
+    diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
-    report(4, 4, "")
     return diagnosis
 
 
 def _with_other_imus(
-    diagnosis: Diagnosis, recording: Recording, real: Location, first: str, topics: Sequence[str], settings: DiagnoseSettings
+    diagnosis: Diagnosis, recording: Recording, real: Location, first: str, others: Sequence[str], settings: DiagnoseSettings
 ) -> Diagnosis:
     """Adds the relation of each other IMU to the first, or the reason why there is none."""
-    imus, remarks = dict[str, Mapping[str, Estimate]](), [f"{len(topics)} IMUs; the findings are those of {first}"]
-    for topic in (name for name in topics if name != first):
+    imus, remarks = dict[str, Mapping[str, Estimate]](), [f"{1 + len(others)} IMUs; the findings are those of {first}"]
+    for topic in others:
         try:
             imus[topic] = imu_relation(recording, read_log(real, imu=topic), EVERY_UNIT, settings)
             remarks.append(imu_sentence(topic, first, imus[topic]))

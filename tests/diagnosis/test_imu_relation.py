@@ -20,9 +20,9 @@ ARM, CLOCK_S, OTHER_S = np.array([-0.3, 0.12, 0.05]), 0.006, 1.0 / 160.0
 SURE = 4.0
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two IMUs at rates of their own, and poses of the first."""
+@pytest.fixture(scope="module", params=[True, False], ids=["poses", "no poses"])
+def log(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """Two IMUs at rates of their own, with or without poses of the first."""
     felt, path = planted.rich(), planted.moving()
     other_s = np.arange(round((planted.DURATION_S - 1.0) / OTHER_S)) * OTHER_S
     moved = planted.ideal(felt, planted.acting({"lever_arm": ARM, "clock_offset": [CLOCK_S]}), other_s)
@@ -37,7 +37,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
             read = samples + planted.noise(len(t_s), seed) + seed * planted.BIAS
             t_ns = planted.START_NS + np.round(t_s * 1e9).astype(np.int64)
             rows.append((schemas.IMU, topic, t_ns, encode_imu(t_ns, read[:, :3], read[:, 3:], "unit")))
-        rows.append((schemas.POSE, POSES, poses.t_ns, encode_pose(poses.t_ns, poses.p_wb, poses.q_wb_wxyz, "world")))
+        if request.param:
+            rows.append((schemas.POSE, POSES, poses.t_ns, encode_pose(poses.t_ns, poses.p_wb, poses.q_wb_wxyz, "world")))
         for schema, topic, t_ns, payloads in rows:
             kind = writer.register_schema(schema, "ros2msg", schemas.definition(schema).encode())
             channel = writer.register_channel(topic, "cdr", kind)
