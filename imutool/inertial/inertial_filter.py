@@ -15,6 +15,8 @@ constant for the run. Measurements: at rest, velocity and rate are zero; in moti
 correlation time `speed_correlation_s`. Over tens of seconds the bound makes tilt observable through gravity, and with it the
 bias across gravity. For a body at several times `speed_m_s` the measurement gets less weight (Huber).
 
+Behind the 21 errors of pose, velocity and biases a state may have `offsets`: constants of other sensors, or random walks.
+
 Settings: about two dozen variants were compared on the training sequences, one changed at a time, with models trained on the
 test sequences. `tests/bench/starts.py` measures the result on the same sequences, so it is slightly optimistic.
 """
@@ -22,7 +24,7 @@ test sequences. `tests/bench/starts.py` measures the result on the same sequence
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -37,7 +39,7 @@ TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 POSE, BIAS, GROUND = slice(0, 9), slice(9, 15), slice(15, 21)
 SIZE = 21
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
-HAT_G, UNCHANGED = hat(G_W), np.eye(SIZE)
+HAT_G = hat(G_W)
 STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
@@ -46,10 +48,12 @@ HUBER = 2.0  # standard deviations of a speed, above which it gets less weight
 LEAST_FORCE_M_S2 = 1e-6  # below, a mean specific force has no direction
 LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
 MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
+PAUSE_RAD, PAUSE_M_S, PAUSE_M = 0.3, 3.0, 1e3  # of turn, velocity and (at most) position over a gap in which the pose stays
 
-Covariance = Float64[np.ndarray, "21 21"]
+Covariance = Float64[np.ndarray, "_ _"]  # 21, and one for each offset
 Vector6 = Float64[np.ndarray, "6"]
-Error = Float64[np.ndarray, "21"]
+Error = Float64[np.ndarray, " _"]
+Walk = Float64[np.ndarray, " _"]  # of b, then of the offsets, per second^1/2
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -68,7 +72,7 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class State:
-    """Filter state: pose, bias b in motion, offset d at rest, and covariance.
+    """Filter state: pose, bias b in motion, offset d at rest, covariance, and offsets of other sensors.
 
     Biases are gyro (rad/s), then accel (m/s²).
     """
@@ -79,6 +83,7 @@ class State:
     bias: Vector6
     ground: Vector6
     P: Covariance
+    offsets: Float64[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))
 
     def rest_bias(self, resting: bool) -> Vector6:
         """Bias of the sensor, at rest or in motion."""
@@ -100,6 +105,7 @@ class State:
             self.bias + e[BIAS],
             self.ground + e[GROUND],
             P,
+            self.offsets + e[SIZE:],
         )
 
     def minus(self, other: State) -> Error:
@@ -108,7 +114,7 @@ class State:
         xi = _log(E)
         J = _left_jacobian(xi)
         v, p = (np.linalg.solve(J, a - E @ b) for a, b in ((self.v_w, other.v_w), (self.p_wb, other.p_wb)))
-        return np.concatenate([xi, v, p, self.bias - other.bias, self.ground - other.ground])
+        return np.concatenate([xi, v, p, self.bias - other.bias, self.ground - other.ground, self.offsets - other.offsets])
 
 
 class Step(NamedTuple):
@@ -144,12 +150,12 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
     return State(exp(turn), np.zeros(3), np.zeros(3), bias, ground, P)
 
 
-def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
+def motion_step(x: State, motion: Increment, missing_s: float, walk: Walk, s: FilterSettings) -> Step:
     """Filter step over a block in motion.
 
     Prediction with the bias of `x`, then the bounded velocity.
 
-    `walk` is the random walk of b per second^1/2.
+    `walk` is the random walk of b and of the offsets per second^1/2.
     """
     T = motion.duration_s
     R = x.R_wb @ motion.R
@@ -163,7 +169,7 @@ def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s:
     return step._replace(after=update(step.expected, STOPPED, v, np.full(3, noise)))
 
 
-def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
+def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Walk, s: FilterSettings) -> Step:
     """Filter step over a block at rest.
 
     From the samples' mean and the variance of the gyro's mean.
@@ -186,14 +192,14 @@ def _predict(
     by_bias: Float64[np.ndarray, "9 6"],
     T: float,
     noise: tuple[float, float],
-    walk: Vector6,
+    walk: Walk,
     *,
     resting: bool,
 ) -> Step:
     """Predicted state after a block."""
     v = x.v_w + G_W * T + x.R_wb @ dv
     p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
-    F, V, X = UNCHANGED.copy(), hat(v), hat(p)
+    F, V, X = np.eye(len(x.P)), hat(v), hat(p)
     F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
     turned = R @ by_bias[:3]
     F[POSE, BIAS] = np.concatenate([turned, x.R_wb @ by_bias[3:6] + V @ turned, x.R_wb @ by_bias[6:] + X @ turned])
@@ -204,21 +210,23 @@ def _predict(
     turn_noise[TURN], turn_noise[VELOCITY], turn_noise[POSITION] = EYE, V, X
     push_noise[VELOCITY], push_noise[POSITION] = EYE, 0.5 * T * EYE
     P[POSE, POSE] += noise[0] * turn_noise @ turn_noise.T + noise[1] * push_noise @ push_noise.T
-    variances = P.reshape(-1)[:: SIZE + 1]
+    variances = P.reshape(-1)[:: len(P) + 1]
     variances += LEAST_VARIANCE
-    variances[BIAS] += walk**2 * T
-    expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T))
+    variances[BIAS] += walk[:6] ** 2 * T
+    variances[SIZE:] += walk[6:] ** 2 * T
+    expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T), x.offsets)
     return Step(x, expected, F, expected)
 
 
-def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
+def update(x: State, H: Float64[np.ndarray, "k m"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
     """Kalman update by z = H e + n.
 
-    With e the error of the estimate and `noise` the variances of n.
+    With e the first m errors of the estimate and `noise` the variances of n.
     """
+    H = H if H.shape[1] == len(x.P) else np.pad(H, ((0, 0), (0, len(x.P) - H.shape[1])))
     PH = x.P @ H.T
     K = np.linalg.solve(H @ PH + np.diag(noise), PH.T).T
-    I_KH = UNCHANGED - K @ H
+    I_KH = np.eye(len(x.P)) - K @ H
     P = I_KH @ x.P @ I_KH.T + (K * noise) @ K.T
     return x.moved(-K @ z, 0.5 * (P + P.T))
 
@@ -235,6 +243,14 @@ def smooth(steps: Sequence[Step]) -> list[State]:
         later = step.before.moved(C @ later.minus(step.expected), 0.5 * (P + P.T))
         states.append(later)
     return states[::-1]
+
+
+def pause_step(x: State, T: float, walk: Walk) -> Step:
+    """Step over a gap of T seconds in the samples: the state stays, less certain of its pose."""
+    std = np.repeat([PAUSE_RAD, PAUSE_M_S, min(PAUSE_M_S * T, PAUSE_M)], 3)
+    noise = np.concatenate([std**2, walk[:6] ** 2 * T, np.zeros(6), walk[6:] ** 2 * T]) + LEAST_VARIANCE
+    expected = replace(x, P=x.P + np.diag(noise))
+    return Step(x, expected, np.eye(len(x.P)), expected)
 
 
 def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, most: Vector6, s: FilterSettings) -> Step:
