@@ -1,4 +1,4 @@
-"""Aided path: the inertial filter over debiased samples from a known pose, with a log's aids, forward and backward.
+"""Aided path: the inertial filter over debiased samples and aids, forward and backward.
 
 At the end of each of the filter's blocks (`imutool.inertial.inertial_filter`) an aid measures
 

@@ -58,7 +58,7 @@ class FilteredBlock(NamedTuple):
 
 
 class Aiding(NamedTuple):
-    """What aids a filter that keeps its pose: a measurement at the end of each block, stops, the walk of its offsets."""
+    """Aids of a filter that keeps its pose: measurement per block, stops, walk of offsets."""
 
     measure: Callable[[State, float], State]  # of the state at a time (s)
     stops: bool

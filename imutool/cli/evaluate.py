@@ -107,13 +107,8 @@ def evaluate(
             first = len(results)
             refused: dict[str, ImutoolError] = {}
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
-            more: dict[str, Any] = {
-                "aid": aid or ("stops" if zupt else None),
-                "trajectories": trajectories,
-                "overwrite": overwrite,
-            }
-            more["refused"] = refused.__setitem__
-            results += run(log, models=model or (), **read, **more)
+            more: dict[str, Any] = {"trajectories": trajectories, "overwrite": overwrite, "refused": refused.__setitem__}
+            results += run(log, models=model or (), aid=aid or ("stops" if zupt else None), **read, **more)
             errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +22,7 @@ from imutool.geometry import quaternion
 from imutool.inertial.metrics import align
 from imutool.inertial.preintegration import hat
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.mcap_io.codec.schemas import MESSAGE_TWISTS, ODOMETRY, PRESSURE, TF
+from imutool.mcap_io.codec.schemas import MESSAGE_TWISTS, PRESSURE, TF
 from imutool.mcap_io.fields import numbers, numeric_fields, split
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
@@ -32,11 +31,10 @@ from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.recording.columns import ClockRun
 from imutool.recording.message_log import named_kind
 
-STOPS, BAROMETER, ODOMETRY_AID, GROUND = KINDS = ("stops", "barometer", "odometry", "ground")
+STOPS, BAROMETER, WHEELS, GROUND = KINDS = ("stops", "barometer", "odometry", "ground")
 AUTO = "auto"
 BLOCK_NS = 500_000_000  # over which the accelerations of odometry and IMU are compared
 MOST_MOUNT_STD_RAD = 0.2  # of a mount that the motion shows
-SMALLEST = 1e-12
 SAME_M, LEAST_PATH_M = 1e-3, 1.0  # odometry as near to the truth, over such a path, is the truth
 PRESSURE_UNITS = {"Pa": (1.5e4, 1.2e5), "hPa": (150.0, 1200.0), "kPa": (15.0, 120.0)}
 SEA_PA, EXPONENT, FACTOR_M = 101_325.0, 0.190263, 44_330.8  # of the standard atmosphere, ISO 2533
@@ -45,7 +43,6 @@ NO_HEIGHT = re.compile(
     r"diff|dynamic|airspeed|temp|ti?y?re|estimat|innov|bias|gps|gnss|navsat|global|setpoint|home|_id\b|count|ratio"
 )
 COMMAND = re.compile(r"cmd|command|setpoint|target|desired")
-MOST_LISTED = 12
 
 logger = logging.getLogger(__name__)
 Vectors = Float64[np.ndarray, "n 3"]
@@ -53,7 +50,7 @@ Vectors = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True)
 class Odometry:
-    """Velocity of a vehicle in its own frame, as poses with velocity; R_vb turns the IMU's vectors to that frame."""
+    """Poses of a vehicle with velocity; R_vb turns the IMU's vectors to the vehicle's frame."""
 
     poses: Poses
     R_vb: Float64[np.ndarray, "3 3"]
@@ -70,7 +67,7 @@ class Aids:
 
 
 def parse_aids(words: str) -> dict[str, str]:
-    """Topic by kind of words such as `stops,barometer=/baro`; empty where the log is searched for it.
+    """Topic by kind, of words such as `stops,barometer=/baro`; empty: to be searched for.
 
     Raises:
         ConfigError: an unknown kind.
@@ -78,7 +75,7 @@ def parse_aids(words: str) -> dict[str, str]:
     asked = dict[str, str]()
     for word in words.split(","):
         kind, _, topic = word.strip().partition("=")
-        if kind not in (*KINDS, AUTO) or (topic and kind not in (BAROMETER, ODOMETRY_AID)):
+        if kind not in (*KINDS, AUTO) or (topic and kind not in (BAROMETER, WHEELS)):
             fix = did_you_mean(kind, KINDS) or "Only barometer and odometry take a topic"
             raise ConfigError(f"aid {word!r}", where="aid", expected=f"auto, or some of {', '.join(KINDS)}", fix=fix)
         asked[kind] = topic
@@ -94,49 +91,32 @@ def find_aids(log: Log, recording: Recording, asked: dict[str, str]) -> Aids:
         LogError: the log has no such aid; the message lists the topics that were looked at.
         DataError: it cannot be used: the truth itself, values of no pressure, a motion that does not show the mount.
     """
-    wanted = dict.fromkeys((STOPS, BAROMETER, ODOMETRY_AID), "") | asked if AUTO in asked else asked
+    wanted = dict.fromkeys((STOPS, BAROMETER, WHEELS), "") | asked if AUTO in asked else asked
     found = Aids({STOPS: ""} if STOPS in wanted else {})
-    for kind, read in ((BAROMETER, _with_height), (ODOMETRY_AID, _with_odometry)):
+    for kind, offered, read in ((BAROMETER, _barometers, _with_height), (WHEELS, _wheels, _with_odometry)):
         if kind not in wanted:
             continue
+        names, looked_at = ([wanted[kind]], "") if wanted[kind] else offered(log, recording)
+        if not names and kind in asked:
+            raise LogError(
+                f"no {kind} in this log; looked at {looked_at}", where=log.path, fix="Name a topic, or leave this aid out"
+            )
         try:
-            found = read(found, log, recording, wanted[kind])
+            found = read(found, log, recording, names[0]) if names else found
         except (LogError, DataError) as error:
             if kind in asked:
                 raise
-            if not isinstance(error, _AbsentError):
-                logger.warning("%s: the aid %s is left out: %s", recording.name, kind, error)
+            logger.warning("%s: the aid %s is left out: %s", recording.name, kind, error)
     if GROUND in wanted or found.odometry is not None:
         what = "vehicle frame of the odometry" if found.odometry else "x of the IMU is forward, levelled"
         found = replace(found, signals=found.signals | {GROUND: what})
     return found
 
 
-class _AbsentError(LogError):
-    """No topic of the log is such an aid."""
-
-
-def _absent(log: Log, what: str, expected: str, looked_at: Sequence[str]) -> _AbsentError:
-    more = f" and {len(looked_at) - MOST_LISTED} more" if len(looked_at) > MOST_LISTED else ""
-    listed = ", ".join(looked_at[:MOST_LISTED]) + more
-    return _AbsentError(
-        f"no {what} in this log; looked at {listed or 'its topics, of which none is of such a type'}",
-        where=log.path,
-        expected=expected,
-        fix="Name the topic, or leave this aid out",
-    )
-
-
 def _with_height(found: Aids, log: Log, recording: Recording, signal: str) -> Aids:
     """With the height of a barometer."""
     if signal in log.topics and log.topics[signal].schema_name == PRESSURE:
         signal += ".fluid_pressure"
-    if not signal:
-        names = _heights(log, recording)
-        if not names:
-            looked_at = [f"{t.name} ({t.schema_name})" for t in log.topics.values() if HEIGHT_NAME.search(t.name.lower())]
-            raise _absent(log, "barometer", f"{PRESSURE}, or a number named pressure or altitude", looked_at)
-        signal = names[0]
     topic, field = split(log, signal)
     t_ns, values = _of_stretch(recording.imu, *numbers(log, topic, (field,)))
     if len(t_ns) < 2:
@@ -145,20 +125,16 @@ def _with_height(found: Aids, log: Log, recording: Recording, signal: str) -> Ai
     return replace(found, signals=found.signals | {BAROMETER: f"{signal} ({unit})"}, height=Scalars(t_ns, height[:, None], "m"))
 
 
-def _heights(log: Log, recording: Recording) -> list[str]:
-    """Signals that are a pressure or a barometric altitude: FluidPressure first, then by their number of messages."""
-    ranked = list[tuple[bool, int, str]]()
+def _barometers(log: Log, recording: Recording) -> tuple[list[str], str]:
+    """Pressures and barometric altitudes, FluidPressure first, then by their number of messages; and what was looked at."""
+    ranked, looked_at = list[tuple[bool, int, bool, str]](), list[str]()
     for topic in log.topics.values():
         named = f"{topic.name} {topic.schema_name}".lower()
-        if (
-            topic.is_derived
-            or not topic.count
-            or NO_HEIGHT.search(named)
-            or named_kind(topic.name, "") in ("truth", "estimate")
-        ):
-            continue
-        if not HEIGHT_NAME.search(f"{named} {_definition(log, topic.name)}"):
+        if not topic.count or topic.is_derived or not HEIGHT_NAME.search(f"{named} {_definition(log, topic.name)}"):
             continue  # the first message of no other topic is looked at
+        looked_at.append(f"{topic.name} ({topic.schema_name})")
+        if NO_HEIGHT.search(named) or named_kind(topic.name, "") in ("truth", "estimate"):
+            continue
         try:
             fields = numeric_fields(log, topic.name, long=False)
         except LogError:
@@ -166,8 +142,8 @@ def _heights(log: Log, recording: Recording) -> list[str]:
         for field in ["fluid_pressure"] if topic.schema_name == PRESSURE else fields:
             text = named if field == "data" else field
             if HEIGHT_NAME.search(text) and not NO_HEIGHT.search(text):
-                ranked.append((topic.schema_name != PRESSURE, -topic.count, f"{topic.name}.{field}"))
-    return [name for _, _, name in sorted(ranked, key=lambda entry: (entry[:2], "pressure" not in entry[2]))]
+                ranked.append((topic.schema_name != PRESSURE, -topic.count, "pressure" not in field, f"{topic.name}.{field}"))
+    return [name for *_, name in sorted(ranked)], ", ".join(looked_at) or "types and names, of which none is of a pressure"
 
 
 def _definition(log: Log, name: str) -> str:
@@ -201,23 +177,25 @@ def _of_stretch(
     return t_ns[rises], values[rises]
 
 
+def _wheels(log: Log, recording: Recording) -> tuple[list[str], str]:
+    """Topics of wheel odometry, and what was looked at."""
+    pose_topics = log.pose_topics
+    every = [t for t in log.topics.values() if t.schema_name in MESSAGE_TWISTS or t.name in pose_topics]
+    kinds = {t.name: "truth" if _is_truth(t, recording) else _kind(t) for t in every if t.count}
+    listed = ", ".join(f"{name} ({kind})" for name, kind in kinds.items())
+    return [
+        name for name, kind in kinds.items() if kind == WHEELS
+    ], listed or "types, of which none is of poses or a TwistStamped"
+
+
 def _with_odometry(found: Aids, log: Log, recording: Recording, name: str) -> Aids:
     """With the velocity of wheel odometry."""
-    pose_topics = log.pose_topics
-    looked_at = [t for t in log.topics.values() if t.schema_name in MESSAGE_TWISTS or t.name in pose_topics]
-    if not name:
-        names = [t.name for t in looked_at if t.count and not _is_truth(t, recording) and _kind(t) == ODOMETRY_AID]
-        if not names:
-            listed = [f"{t.name} ({'truth' if _is_truth(t, recording) else _kind(t)})" for t in looked_at]
-            raise _absent(log, "wheel odometry", f"{ODOMETRY} or a TwistStamped, not the truth, estimate or command", listed)
-        name = names[0]
-    topic = log.topics.get(name)
-    if name in recording.truths or (topic is not None and _is_truth(topic, recording)):
+    if name in recording.truths or (name in log.topics and _is_truth(log.topics[name], recording)):
         raise DataError(f"{name} is the truth, and no aid", where=recording.name, expected="a topic of wheel odometry")
     poses = _poses(log, name, recording)
     if recording.truths and _same_path(poses, recording.truth):
         raise DataError(f"{name} moves exactly as the truth, and is no aid", where=recording.name, expected="wheel odometry")
-    return replace(found, signals=found.signals | {ODOMETRY_AID: name}, odometry=_mounted(poses, recording.imu, name))
+    return replace(found, signals=found.signals | {WHEELS: name}, odometry=_mounted(poses, recording.imu, name))
 
 
 def _is_truth(topic: Topic, recording: Recording) -> bool:
@@ -231,7 +209,7 @@ def _kind(topic: Topic) -> str:
     if COMMAND.search(topic.name.lower()):
         return "command"
     kind = named_kind(topic.name, "")
-    return ODOMETRY_AID if kind == "unknown" else kind
+    return WHEELS if kind == "unknown" else kind
 
 
 def _poses(log: Log, name: str, recording: Recording) -> Poses:
@@ -297,7 +275,7 @@ def _mounted(poses: Poses, imu: Imu, name: str) -> Odometry:
     R_vb = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
     residual = float(((f_v - f_b @ R_vb.T) ** 2).sum()) / (3 * len(f_v) - 3)
     information = np.linalg.eigvalsh(-(hat(f_v) @ hat(f_v)).sum(axis=0)).min()
-    std = float(np.sqrt(residual / max(information, SMALLEST)))
+    std = float(np.sqrt(residual / max(information, np.finfo(float).tiny)))
     if std > MOST_MOUNT_STD_RAD:
         raise DataError(
             f"the motion does not show how the IMU is mounted in the frame of {name}",

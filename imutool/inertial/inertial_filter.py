@@ -72,7 +72,7 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class State:
-    """Filter state: pose, bias b in motion, offset d at rest, covariance, and offsets of other sensors.
+    """Filter state: pose, bias b in motion, offset d at rest, covariance, other offsets.
 
     Biases are gyro (rad/s), then accel (m/s²).
     """

@@ -92,7 +92,7 @@ def split(log: Log, signal: str) -> tuple[str, str]:
 
 
 def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
-    """Paths of the numbers in a topic's first message, without stamps; `long` arrays by their first elements, else left out.
+    """Paths of the numbers in a topic's first message, without stamps; `long` arrays if asked.
 
     Raises:
         LogError: no definition or another encoding than ros2msg and cdr.

@@ -130,7 +130,7 @@ def test_the_truth_is_no_aid_by_any_name(drive: Drive, tmp_path: Path) -> None:
     assert found(path, "auto").signals == {"stops": ""}
     del topics["/odom"]
     path = driven.write(tmp_path / "b.mcap", drive.imu, drive.truth, topics)
-    with pytest.raises(LogError, match="no wheel odometry in this log; looked at") as error:
+    with pytest.raises(LogError, match="no odometry in this log; looked at") as error:
         found(path, "odometry")
     assert all(
         text in str(error.value) for text in ("/ground_truth/pose (truth)", "/ekf/odom (estimate)", "/cmd_vel (command)")
