@@ -74,7 +74,7 @@ def evaluate(
     init: Init = "auto",
     smooth: Smooth = False,
     aid: Annotated[str | None, typer.Option(metavar="KIND,...", help=AID_HELP)] = None,
-    zupt: Annotated[bool, typer.Option("--zupt", help="The same as --aid stops.", hidden=True)] = False,
+    zupt: Annotated[bool, typer.Option("--zupt", help="The same as --aid stops.")] = False,
     truth: Truth = None,
     imu: Imu = None,
     trajectories: Annotated[
