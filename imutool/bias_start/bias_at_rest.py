@@ -6,7 +6,7 @@ True rate zero, specific force g along an unknown direction.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -34,6 +34,7 @@ from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, 
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
+PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
@@ -59,21 +60,30 @@ def auto(model: BiasModel, imu: Imu) -> InitialBias:
     if (wide > before.std).any():
         before = replace(before, std=wide)
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
-        again = itertools.islice(filter_blocks(model, [relative_samples(imu)], before), len(rest_blocks))
+        again = itertools.islice(filter_blocks(model, _pieces(imu), before), len(rest_blocks))
         rest_blocks = _first_stop(model, stop, before) or list(again)
-    state = before.supported(rest_blocks[-1].step.after, end_s)
-    std = np.sqrt(np.diag(state.covariance(False)))  # in motion, where the bias is used
+    last = [rest_blocks[-1].step.after] * 2
+    (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
+    std = np.sqrt(np.diag(P))  # in motion, where the bias is used
     noise = white_noise(u)
     source = f"{end_s - rest_blocks[0].start_s:.1f} s at rest from 0.0 s on"
     if model.card:
         source = f"{source}, {training_source(model)}"
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
-    return InitialBias(state.rest_bias(True), std, how, noise, follows=before, hold_s=end_s)
+    return InitialBias(rest, std, how, noise, follows=before, hold_s=end_s)
 
 
 def _first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:
     """Filtered blocks of the stop at the beginning of some samples; none if they begin in motion."""
-    return list(itertools.takewhile(lambda b: b.resting, filter_blocks(model, [relative_samples(imu)], before)))
+    return list(itertools.takewhile(lambda b: b.resting, filter_blocks(model, _pieces(imu), before)))
+
+
+def _pieces(imu: Imu) -> Iterator[Samples]:
+    """Samples in pieces, so that the model sees few beyond a stop."""
+    t_s, gyro, accel = relative_samples(imu)
+    for first in range(0, len(t_s), PIECE):
+        rows = slice(first, first + PIECE)
+        yield t_s[rows], gyro[rows], accel[rows]
 
 
 def _at_rest_variance(model: BiasModel, samples: Float64[np.ndarray, "n 6"]) -> Vector6:

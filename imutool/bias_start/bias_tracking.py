@@ -182,14 +182,17 @@ class TrackedBiasStream:
     ) -> BiasEstimate:
         """Bias at each sample, and the filter's covariance of the rest bias."""
         bias = self._motion(t_s, gyro, accel) - self._mean
-        rest, covariance = np.empty_like(bias), np.empty((len(bias), 6, 6))
-        done = 0
-        for block in self.filter.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:]):
-            row = int(np.searchsorted(t_s, block.end_s))
-            rest[done:row], covariance[done:row] = self._now, self._covariance
-            state = self._prior.supported(block.step.after, block.end_s)
-            done, self._now, self._covariance = row, state.rest_bias(block.resting), state.covariance(block.resting)
-        rest[done:], covariance[done:] = self._now, self._covariance
+        blocks = list(self.filter.feed(t_s, gyro - bias[:, :3], accel - bias[:, 3:]))
+        rest, covariance = self._now[None], self._covariance[None]
+        if blocks:
+            end_s, resting = np.array([block.end_s for block in blocks]), np.array([block.resting for block in blocks])
+            after, P = self._prior.supported([block.step.after for block in blocks], end_s, resting)
+            rest, covariance = np.concatenate([rest, after]), np.concatenate([covariance, P])
+            self._now, self._covariance = rest[-1], covariance[-1]
+            row = np.searchsorted(end_s, t_s, side="right")  # a block's estimate holds from its last sample on
+            rest, covariance = rest[row], covariance[row]
+        else:
+            rest, covariance = np.repeat(rest, len(bias), axis=0), np.repeat(covariance, len(bias), axis=0)
         rest[t_s < self._hold_s] = self._rest
         return BiasEstimate(bias + rest, covariance)
 

@@ -23,7 +23,7 @@ from imutool.bias import static
 from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import BiasPrior, supported_std
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
@@ -76,16 +76,19 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)
-    found = _evidence(model, samples, prior)
+    corrected = _without_motion(model, samples, prior)
+    found = _evidence(corrected, prior)
     supported = supported_std(prior.std, prior.least_std, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
     none = None
     most = np.full(6, MOST_DEVIATIONS) if prior.least_std is None else MOST_OF_GUESS
     if (_deviations(found, prior) > most).any() or found.surprising > MOST_SURPRISING:
-        none = _evidence(static.Model(), samples, BiasPrior(np.zeros(6), UNKNOWN_STD, prior.ground_std, prior.walk))
+        none = _evidence(samples, BiasPrior(np.zeros(6), UNKNOWN_STD, prior.ground_std, prior.walk))
     contradictions = [] if none is None else _contradictions(found, prior, none, most)
     if none is not None and contradictions:
-        worse = _worse_than_none(model, samples, start, found, prior, none)
+        used = _started(start, prior)
+        same = np.array_equal(used.mean, prior.mean)
+        worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
         if worse:
             return Fitness("unfit", (*contradictions, *worse))
     doubts = [*contradictions, *_other_conditions(model, samples), *_other_unit(model, about)]
@@ -120,9 +123,23 @@ def _wrong_gravity(samples: Samples) -> str:
     return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
 
 
-def _evidence(model: BiasModel, samples: Samples, prior: BiasPrior) -> _Evidence:
-    """Evidence of samples, minus the model's motion-dependent bias, about a prior of a constant bias."""
-    blocks = list(filter_blocks(model, [samples], replace(prior, walk=np.zeros(6))))
+def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Samples:
+    """Samples minus the model's motion-dependent bias."""
+    t_s, gyro, accel = samples
+    bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
+    return t_s, gyro - bias[:, :3], accel - bias[:, 3:]
+
+
+def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:
+    """Prior with which a start begins; one that the user gives is no part of the model."""
+    measured = replace(prior, mean=start.rest, std=np.maximum(start.std, LEAST_STD)) if start.std.any() else prior
+    return start.follows or measured
+
+
+def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
+    """Evidence of samples, which hold no motion-dependent bias, about a prior of a constant bias."""
+    filter_ = BiasFilter(replace(prior, walk=np.zeros(6)), ahead=True)
+    blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
     innovations = np.array([_innovation(block) for block in blocks])
@@ -176,16 +193,12 @@ def _contradictions(found: _Evidence, prior: BiasPrior, none: _Evidence, most: V
     return sentences
 
 
-def _worse_than_none(
-    model: BiasModel, samples: Samples, start: InitialBias, found: _Evidence, prior: BiasPrior, none: _Evidence
-) -> list[str]:
+def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:
     """Sentences on a model that explains a log worse than no model, even from its start in that log."""
     shown = found.variance < MOST_CHANGE**2 / MOST_DEVIATIONS**2
     if (shown & (np.abs(found.difference) > MOST_CHANGE + MOST_DEVIATIONS * prior.std)).any():
         return ["no switching-on changes the bias by so much: the log is of another unit"]
-    measured = start.std.any()  # a start that the user gives is no part of the model
-    used = start.follows or (replace(prior, mean=start.rest, std=np.maximum(start.std, LEAST_STD)) if measured else prior)
-    evidence = _evidence(model, samples, used).log_likelihood - none.log_likelihood
+    evidence = _evidence(samples, used).log_likelihood - none.log_likelihood
     if evidence > LEAST_EVIDENCE:
         return []
     return [f"the raw samples agree with gravity and stops better than the corrected, by {-evidence:.0f} in log-likelihood"]

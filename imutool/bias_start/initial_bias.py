@@ -273,5 +273,7 @@ def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) 
         rows.append(np.concatenate([[block.start_s], state.rest_bias(block.resting), std]))
         rested_s += (block.end_s - block.start_s) * block.resting
     table = np.array(rows).reshape(-1, 13)
-    shown = (np.zeros(6), np.full(6, np.inf)) if first is None else shown_bias(first, prior.mean, prior.std**2)
+    shown = np.zeros(6), np.full(6, np.inf)
+    if first is not None:
+        shown = shown_bias(first.bias, np.diag(first.covariance(False)), prior.mean, prior.std**2)
     return SmoothedBias(BiasTrajectory(table[:, 0], table[:, 1:7], table[:, 7:]), rested_s, *shown)

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from imutool.bias.model import COLUMNS, Vector6
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import State
 
 USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
-BIAS_ROWS = np.eye(inertial_filter.SIZE)[inertial_filter.BIAS]  # d(bias)/d(error)
+BIASES = slice(inertial_filter.BIAS.start, inertial_filter.GROUND.stop)  # both biases in the filter's error
+BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
 LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
-WIDTHS = 25  # of a prior whose width is not known, from the least to the most in equal ratios
-CONTRADICTED = (10.8, 13.8, 16.3)  # chi-square of one, two, three differences that a true prior exceeds once in a thousand logs
+SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
+CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
+
+
+Rows6 = Float64[np.ndarray, "*batch 6"]
 
 
 @dataclass(frozen=True)
@@ -34,32 +40,71 @@ class BiasPrior:
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
     least_std: Vector6 | None = None
 
-    def supported(self, state: State, elapsed_s: float) -> State:
-        """State of a filter that began with `std`, for the width that the log supports until now."""
-        if self.least_std is None:
-            return state
-        walked = self.walk**2 * elapsed_s
-        wide = self.std**2 + walked
-        difference, variance = shown_bias(state, self.mean, wide)
-        narrow = np.minimum(
-            supported_std(self.std, self.least_std, difference, variance) ** 2 + walked, wide * (1.0 - SAME_WIDTH)
-        )
-        return inertial_filter.update(state, BIAS_ROWS, state.bias - self.mean, narrow * wide / (wide - narrow))
+    def supported(
+        self, states: Sequence[State], elapsed_s: Float64[np.ndarray, " m"], resting: Bool[np.ndarray, " m"]
+    ) -> tuple[Float64[np.ndarray, "m 6"], Float64[np.ndarray, "m 6 6"]]:
+        """Rest biases and covariances of a filter that began with `std`.
+
+        They are those for the width that the log supports until each time; the covariance counts that this width is not known.
+        """
+        bias, ground = (np.array([getattr(state, part) for state in states]) for part in ("bias", "ground"))
+        P = np.array([state.P[BIASES, BIASES] for state in states])
+        if self.least_std is not None:
+            walked = self.walk**2 * elapsed_s[:, None]
+            wide = self.std**2 + walked
+            difference, variance = shown_bias(bias, P[:, range(6), range(6)], self.mean, wide)
+            narrow = supported_std(self.std, self.least_std, difference, variance) ** 2 + walked
+            narrow = np.minimum(narrow, wide * (1.0 - SAME_WIDTH))
+            K, P = inertial_filter.gain(P, BIAS_ROWS, narrow * wide / (wide - narrow))
+            moved = (K @ (bias - self.mean)[..., None])[..., 0]
+            bias, ground = bias - moved[:, :6], ground - moved[:, 6:]
+            wider = np.ones((len(P), P.shape[1]))
+            wider[:, :6] = np.sqrt(self._share_of_width(difference, variance, narrow))
+            P = P * wider[:, :, None] * wider[:, None, :]
+        both = P[:, :6, :6] + P[:, :6, 6:] + P[:, 6:, :6] + P[:, 6:, 6:]
+        at_rest = resting[:, None, None]
+        return np.where(at_rest[..., 0], bias + ground, bias), np.where(at_rest, both, P[:, :6, :6])
+
+    def _share_of_width(self, difference: Rows6, variance: Rows6, narrow: Rows6) -> Rows6:
+        """Variance of the bias over all widths that the log allows, by that for the width of variance `narrow`; 1 or more.
+
+        Each width w shows the mean d g and the variance w^2 (1 - g) with g = w^2 / (w^2 + v).
+        """
+        assert self.least_std is not None
+        std, out = widened(self.std, difference, variance), np.ones_like(difference)
+        for columns in COLUMNS.values():
+            width, weight = _possible_widths(std, self.least_std, difference, variance, columns)
+            square, d, v = width**2, difference[:, None, columns], variance[:, None, columns]
+            usual = narrow[:, None, columns]
+            gain, usual_gain = square / (square + v), usual / (usual + v)
+            spread = square * (1.0 - gain) + (d * (gain - usual_gain)) ** 2
+            out[:, columns] = np.maximum((weight * spread / (usual * (1.0 - usual_gain))).sum(axis=1), 1.0)
+        return out
 
 
-def shown_bias(state: State, mean: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
+def shown_bias(
+    bias: Float64[np.ndarray, "*batch 6"],
+    after: Float64[np.ndarray, "*batch 6"],
+    mean: Vector6,
+    before: Float64[np.ndarray, "*batch 6"],
+) -> tuple[Float64[np.ndarray, "*batch 6"], Float64[np.ndarray, "*batch 6"]]:
     """Bias minus the prior's mean, as a log shows it without the prior, and its variance.
 
-    Axis by axis: the precision of the state minus that of the prior. The variance is infinite where the log shows little.
+    Axis by axis from the variances after and before the log: the difference of the precisions. The variance is infinite where
+    the log shows little.
     """
-    after = np.diag(state.covariance(False))
-    precision = 1.0 / after - 1.0 / variance
-    measured = precision > LEAST_SHOWN / variance
-    gain = np.where(measured, 1.0 - after / variance, 1.0)
-    return (state.bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
+    precision = 1.0 / after - 1.0 / before
+    measured = precision > LEAST_SHOWN / before
+    gain = np.where(measured, 1.0 - after / before, 1.0)
+    return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def supported_std(std: Vector6, least_std: Vector6 | None, difference: Vector6, variance: Vector6) -> Vector6:
+def supported_std(
+    std: Vector6,
+    least_std: Vector6 | None,
+    difference: Float64[np.ndarray, "*batch 6"],
+    variance: Float64[np.ndarray, "*batch 6"],
+) -> Float64[np.ndarray, "*batch 6"]:
     """Standard deviation of a prior that a log supports.
 
     `difference` and `variance` are those of `widened`. Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s,
@@ -67,33 +112,44 @@ def supported_std(std: Vector6, least_std: Vector6 | None, difference: Vector6, 
     sensor are switched on together and have the same share of the way: where two axes repeat, weak evidence about the third is
     not believed. The result is the mean of that logarithm, given the log.
     """
-    std = widened(std, difference, variance)
+    out = widened(std, difference, variance)
     if least_std is None:
-        return std
-    share = np.linspace(0.0, 1.0, WIDTHS)[:, None]
+        return out
     for columns in COLUMNS.values():
-        shown = columns.start + np.flatnonzero(np.isfinite(variance[columns]))
-        least = np.minimum(least_std, std)
-        width = least ** (1.0 - share) * std**share
-        expected = width[:, shown] ** 2 + variance[shown]
-        log_likelihood = -0.5 * (difference[shown] ** 2 / expected + np.log(expected)).sum(axis=1)
-        weight = np.exp(log_likelihood - log_likelihood.max())
-        mean_share = float(weight @ share[:, 0] / weight.sum())
-        std[columns] = least[columns] ** (1.0 - mean_share) * std[columns] ** mean_share
-    return std
+        _, weight = _possible_widths(out, least_std, difference, variance, columns)
+        most, mean_share = out[..., columns], (weight * SHARES).sum(axis=-2)
+        out[..., columns] = np.minimum(least_std[columns], most) ** (1.0 - mean_share) * most**mean_share
+    return out
 
 
-def widened(std: Vector6, difference: Vector6, variance: Vector6) -> Vector6:
+def _possible_widths(
+    std: Rows6, least_std: Vector6, difference: Rows6, variance: Rows6, columns: slice
+) -> tuple[Float64[np.ndarray, "*batch widths 3"], Float64[np.ndarray, "*batch widths 1"]]:
+    """Widths of a sensor's prior from the least to the most, and their probabilities given what the log shows."""
+    most, square, noise = std[..., None, columns], difference[..., None, columns] ** 2, variance[..., None, columns]
+    shown = np.isfinite(noise)
+    width = np.minimum(least_std[columns], most) ** (1.0 - SHARES) * most**SHARES
+    expected = width**2 + np.where(shown, noise, 1.0)
+    log_likelihood = -0.5 * np.where(shown, square / expected + np.log(expected), 0.0).sum(axis=-1, keepdims=True)
+    weight = np.exp(log_likelihood - log_likelihood.max(axis=-2, keepdims=True))
+    return width, weight / weight.sum(axis=-2, keepdims=True)
+
+
+def widened(
+    std: Vector6, difference: Float64[np.ndarray, "*batch 6"], variance: Float64[np.ndarray, "*batch 6"]
+) -> Float64[np.ndarray, "*batch 6"]:
     """Standard deviation of a prior after comparison with what a log shows.
 
     `difference` is the bias that the log shows minus the prior's mean, `variance` that of the measurement (infinite where it
     shows nothing). A sensor whose chi-square exceeds `CONTRADICTED` gets the root mean square of its difference.
     """
-    out = std.copy()
+    out = np.empty_like(difference)
     for columns in COLUMNS.values():
-        shown = np.isfinite(variance[columns]) & (std[columns] > 0)  # a prior of zero variance stays
-        square = difference[columns][shown] ** 2
-        chi_square = (square / (std[columns][shown] ** 2 + variance[columns][shown])).sum()
-        if shown.any() and chi_square > CONTRADICTED[shown.sum() - 1]:
-            out[columns] = np.maximum(std[columns], np.sqrt(square.mean()))
+        shown = np.isfinite(variance[..., columns]) & (std[columns] > 0)  # a prior of zero variance stays
+        square, count = np.where(shown, difference[..., columns] ** 2, 0.0), shown.sum(axis=-1)
+        expected = std[columns] ** 2 + variance[..., columns]
+        chi_square = np.divide(square, expected, out=np.zeros_like(square), where=shown).sum(axis=-1)
+        contradicted = chi_square > np.take(CONTRADICTED, count)
+        rms = np.sqrt(square.sum(axis=-1) / np.maximum(count, 1))
+        out[..., columns] = np.maximum(std[columns], np.where(contradicted, rms, 0.0)[..., None])
     return out

@@ -15,14 +15,13 @@ constant for the run. Measurements: at rest, velocity and rate are zero; in moti
 correlation time `speed_correlation_s`. Over tens of seconds the bound makes tilt observable through gravity, and with it the
 bias across gravity. For a body at several times `speed_m_s` the measurement gets less weight (Huber).
 
-Behind the 21 errors of pose, velocity and biases a state may have `offsets`: constants of other sensors, or random walks.
-
 Settings: about two dozen variants were compared on the training sequences, one changed at a time, with models trained on the
 test sequences. `tests/bench/starts.py` measures the result on the same sequences, so it is slightly optimistic.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
@@ -32,7 +31,7 @@ from jaxtyping import Float64
 from msgspec import Meta
 
 from imutool.config import Settings
-from imutool.inertial.preintegration import EYE, SMALL_RAD2, Increment, Matrix3, Vector3, exp, hat
+from imutool.inertial.preintegration import EYE, Increment, Matrix3, Vector3, hat
 from imutool.recording import GRAVITY_M_S2
 
 TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -45,6 +44,7 @@ STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
 STILL[:, 9:12] = STILL[:, 15:18] = np.eye(3)
 HUBER = 2.0  # standard deviations of a speed, above which it gets less weight
+SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
 LEAST_FORCE_M_S2 = 1e-6  # below, a mean specific force has no direction
 LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
 MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
@@ -83,7 +83,7 @@ class State:
     bias: Vector6
     ground: Vector6
     P: Covariance
-    offsets: Float64[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))
+    offsets: Float64[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))  # of other sensors
 
     def rest_bias(self, resting: bool) -> Vector6:
         """Bias of the sensor, at rest or in motion."""
@@ -97,22 +97,16 @@ class State:
 
     def moved(self, e: Error, P: Covariance) -> State:
         """State with an added error e: Exp(e) of the pose, and sums."""
-        E, J = exp(e[TURN]), _left_jacobian(e[TURN])
-        return State(
-            E @ self.R_wb,
-            E @ self.v_w + J @ e[VELOCITY],
-            E @ self.p_wb + J @ e[POSITION],
-            self.bias + e[BIAS],
-            self.ground + e[GROUND],
-            P,
-            self.offsets + e[SIZE:],
-        )
+        E, J = _turn(e[TURN])
+        v, p = (E @ x + J @ xi for x, xi in ((self.v_w, e[VELOCITY]), (self.p_wb, e[POSITION])))
+        bias, ground, offsets = self.bias + e[BIAS], self.ground + e[GROUND], self.offsets + e[SIZE:]
+        return State(E @ self.R_wb, v, p, bias, ground, P, offsets)
 
     def minus(self, other: State) -> Error:
         """Error e with `self == other.moved(e)`."""
         E = self.R_wb @ other.R_wb.T
         xi = _log(E)
-        J = _left_jacobian(xi)
+        J = _turn(xi)[1]
         v, p = (np.linalg.solve(J, a - E @ b) for a, b in ((self.v_w, other.v_w), (self.p_wb, other.p_wb)))
         return np.concatenate([xi, v, p, self.bias - other.bias, self.ground - other.ground, self.offsets - other.offsets])
 
@@ -147,7 +141,7 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
     P[0, 0] = P[1, 1] = tilt
     P[VELOCITY, VELOCITY] = np.eye(3) * s.speed_m_s**2
     P[9:, 9:] = P_bias
-    return State(exp(turn), np.zeros(3), np.zeros(3), bias, ground, P)
+    return State(_turn(turn)[0], np.zeros(3), np.zeros(3), bias, ground, P)
 
 
 def motion_step(x: State, motion: Increment, missing_s: float, walk: Walk, s: FilterSettings) -> Step:
@@ -164,7 +158,8 @@ def motion_step(x: State, motion: Increment, missing_s: float, walk: Walk, s: Fi
     step = _predict(x, R, motion.v, motion.p, motion.by_bias, T, (turn, push), walk, resting=False)
     noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
     v = step.expected.v_w
-    size = np.sqrt(v @ v / 3.0 / (np.trace(step.expected.P[VELOCITY, VELOCITY]) / 3.0 + noise))
+    variance = float(np.einsum("ii", step.expected.P[VELOCITY, VELOCITY])) / 3.0
+    size = math.sqrt(float(v @ v) / 3.0 / (variance + noise))
     noise *= max(1.0, size / HUBER) ** 2
     return step._replace(after=update(step.expected, STOPPED, v, np.full(3, noise)))
 
@@ -199,17 +194,21 @@ def _predict(
     """Predicted state after a block."""
     v = x.v_w + G_W * T + x.R_wb @ dv
     p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
-    F, V, X = np.eye(len(x.P)), hat(v), hat(p)
+    by_bias_w = x.R_wb @ by_bias.reshape(3, 3, 6)
+    by_bias_w[0] = turned = R @ by_bias[:3]
+    V, X = hat(v), hat(p)
+    by_bias_w[1] += V @ turned
+    by_bias_w[2] += X @ turned
+    F = np.eye(len(x.P))
     F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
-    turned = R @ by_bias[:3]
-    F[POSE, BIAS] = np.concatenate([turned, x.R_wb @ by_bias[3:6] + V @ turned, x.R_wb @ by_bias[6:] + X @ turned])
+    F[POSE, BIAS] = by_bias_w.reshape(9, 6)
     if resting:
         F[POSE, GROUND] = F[POSE, BIAS]
     P = F @ x.P @ F.T
-    turn_noise, push_noise = np.zeros((2, 9, 3))
-    turn_noise[TURN], turn_noise[VELOCITY], turn_noise[POSITION] = EYE, V, X
-    push_noise[VELOCITY], push_noise[POSITION] = EYE, 0.5 * T * EYE
-    P[POSE, POSE] += noise[0] * turn_noise @ turn_noise.T + noise[1] * push_noise @ push_noise.T
+    by_noise = np.zeros((9, 6))  # of the turn, then of the push
+    by_noise[TURN, :3], by_noise[VELOCITY, :3], by_noise[POSITION, :3] = EYE, V, X
+    by_noise[VELOCITY, 3:], by_noise[POSITION, 3:] = EYE, 0.5 * T * EYE
+    P[POSE, POSE] += (by_noise * np.repeat(noise, 3)) @ by_noise.T
     variances = P.reshape(-1)[:: len(P) + 1]
     variances += LEAST_VARIANCE
     variances[BIAS] += walk[:6] ** 2 * T
@@ -224,11 +223,22 @@ def update(x: State, H: Float64[np.ndarray, "k m"], z: Float64[np.ndarray, " k"]
     With e the first m errors of the estimate and `noise` the variances of n.
     """
     H = H if H.shape[1] == len(x.P) else np.pad(H, ((0, 0), (0, len(x.P) - H.shape[1])))
-    PH = x.P @ H.T
-    K = np.linalg.solve(H @ PH + np.diag(noise), PH.T).T
-    I_KH = np.eye(len(x.P)) - K @ H
-    P = I_KH @ x.P @ I_KH.T + (K * noise) @ K.T
-    return x.moved(-K @ z, 0.5 * (P + P.T))
+    K, P = gain(x.P, H, noise)
+    return x.moved(-K @ z, P)
+
+
+def gain(
+    P: Float64[np.ndarray, "*batch s s"], H: Float64[np.ndarray, "k s"], noise: Float64[np.ndarray, "*batch k"]
+) -> tuple[Float64[np.ndarray, "*batch s k"], Float64[np.ndarray, "*batch s s"]]:
+    """Kalman gain of a measurement z = H e + n, and the covariance after it (Joseph form)."""
+    HP = H @ P
+    S = HP @ H.T
+    diagonal = np.arange(len(H))
+    S[..., diagonal, diagonal] += noise
+    K = np.linalg.solve(S, HP).swapaxes(-1, -2)
+    I_KH = np.eye(P.shape[-1]) - K @ H
+    after = I_KH @ P @ I_KH.swapaxes(-1, -2) + (K * noise[..., None, :]) @ K.swapaxes(-1, -2)
+    return K, 0.5 * (after + after.swapaxes(-1, -2))
 
 
 def smooth(steps: Sequence[Step]) -> list[State]:
@@ -268,16 +278,19 @@ def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, most: Vector6,
     return Step(x, fresh, F, fresh)
 
 
-def _left_jacobian(xi: Vector3) -> Matrix3:
-    square = float(xi @ xi)
-    X = hat(xi)
+def _turn(xi: Vector3) -> tuple[Matrix3, Matrix3]:
+    """Rotation by a rotation vector and its left Jacobian, of a single vector: in floats, as one array costs as much as all."""
+    x, y, z = xi.tolist()
+    square = x * x + y * y + z * z
     if square < SMALL_RAD2:
-        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+        sine, first, second = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
     else:
-        angle = np.sqrt(square)
-        first, second = (1.0 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
-    J: Matrix3 = EYE + first * X + second * X @ X
-    return J
+        angle = math.sqrt(square)
+        sine, first = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        second = (1.0 - sine) / square
+    X = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    X2 = X.dot(X)
+    return EYE + sine * X + first * X2, EYE + first * X + second * X2
 
 
 def _log(R: Matrix3) -> Vector3:

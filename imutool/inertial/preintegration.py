@@ -9,6 +9,7 @@ dozen array operations.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,9 @@ Vector3 = Float64[np.ndarray, "3"]
 Matrix3 = Float64[np.ndarray, "3 3"]
 Vectors = Float64[np.ndarray, "n 3"]
 EYE = np.eye(3)
-SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
+HATS = np.cross(EYE[:, None], EYE[None]).swapaxes(1, 2).reshape(3, 9)  # hat(x), row by row, is x @ HATS: one product
+AFTER, BEFORE = (1, 2, 0), (2, 0, 1)  # axes of a cross product
+LEAST_RAD2 = 1e-300  # added to a square, so that sin(x) / x is 1 at zero
 
 
 class Increment(NamedTuple):
@@ -37,21 +40,20 @@ class Increment(NamedTuple):
 
 def hat(x: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
     """Skew matrix of `x ×`."""
-    out = np.zeros((*x.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = x[..., 2], -x[..., 1], x[..., 0]
-    return out
+    return np.asarray(np.dot(x, HATS).reshape(*x.shape, 3))
 
 
 def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Rotation by a rotation vector (Rodrigues)."""
-    square = (xi * xi).sum(-1)[..., None, None]
-    small = square < SMALL_RAD2
-    angle = np.sqrt(np.where(small, 1.0, square))
-    first = np.where(small, 1.0 - square / 6.0, np.sin(angle) / angle)
-    second = np.where(small, 0.5 - square / 24.0, 2.0 * (np.sin(0.5 * angle) / angle) ** 2)
-    X = hat(xi)
-    R: Float64[np.ndarray, "*batch 3 3"] = EYE + first * X + second * (X @ X)
+    """Rotation by a rotation vector (Rodrigues).
+
+    cos I + sin/angle hat(xi) + (1 - cos)/angle² xi xi^T.
+    """
+    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", xi, xi) + LEAST_RAD2)[..., None]
+    sine = np.sin(half)
+    first, second = sine / half * np.cos(half), 0.5 * (sine / half) ** 2
+    R: Float64[np.ndarray, "*batch 3 3"] = (second * xi)[..., None] * xi[..., None, :]
+    R += hat(first * xi)
+    R.reshape(*xi.shape[:-1], 9)[..., ::4] += 1.0 - 2.0 * sine**2
     return R
 
 
@@ -59,36 +61,39 @@ def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> 
     """Increment from the first sample to the last; the samples are already minus their bias."""
     # numpy's functions that join and pad take as long as the sums: the arrays are filled in place
     n, dt = len(t_s), t_s[1:] - t_s[:-1]
-    step = 0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None]
+    step = (gyro[:-1] + gyro[1:]) * (0.5 * dt)[:, None]
     R, turned = np.empty((n, 3, 3)), np.zeros((n, 3, 3))  # R: body at each sample to body at the first
     R[0], R[1:] = EYE, _running_product(exp(step))
     # a constant c added to the bias turns step k by -Jr c dt, transformed by the later steps
     right_jacobian = (EYE - 0.5 * hat(step)) * dt[:, None, None]
     np.cumsum(R[1:] @ right_jacobian, axis=0, out=turned[1:])
-    R_by_bias = -R.swapaxes(-1, -2) @ turned
     force = (R @ accel[..., None])[..., 0]
-    force_by_gyro_bias = -R @ hat(accel) @ R_by_bias
 
     weights = np.zeros((2, n))  # trapezoidal, to velocity and to position
     weights[0, :-1], weights[1, :-1] = dt, dt * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:]))
     weights[:, 1:] += weights[:, :-1].copy()
     weights *= 0.5
-    to_velocity, to_position = weights
+    v, p = weights @ force
     by_bias = np.zeros((9, 6))
-    by_bias[:3, :3] = R_by_bias[-1]
-    for rows, of_sample in ((slice(3, 6), to_velocity), (slice(6, 9), to_position)):
-        by_bias[rows, :3] = np.einsum("n,nij->ij", of_sample, force_by_gyro_bias)
-        by_bias[rows, 3:] = -np.einsum("n,nij->ij", of_sample, R)
-    turned_rad = float(np.sqrt((step * step).sum(axis=1)).sum())
-    return Increment(float(t_s[-1] - t_s[0]), R[-1], to_velocity @ force, to_position @ force, by_bias, turned_rad)
+    by_bias[:3, :3] = -R[-1].T @ turned[-1]
+    # force turned by -turned: its derivative is hat(force) turned, from the sums of force_a turned_bj
+    sums = ((weights[:, None] * force.T).reshape(6, n) @ turned.reshape(n, 9)).reshape(2, 3, 3, 3)
+    by_bias[3:, :3] = (sums[:, AFTER, BEFORE] - sums[:, BEFORE, AFTER]).reshape(6, 3)
+    by_bias[3:, 3:] = -(weights @ R.reshape(n, 9)).reshape(6, 3)
+    turned_rad = float(np.sqrt(np.einsum("ni,ni->n", step, step)).sum())
+    return Increment(float(t_s[-1] - t_s[0]), R[-1], v, p, by_bias, turned_rad)
 
 
 def _running_product(R: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 3 3"]:
-    """R_0, R_0 R_1, ..., in log2(n) passes."""
-    shift = 1
-    while shift < len(R):
-        before, R = R, np.empty_like(R)
-        R[:shift] = before[:shift]
-        np.matmul(before[:-shift], before[shift:], out=R[shift:])
-        shift *= 2
-    return R
+    """R_0, R_0 R_1, ...: within rows of about n^1/2 at once, then from row to row."""
+    n = len(R)
+    width = max(1, math.isqrt(n))
+    rows = -(-n // width)
+    product = np.empty((rows, width, 3, 3))
+    whole = product.reshape(-1, 3, 3)
+    whole[:n], whole[n:] = R, EYE
+    for k in range(1, width):
+        product[:, k] = product[:, k - 1] @ product[:, k]
+    for row in range(1, rows):
+        product[row] = product[row - 1, -1] @ product[row]
+    return whole[:n]

@@ -12,6 +12,7 @@ A steady turn about the vertical looks like a bias; only its difference from the
 
 from __future__ import annotations
 
+import math
 from bisect import insort
 from collections import deque
 from collections.abc import Iterable
@@ -167,7 +168,8 @@ class OnlineRestDetector:
             return False
         cut = np.concatenate([gyro, accel], axis=1)[: k * self.parts].reshape(self.parts, k, 6)
         mean = cut.sum(axis=1) / k
-        var = ((cut - mean[:, None]) ** 2).sum(axis=1) / (k - 1)  # `np.var` takes the mean again
+        away = cut - mean[:, None]
+        var = np.einsum("pki,pki->pi", away, away) / (k - 1)  # `np.var` takes the mean again
         before, self._last = self._last, (mean, var, k)
         if before is None:
             return False
@@ -177,14 +179,16 @@ class OnlineRestDetector:
 
     def _window(self, mean: Float64[np.ndarray, "w 6"], var: Float64[np.ndarray, "w 6"], k: int) -> bool:
         s = self.settings
-        scatter = np.sqrt(mean.var(axis=0, ddof=1).reshape(2, 3).sum(axis=1))
-        noise = np.sqrt(var.mean(axis=0).reshape(2, 3).sum(axis=1))
-        centre = mean[:, :3].mean(axis=0)
-        insort(self._calmest, float(scatter[0]))
+        whole = mean.sum(axis=0) / len(mean)
+        away, centre = mean - whole, whole[:3]
+        squares, noises = np.einsum("wi,wi->i", away, away).tolist(), var.sum(axis=0).tolist()
+        scatter = [math.sqrt(sum(squares[j : j + 3]) / (len(mean) - 1)) for j in (0, 3)]
+        noise = [math.sqrt(sum(noises[j : j + 3]) / len(mean)) for j in (0, 3)]
+        insort(self._calmest, scatter[0])
         del self._calmest[FLOOR_RANK + 1 :]
         self._windows += 1
         floor = self._calmest[min(FLOOR_RANK, self._windows // 10, len(self._calmest) - 1)]
-        allowed = min(max(WHITE_MARGIN * noise[0] / np.sqrt(k), FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
+        allowed = min(max(WHITE_MARGIN * noise[0] / math.sqrt(k), FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
         calm = scatter[0] <= allowed and scatter[1] <= s.accel_scatter_m_s2
         quiet = noise[0] <= s.gyro_noise_rad_s and noise[1] <= s.accel_noise_m_s2
         if not (calm and quiet and np.linalg.norm(centre) <= s.gyro_mean_rad_s):

@@ -26,6 +26,7 @@ from imutool.location import Location, identity, io_errors, same_location
 from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, ChunkHead
+from imutool.mcap_io.recovery import chunk_repair
 from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
@@ -205,7 +206,7 @@ class _Saver:
         raw = self.index.read(block)
         found = self.index.unpack_bytes(block, raw)
         head = None if block.compression is None else ChunkHead.of(raw, len(raw), block.offset)
-        if head is None or block.edited or not _frame_ends(raw[head.data_at :], head.compression):
+        if head is None or block.edited or not chunk_repair.keeps_sound(head, raw, found):
             if len(found.heads):
                 self._new_chunk(block, found)
             return
@@ -246,14 +247,6 @@ class _Saver:
             attachment.check_crc(self.source)
             self.out.contents.attachments.append(attachment.index_at(at))
         self.out.target.copy(self.source, span.offset, span.offset + span.length)
-
-
-def _frame_ends(packed: bytes, compression: str) -> bool:
-    """Whether packed data have their end mark, without which other readers refuse them."""
-    if compression != "lz4":
-        return True
-    checksum = 4 if packed[4] & 4 else 0  # of the contents, behind the end mark
-    return packed[len(packed) - 4 - checksum : len(packed) - checksum] == bytes(4)
 
 
 def _attach_damaged(out: LogWriter, source: Source, loss: Loss) -> None:

@@ -1,26 +1,37 @@
-"""Whether debiasing knows how sure it is: NEES of the gyro's rest bias along sequences, against what their truth says.
+"""Whether debiasing knows how sure it is: errors of bias, attitude and velocity, and what their covariances say.
 
-    python tests/bench/consistency.py --model M.safetensors LOG... [--start truth] [--start auto] [--start smooth]
+    python tests/bench/consistency.py --model M.safetensors LOG... [--start truth] [--start auto] [--start smooth] [--each-log]
     python tests/bench/consistency.py --left-out TRAINING_LOG...
+    python tests/bench/consistency.py --made-up SENSORS
 
-Every `TRUTH_S` of a log the bias is measured from the truth around (the slope, in time, of what integration misses), and the
-difference to the bias in use is weighed by its covariance plus that of the measurement. Three degrees of freedom: honest
-covariances give a mean of 3; the bounds are chi-square's. The coverage is the share of windows within the ellipsoids that
-should hold 68, 95 and 99.7 % of them. With `--left-out` each log is judged by the closed form of all others. V1_01 is compared
-with its recomputed truth.
+The bias: every `TRUTH_S` of a log the gyro's rest bias is measured from the truth around (the slope, in time, of what
+integration misses), and the difference to the bias in use is weighed by its covariance plus that of the measurement. Attitude
+and velocity: the debiased samples are integrated from a true pose for `WINDOWS_S`, and the errors at the end are weighed by the
+stated covariance of the bias, carried over the window, the white noise of the samples and the poses' own errors
+(`imutool.inertial.error_growth`). Each has three degrees of freedom: honest covariances give a mean of 3; the bounds are
+chi-square's. The coverage is the share of windows within the ellipsoids that should hold 68, 95 and 99.7 % of them. With
+`--left-out` each log is judged by the closed form of all others. `--made-up` draws sensors, each with its own size of errors
+and noise, learns each from `TRAINING` logs of one switching-on, and judges it by the exact poses of `TESTS` logs of others:
+here the poses have no error, and there are windows enough to see a few points. V1_01 is compared with its recomputed truth.
+With `--factor` a second coverage stands beside the first: each log's covariance of the bias times a factor by which the other
+logs' 68 % ellipsoids hold 68 % of their windows (split conformal prediction, with the logs as the sample).
 
 The calibration's share of a window's covariance is that of the slope: its unknowns are the same at every sample, and what goes
 with the motion mostly cancels over 15 s, which the samples' covariances one by one do not show. What a measurement is worth is
 seen in the log itself, for truths differ by a factor of eight from log to log: how far half windows differ from the next ones
 (Allan's variance), carried over to whole ones as errors of an attitude go, with T^-3/2. Where the truth's errors last for
 seconds that is too little, and too much is never forgiven. Errors of a rest bias last longer than a window: the bounds, for
-independent windows, are a little narrow.
+independent windows, are a little narrow. The poses' errors at the ends of a window come from second differences over a second;
+after one second they are most of the error, so that only the made-up sensors say something there. The lean of a truth's world
+is fitted to each log.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,128 +40,177 @@ import torch
 from jaxtyping import Float64
 from scipy.stats import chi2
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from nees import consistency
+from support.nees import consistency
+from support.switchings_on import Switchings, log
 
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.bias_covariance import Judged
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
+from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
-from imutool.geometry.quaternion import unit
-from imutool.inertial.strapdown import with_velocity
+from imutool.inertial.error_growth import Motion
 from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
-from imutool.recording import Recording, seconds
+from imutool.recording import Poses, Recording
 
-LEAST_TRUSTED = 0.5
 SHARES = (0.68, 0.95, 0.997)
+STARTS = ("truth", "auto", "smooth")
+WINDOWS_S = (1.0, 5.0, 15.0)
 RECOMPUTED = "/ground_truth_recomputed/pose"
+TRAINING, TESTS = 4, 3
+
+MOST_FACTOR, PRIOR_LOGS = 16.0, 3  # of a covariance; n logs of three axes show the factor's logarithm to sqrt(2 / 3n)
+BISECTIONS = 40
 
 
-class Seen(NamedTuple):
-    """The samples of a log, and its truth at their times."""
+class Judgement(NamedTuple):
+    """Errors of a log's windows, and their covariance: the bias's part, and that of noise, poses and measurement."""
 
-    t_s: Float64[np.ndarray, " n"]
-    samples: Float64[np.ndarray, "n 6"]
-    q_wb_wxyz: np.ndarray
-    v_w: np.ndarray
-    trusted: np.ndarray
+    error: Float64[np.ndarray, "m 3"]
+    bias: Float64[np.ndarray, "m 3 3"]
+    other: Float64[np.ndarray, "m 3 3"]
 
-    @classmethod
-    def of(cls, recording: Recording) -> Seen:
-        """A recording's own."""
-        imu = recording.imu
-        poses, trusted = with_velocity(recording.truth).at(imu.t_ns)
-        assert poses.v_w is not None
-        samples = np.concatenate([imu.gyro, imu.accel], axis=1)
-        return cls(seconds(imu.t_ns, int(imu.t_ns[0])), samples, unit(poses.q_wb_wxyz), poses.v_w, trusted)
+    def squares(self, factor: float | Float64[np.ndarray, "m 1 1"] = 1.0) -> Float64[np.ndarray, " m"]:
+        """Normalised squares of the errors, with a factor on the bias's part."""
+        P = factor * self.bias + self.other
+        return np.asarray(np.einsum("mi,mi->m", self.error, np.linalg.solve(P, self.error[..., None])[..., 0]))
 
-    def window(self, from_s: float, length_s: float) -> slice | None:
-        """The samples from a time on, if the truth can be trusted there."""
-        first, last = (int(np.searchsorted(self.t_s, t)) for t in (from_s, from_s + length_s))
-        rows = slice(first, last + 1)
-        whole = last < len(self.t_s) and self.trusted[first] and self.trusted[rows].mean() >= LEAST_TRUSTED
-        return rows if whole else None
 
-    def gyro_offset(self, rows: slice, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "3"]:
-        """What a bias leaves of the rest bias over a window."""
-        left = self.samples[rows] - bias[rows]
-        return bias_from_truth(self.t_s[rows], left, self.q_wb_wxyz[rows], self.v_w[rows], self.trusted[rows])[:3]
+class Case(NamedTuple):
+    """A log, the model that judges it, and the exact poses where they are known."""
 
-    def slope_of(
-        self, rows: slice, gyro: Float64[np.ndarray, "n 3"], S: Float64[np.ndarray, "n 3 p"]
-    ) -> Float64[np.ndarray, "3 p"]:
-        """What errors S of a window's debiased rate look like as an offset: the slope of their integral, by least squares."""
-        dt, seen = torch.from_numpy(np.diff(self.t_s[rows])), self.trusted[rows][1:]
-        R = running_product(so3.exp(step_means(torch.from_numpy(gyro[rows])[None]) * dt[None, :, None]))[0] * dt[:, None, None]
-        integral = torch.cumsum(R @ step_means(torch.from_numpy(S[rows]).movedim(2, 0)).movedim(0, 2), dim=0)[seen]
-        X = torch.cat([torch.cumsum(R, dim=0)[seen], torch.eye(3, dtype=R.dtype).expand(len(integral), 3, 3)], dim=2)
-        found = torch.linalg.lstsq(X.flatten(0, 1), integral.flatten(0, 1)).solution[:3]
-        return np.asarray(found)
+    recording: Recording
+    model: BiasModel
+    exact: Poses | None = None
 
 
 def main() -> None:
-    """One line a log and start, and one for all logs together."""
+    """One line a start and quantity for all logs together, and with `--each-log` for every one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("logs", type=Path, nargs="+")
+    parser.add_argument("logs", type=Path, nargs="*")
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--model", type=Path)
     which.add_argument("--left-out", action="store_true")
-    parser.add_argument("--start", action="append", choices=("truth", "auto", "smooth"))
+    which.add_argument("--made-up", type=int, metavar="SENSORS")
+    parser.add_argument("--start", action="append", choices=STARTS)
+    parser.add_argument("--each-log", action="store_true")
+    parser.add_argument("--factor", action="store_true")
     options = parser.parse_args()
-    recordings = []
-    for path in options.logs:
-        recording = read(path)
-        recordings.append(recording.with_truth(RECOMPUTED if RECOMPUTED in recording.truths else next(iter(recording.truths))))
-    models = {r.name: load(options.model) if options.model else of_others(recordings, r) for r in recordings}
-    for start in options.start or ("truth", "auto", "smooth"):
-        logs = []
-        for recording in recordings:
-            model = models[recording.name]
-            one = windows(model, recording, start)
-            if len(one[0]):
-                print(f"{start:7}{recording.name:18}", told([one]), flush=True)
-                logs.append(one)
-        print(f"{start:7}{'all':18}", told(logs), flush=True)
+    found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
+    starts = options.start or STARTS
+    cases = made_up(options.made_up) if options.made_up else recorded(options.logs, options.model)
+    for case in cases:
+        for start in starts:
+            for quantity, one in judged(case, start):
+                found[start, quantity].append(one)
+                if options.each_log and len(one.error):
+                    print(f"{start:7}{quantity:16}{case.recording.name:24}", told([one]), flush=True)
+    for start in starts:
+        for (of, quantity), logs in found.items():
+            if of == start:
+                print(f"{start:7}{quantity:16}{'all':24}", told(logs), with_factor(logs) if options.factor else "")
 
 
-def of_others(recordings: list[Recording], left_out: Recording) -> BiasModel:
-    """Closed form of all logs but one."""
+def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
+    """Logs with a model, or each with the closed form of all others."""
+    logs = [read(path) for path in paths]
+    logs = [r.with_truth(RECOMPUTED if RECOMPUTED in r.truths else next(iter(r.truths))) for r in logs]
+    for one in logs:
+        yield Case(one, load(model) if model else learned_from([other for other in logs if other is not one]))
+
+
+def made_up(sensors: int) -> Iterator[Case]:
+    """Logs of sensors of many sizes, each with a model of its own that other logs gave."""
+    for seed in range(sensors):
+        rng = np.random.default_rng([seed, 20])
+        kind = Switchings(
+            sensor_seed=seed,
+            turn_on_rad_s=10.0 ** rng.uniform(-3.3, -2.0),
+            turn_on_m_s2=10.0 ** rng.uniform(-2.0, -1.0),
+            scale=10.0 ** rng.uniform(-3.0, -1.7),
+            misalignment_rad=10.0 ** rng.uniform(-3.0, -1.7),
+            noise_rad_s_rthz=10.0 ** rng.uniform(-4.3, -3.3),
+            walk_rad_s2_rthz=10.0 ** rng.uniform(-5.5, -4.3),
+            room_m=10.0 ** rng.uniform(-0.7, 0.3),
+            mount_rad=0.0,
+            clock_s=0.0,
+            rest_s=float(rng.choice([0.0, 8.0])),
+            duration_s=60.0,
+        )
+        first = 100 * seed
+        model = learned_from([log(first + k, first, kind) for k in range(TRAINING)])
+        for k in range(50, 50 + TESTS):
+            test = log(first + k, first + k, kind)
+            exact = log(first + k, first + k, replaced(kind, truth_noise=0.0))
+            assert np.array_equal(test.imu.gyro, exact.imu.gyro)
+            yield Case(test, model, exact.truth)
+
+
+def replaced(kind: Switchings, **changes: float) -> Switchings:
+    """A kind with other settings."""
+    return Switchings(**{name: getattr(kind, name) for name in kind.__struct_fields__} | changes)
+
+
+def learned_from(recordings: list[Recording]) -> BiasModel:
+    """Closed form of some logs."""
     from left_out import learned
 
-    return learned([recording for recording in recordings if recording is not left_out], [])
+    return learned(recordings, [])
 
 
-def windows(
-    model: BiasModel, recording: Recording, start: str
-) -> tuple[Float64[np.ndarray, "m 3"], Float64[np.ndarray, "m 3 3"]]:
+def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
+    """Errors and their covariances, by quantity."""
+    model, recording = case.model, case.recording
+    imu, smooth = recording.imu, start == "smooth"
+    begun = smooth_in_memory(model, imu, recording.name) if smooth else find_initial_bias(start, model, recording)
+    from_s = TRUTH_S if start == "truth" else 0.0  # what it was found from proves nothing
+    known = None if case.exact is None else np.zeros(6)
+    one = Judged(model, begun, imu, case.exact or recording.truth, known)
+    yield "bias", rest_bias(model, begun, one, from_s, recording)
+    for length_s in WINDOWS_S:
+        grown = one.errors(length_s, from_s)
+        for name, axes in (("attitude", slice(0, 3)), ("velocity", slice(3, 6))):
+            yield f"{name} {length_s:g} s", Judgement(grown.error[:, axes], *(P[:, axes, axes] for P in grown[1:]))
+
+
+def rest_bias(model: BiasModel, begun: InitialBias, one: Judged, from_s: float, recording: Recording) -> Judgement:
     """Differences of the gyro's rest bias to what the truth says, window by window, and what covariance they should have."""
-    imu, seen = recording.imu, Seen.of(recording)
-    begun = smooth_in_memory(model, imu, recording.name) if start == "smooth" else find_initial_bias(start, model, recording)
-    bias, P, roots = BiasEstimator(model, begun).parts(seen.t_s, imu.gyro, imu.accel)
-    S = roots.get("gyro", np.zeros((len(bias), 3, 0)))
-    measured = np.diag(measured_variance(model, seen))
+    S = one.roots.get("gyro", np.zeros((len(one.bias), 3, 0)))
+    measured = np.diag(measured_variance(model, one, recording))
     errors, covariances = [], []
-    from_s = float(seen.t_s[np.argmax(seen.trusted)])
-    if start == "truth":  # what it was found from proves nothing
-        from_s += TRUTH_S
-    while from_s + TRUTH_S <= seen.t_s[-1]:
-        if rows := seen.window(from_s, TRUTH_S):
-            T = seen.slope_of(rows, imu.gyro - bias[:, :3], S)
-            errors.append(seen.gyro_offset(rows, bias))
-            covariances.append(P[rows, :3, :3].mean(axis=0) + T @ T.T + measured)
-        from_s += TRUTH_S
-    return np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3))
+    for rows in one.motion.windows(TRUTH_S, from_s):
+        T = slope_of(one.motion, rows, S)
+        errors.append(gyro_offset(one.motion, rows))
+        covariances.append(one.stated.rest[rows, :3, :3].mean(axis=0) + T @ T.T)
+    return Judgement(np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.tile(measured, (len(errors), 1, 1)))
 
 
-def measured_variance(model: BiasModel, seen: Seen) -> Float64[np.ndarray, "3"]:
+def gyro_offset(motion: Motion, rows: slice) -> Float64[np.ndarray, "3"]:
+    """What a bias leaves of the rest bias over a window."""
+    return bias_from_truth(*(column[rows] for column in motion))[:3]
+
+
+def slope_of(motion: Motion, rows: slice, S: Float64[np.ndarray, "n 3 p"]) -> Float64[np.ndarray, "3 p"]:
+    """What errors S of a window's debiased rate look like as an offset: the slope of their integral, by least squares."""
+    dt, seen = torch.from_numpy(np.diff(motion.t_s[rows])), motion.trusted[rows][1:]
+    rate = torch.from_numpy(motion.samples[rows, :3].copy())
+    R = running_product(so3.exp(step_means(rate[None]) * dt[None, :, None]))[0] * dt[:, None, None]
+    integral = torch.cumsum(R @ step_means(torch.from_numpy(S[rows]).movedim(2, 0)).movedim(0, 2), dim=0)[seen]
+    X = torch.cat([torch.cumsum(R, dim=0)[seen], torch.eye(3, dtype=R.dtype).expand(len(integral), 3, 3)], dim=2)
+    return np.asarray(torch.linalg.lstsq(X.flatten(0, 1), integral.flatten(0, 1)).solution[:3])
+
+
+def measured_variance(model: BiasModel, one: Judged, recording: Recording) -> Float64[np.ndarray, "3"]:
     """Of an offset from a window, by axis; the training logs' where a log is too short to show it."""
-    bias = model.stream(model.prior_mean)(seen.t_s, seen.samples[:, :3], seen.samples[:, 3:])
-    starts_s = np.arange(seen.t_s[np.argmax(seen.trusted)], seen.t_s[-1] - TRUTH_S / 2, TRUTH_S / 4)  # half overlapping
-    half = [seen.gyro_offset(rows, bias) if (rows := seen.window(t, TRUTH_S / 2)) else np.full(3, np.nan) for t in starts_s]
+    imu, at_prior = recording.imu, one.motion
+    bias = model.stream(model.prior_mean)(at_prior.t_s, imu.gyro, imu.accel)
+    motion = at_prior._replace(samples=at_prior.samples + one.bias - bias)
+    starts_s = np.arange(motion.t_s[np.argmax(motion.trusted)], motion.t_s[-1] - TRUTH_S / 2, TRUTH_S / 4)  # half overlapping
+    half = [gyro_offset(motion, rows) if (rows := motion.window(t, TRUTH_S / 2)) else np.full(3, np.nan) for t in starts_s]
     change = np.reshape(half[2:], (-1, 3)) - np.reshape(half[:-2], (-1, 3))
     change = change[np.isfinite(change).all(axis=1)]
     if not len(change):
@@ -158,14 +218,54 @@ def measured_variance(model: BiasModel, seen: Seen) -> Float64[np.ndarray, "3"]:
     return np.asarray(0.5 * (change**2).mean(axis=0) / 2.0**3)
 
 
-def told(logs: list[tuple[np.ndarray, np.ndarray]]) -> str:
+def told(logs: list[Judgement]) -> str:
     """The figures of `support.nees` in a line."""
-    e, P = (np.concatenate(parts) for parts in zip(*logs, strict=True))
-    found = consistency(e, P)
+    error, bias, other = (np.concatenate(parts) for parts in zip(*logs, strict=True))
+    if not len(error):
+        return "no window"
+    found = consistency(error, bias + other)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
-    squares = np.einsum("mi,mij,mj->m", e, np.linalg.inv(P), e)
-    covered = " / ".join(f"{100 * (squares <= chi2.ppf(share, 3)).mean():.0f}" for share in SHARES)
-    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered} %"
+    covered = coverage(np.concatenate([log.squares() for log in logs]))
+    return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered}"
+
+
+def coverage(squares: Float64[np.ndarray, " m"]) -> str:
+    """Shares of windows within the ellipsoids of `SHARES`."""
+    return " / ".join(f"{100 * (squares <= chi2.ppf(share, 3)).mean():.0f}" for share in SHARES) + " %"
+
+
+def with_factor(logs: list[Judgement]) -> str:
+    """Coverage with each log's covariance times the factor that the other logs ask for."""
+    logs = [log for log in logs if len(log.error)]
+    if len(logs) < 2:
+        return ""
+    needed = [needed_factors(log) for log in logs]
+    factors = [factor_of([n for n in needed if n is not own]) for own in needed]
+    squares = np.concatenate([log.squares(factor) for log, factor in zip(logs, factors, strict=True)])
+    return f" with a factor of {np.exp(np.mean(np.log(factors))):.2f}: {coverage(squares)}"
+
+
+def needed_factors(log: Judgement) -> Float64[np.ndarray, " m"]:
+    """Factor on the bias's covariance that puts each window on its ellipsoid of `SHARES[0]`, by bisection of its logarithm."""
+    low, high = np.full(len(log.error), -np.log(MOST_FACTOR)), np.full(len(log.error), np.log(MOST_FACTOR))
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        outside = log.squares(np.exp(middle)[:, None, None]) > chi2.ppf(SHARES[0], 3)
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    return np.asarray(np.exp(0.5 * (low + high)))
+
+
+def factor_of(needed: list[Float64[np.ndarray, " _"]]) -> float:
+    """Conformal quantile of what the windows of n logs need, each log with the same weight.
+
+    The share asked for is n + 1 to n larger, since the next log is none of these. The logarithm of the factor has a prior of
+    about 0.5 around zero: that of n logs counts n / (n + `PRIOR_LOGS`).
+    """
+    weight = np.concatenate([np.full(len(of_log), 1.0 / len(of_log)) for of_log in needed]) / len(needed)
+    ordered = np.argsort(values := np.concatenate(needed))
+    level = min(SHARES[0] * (1.0 + 1.0 / len(needed)), 1.0)
+    row = min(int(np.searchsorted(np.cumsum(weight[ordered]), level - 1e-9)), len(values) - 1)
+    return float(values[ordered[row]] ** (len(needed) / (len(needed) + PRIOR_LOGS)))
 
 
 if __name__ == "__main__":

@@ -105,14 +105,27 @@ def test_a_state_of_a_wide_prior_becomes_that_of_the_width_that_the_log_supports
     imu = biased(3)
     wide = replace(KNOWN, std=3.0 * KNOWN.std, least_std=0.1 * KNOWN.std)
     last = forward(imu, wide)[-1]
-    found = wide.supported(last.step.after, last.end_s)
+    state = last.step.after
+    (found, _), (P, _) = wide.supported([state] * 2, np.full(2, last.end_s), np.array([False, True]))
     walked = wide.walk**2 * last.end_s
-    shown = shown_bias(last.step.after, wide.mean, wide.std**2 + walked)
+    shown = shown_bias(state.bias, np.diag(state.covariance(False)), wide.mean, wide.std**2 + walked)
     again = forward(imu, replace(wide, std=supported_std(wide.std, wide.least_std, *shown), least_std=None))[-1].step.after
     std = np.sqrt(np.diag(again.covariance(False)))
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance(False))), std, rtol=0.1)
-    assert (np.abs(found.bias - again.bias) < 0.5 * std).all()
-    assert np.linalg.norm(last.step.after.bias - again.bias) > np.linalg.norm(found.bias - again.bias)
+    wider = np.sqrt(np.diag(P)) / std
+    assert ((wider > 0.95) & (wider < 1.5)).all(), "nor is it known that this is the width"
+    assert (np.abs(found - again.bias) < 0.5 * std).all()
+    assert np.linalg.norm(state.bias - again.bias) > np.linalg.norm(found - again.bias)
+
+
+def test_a_width_that_the_log_does_not_show_is_counted() -> None:
+    """Widths evenly spread in their logarithm: before the log shows anything, the variance is the mean of their squares."""
+    prior = replace(KNOWN, std=np.full(6, 1e-2), least_std=np.full(6, 1e-3))
+    first = forward(biased(3, still_s=0.0), prior)[0]
+    blind = replace(first.step.after, P=np.diag([1.0] * 9 + [1e-4] * 6 + [1e-6] * 6))
+    _, (P,) = prior.supported([blind], np.zeros(1), np.array([False]))
+    exact = (1e-4 - 1e-6) / (2 * np.log(10.0))
+    np.testing.assert_allclose(np.diag(P), exact, rtol=0.1)
+    assert (np.diag(P) > 1.5 * 1e-2 * 1e-3).all(), "more than that of the middle width"
 
 
 def test_a_stop_tells_the_bias_at_rest_from_that_in_motion() -> None:

@@ -177,7 +177,7 @@ def whitener(
 def level(
     residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, settings: NoiseSettings
 ) -> Whitener:
-    """Whitening filters of a sensor beside an exact simulation.
+    """Whitening filters of a sensor beside an exact simulation, or above the band of its poses.
 
     As `whitener`, but below `motion_hz` the noise is taken to be what it is above.
 

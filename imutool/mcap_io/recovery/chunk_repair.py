@@ -143,6 +143,21 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
             yield HEAD.pack(Opcode.CHUNK, len(raw) - HEAD.size) + body + struct.pack("<Q", len(packed)) + packed
 
 
+def keeps_sound(head: records.ChunkHead, raw: bytes, found: messages.Messages) -> bool:
+    """Whether a chunk that is copied as it is can be told to be sound.
+
+    Without a CRC its head must agree with its messages: nothing else tells the next reader that it is sound. Packed data
+    need their end mark, without which other readers refuse them.
+    """
+    if not head.crc and len(found.heads) and (head.start_ns, head.end_ns) != messages.span(found.times()):
+        return False
+    packed = raw[head.data_at :]
+    if head.compression != "lz4":
+        return True
+    checksum = 4 if packed[4] & 4 else 0  # of the contents, behind the end mark
+    return packed[len(packed) - 4 - checksum : len(packed) - checksum] == bytes(4)
+
+
 def find_definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:
     """Finds Schema and Channel records at the start of a damaged chunk; nothing proves them.
 

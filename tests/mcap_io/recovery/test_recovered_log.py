@@ -407,6 +407,21 @@ def test_a_channel_id_that_changed_where_no_crc_covers_it_is_lost_and_told(forei
     assert sum(report.losses.topics.values()) == 1
 
 
+def test_a_chunk_without_a_crc_that_states_other_times_is_sound_in_the_repaired_log(foreign: Foreign, tmp_path: Path) -> None:
+    """It was copied with its head, which the new index contradicted: the repaired log was damaged."""
+    path = foreign(some(1, 40), "zstd", chunk_size=300)
+    raw, at = bytearray(path.read_bytes()), blocks(path)[3].offset
+    raw[at + 9] ^= 1  # where its first message stands
+    raw[at + 33 : at + 37] = bytes(4)  # its CRC
+    raw[blocks(path)[-1].end :] = b""  # the summary, which contradicts it
+    path.write_bytes(bytes(raw))
+    saved = sum(repair(path, tmp_path / "out.mcap").messages.values())
+    with RecoveredLog(tmp_path / "out.mcap") as log:
+        log.check()
+        assert log.losses.intact
+        assert len(content(log)) == saved == 40
+
+
 def test_damaged_stretches_are_kept_where_no_reader_takes_them_for_messages(
     foreign: Foreign, flight: Messages, tmp_path: Path
 ) -> None:

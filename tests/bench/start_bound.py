@@ -1,0 +1,127 @@
+"""What a start from fifteen seconds of truth must cost: `python tests/bench/start_bound.py LOG... --model M`.
+
+The truth's attitude differs from the integrated gyro, of which the model and the log's own best constant are taken, by an error
+that wanders: its variogram over the whole log says how far. In the first seconds it hides the bias. The best linear unbiased
+estimate of a constant bias from them, with that variogram, the model's prior and a free initial attitude, has a covariance; for
+Gaussian errors no unbiased estimate has a smaller one (Cramér-Rao). Carried through the log it is an orientation error.
+Printed for each log, in degrees:
+
+    own       AOE of pure integration with the log's own best constant, from all of its truth
+    start     root mean square of what the covariance of the start adds
+    heading   the mean error that stays if gravity told the biases of both tilts exactly, from the first sample on
+    reached   AOE of `evaluate --init truth`
+
+The variogram also holds the walk of the bias within the log, which hides the log's constant as the truth's error does.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import nnls
+from starts import aoe, own_bias, samples, with_best_truth
+
+from imutool.bias.io import load
+from imutool.bias.model import BiasModel
+from imutool.bias_start import bias_from_truth, initial_bias
+from imutool.bias_start.initial_bias import InitialBias
+from imutool.geometry import quaternion
+from imutool.inertial.strapdown import along_truth
+from imutool.mcap_io.read import read
+from imutool.recording import Imu, Recording, seconds
+
+START_S = 15.0
+STEP_S = 0.25
+TIMES_S = np.geomspace(0.05, 500.0, 30)  # the longest is a random walk over these seconds
+COLUMNS = ("own", "start", "heading", "reached")
+
+
+def main() -> None:
+    """One row a log, and their mean."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG")
+    parser.add_argument("--model", type=Path, required=True)
+    options = parser.parse_args()
+    model = load(options.model)
+    recordings = [with_best_truth(read(log)) for log in options.logs]
+    print(f"{'':16}" + "".join(f"{column:>9}" for column in COLUMNS) + "   deviation of the start's bias, rad/s")
+    rows = []
+    for recording, own in zip(recordings, own_bias(model, recordings), strict=True):
+        row, std = bound(model, recording, InitialBias(own, np.zeros(6), "own"))
+        rows.append(row)
+        print(
+            f"{recording.name:16}" + "".join(f"{value:9.2f}" for value in row) + f"   {np.round(std, 5).tolist()}", flush=True
+        )
+    print(f"{'mean':16}" + "".join(f"{value:9.2f}" for value in np.mean(rows, axis=0)))
+
+
+def bound(model: BiasModel, recording: Recording, own: InitialBias) -> tuple[list[float], Float64[np.ndarray, "3"]]:
+    """Errors of a log in the order of `COLUMNS`, and the standard deviation of the bias after the start."""
+    t_s, error_w, turned = wander(model, recording, own)
+    step = round(STEP_S / float(np.median(np.diff(t_s))))
+    t_s, error_w, turned = t_s[::step], error_w[::step], turned[::step]
+    gamma = variogram(error_w, int(START_S / STEP_S))
+    first = t_s <= t_s[0] + START_S
+    P = covariance(turned[first], gamma, np.diag(initial_bias.bias_prior(model).std[:3] ** 2))
+    up = turned[-1, 2] / np.linalg.norm(turned[-1, 2])  # the bias that turns the heading
+    heading = np.sqrt(2.0 / np.pi) * rms_deg((turned @ up) / np.sqrt(up @ np.linalg.solve(P, up)))  # mean of a normal's size
+    start = rms_deg(turned @ np.linalg.cholesky(P))
+    reached = aoe(model, bias_from_truth.from_truth(model, recording), recording)
+    return [aoe(model, own, recording), start, float(heading), reached], np.sqrt(np.diag(P))
+
+
+def wander(
+    model: BiasModel, recording: Recording, own: InitialBias
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3 3"]]:
+    """Seconds, truth against integrated gyro (rad, world frame), and the rotation that a unit of each axis' bias gives.
+
+    The second is NaN where there is no truth.
+    """
+    imu = recording.imu
+    bias = own.stream(model)(*samples(imu))
+    estimate, true, valid = along_truth(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel), recording.truth, recording.name)
+    t_s = seconds(true.t_ns, int(true.t_ns[0]))
+    R_true = quaternion.matrix(true.q_wb_wxyz)
+    error_w = quaternion.log(quaternion.multiply(true.q_wb_wxyz, quaternion.inverse(estimate.q_wb_wxyz)))
+    error_w[~valid] = np.nan
+    steps = 0.5 * (R_true[1:] + R_true[:-1]) * np.diff(t_s)[:, None, None]
+    return t_s, error_w, np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
+
+
+def variogram(error_w: Float64[np.ndarray, "n 3"], lags: int) -> Float64[np.ndarray, " lags"]:
+    """Half the mean square by which an axis' error changes over each number of steps, as a sum of exponential ones.
+
+    Such a sum belongs to an error that can be; the bare means, with holes in the truth, need not.
+    """
+    steps = np.arange(1, lags + 1)
+    found = np.array([0.5 * np.nanmean((error_w[lag:] - error_w[:-lag]) ** 2) for lag in steps])
+    terms = 1.0 - np.exp(-np.arange(lags + 1)[:, None] / (TIMES_S / STEP_S))
+    weights, _ = nnls(terms[1:] / found[:, None], np.ones(lags))
+    return terms @ weights
+
+
+def covariance(
+    turned: Float64[np.ndarray, "n 3 3"], gamma: Float64[np.ndarray, " lags"], prior: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """Covariance of the bias by generalized least squares; the initial attitude is free, so the variogram is enough."""
+    n = min(len(turned), len(gamma))
+    turned = turned[:n]
+    S = 2.0 * gamma.max() - gamma[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))]
+    S += 1e-9 * gamma.max() * np.eye(n)
+    X = np.concatenate([np.tile(np.eye(3), (n, 1, 1)), turned], axis=2)
+    whitened = np.linalg.solve(np.linalg.cholesky(S), X.reshape(n, 18)).reshape(3 * n, 6)
+    information = whitened.T @ whitened
+    information[3:, 3:] += np.linalg.inv(prior)
+    return np.linalg.inv(information)[3:, 3:]
+
+
+def rms_deg(turned: Float64[np.ndarray, "n ..."]) -> float:
+    """Root mean square over a log of a rotation error, in degrees."""
+    return float(np.degrees(np.sqrt((turned.reshape(len(turned), -1) ** 2).sum(axis=1).mean())))
+
+
+if __name__ == "__main__":
+    main()
