@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.inertial import inertial_filter

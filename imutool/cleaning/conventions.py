@@ -17,8 +17,8 @@ from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, force_in_world, turning

@@ -11,8 +11,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks

@@ -27,9 +27,9 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 
+from imutool.array_types import Float64
 from imutool.config import Settings
 from imutool.inertial.preintegration import EYE, Increment, Matrix3, Vector3, hat
 from imutool.recording import GRAVITY_M_S2

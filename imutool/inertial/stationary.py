@@ -19,9 +19,9 @@ from collections.abc import Iterable
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 from msgspec import Meta
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import true_ranges

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
 
+from imutool.array_types import Float64, Int64, UInt8
 from imutool.errors import LogError, did_you_mean
 from imutool.location import Location
 from imutool.mcap_io.codec import ros2_definition

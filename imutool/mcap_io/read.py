@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt32
 
+from imutool.array_types import Float64, Int64, UInt32
 from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas

@@ -11,8 +11,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64
 
+from imutool.array_types import Bool, Int64
 from imutool.errors import DataError
 
 MOST_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps is a jump of their clock

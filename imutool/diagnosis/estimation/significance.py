@@ -14,13 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.linalg import solve_triangular
 from scipy.special import gammaincc, gammainccinv, gammaln
 from scipy.stats import f as fisher
 from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors, with_value
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.whitening import WhitenedLog

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import UInt8
 
+from imutool.array_types import UInt8
 from imutool.errors import LogError
 
 IMU = "sensor_msgs/msg/Imu"
