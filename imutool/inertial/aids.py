@@ -15,8 +15,8 @@ import re
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
 from imutool.geometry import quaternion
 from imutool.inertial.metrics import align
