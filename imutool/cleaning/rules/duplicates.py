@@ -16,7 +16,8 @@ MEMORY = 1024  # messages: what a recorder sends again, it sends soon
 class Duplicates(Rule):
     """Rule for duplicates: it keeps the first of equal stamps.
 
-    A message sent again later is a duplicate too, not time that goes back; another one with an earlier stamp is left to that rule.
+    A message sent again later is a duplicate too, not time that goes back. Another message with an earlier stamp is left to the
+    rule for those.
     """
 
     place = 10
