@@ -3,7 +3,7 @@
 A sample is *ahead* when most of the next samples come before it: then it is the one that is wrong, and without this a single
 stamp of the year 2100 would cost the rest of the log. A sample is *late* when it does not come after all that were kept.
 
-Late samples in a row after which the stamps go on where the row ended are motion on the times of earlier motion: the clock was set
+Late samples in a row, after which the stamps go on where the row ended, are motion on earlier times: the clock was set
 back, and what is dropped is missing. Where the clock goes back by more than a second and stays there, or forward by more than a
 day, an *epoch* ends. Of several epochs those are kept that together hold most samples in increasing time; that needs the whole
 log, so such a log is read twice.
