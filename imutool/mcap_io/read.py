@@ -87,7 +87,7 @@ def read_recordings(
     Raises:
         LogError: as `read`.
     """
-    imu_topic = log.topic(log.only_imu() if imu is None else imu, (schemas.IMU,)).name
+    imu_topic = imu if imu and samples is not None else log.topic(imu or log.only_imu(), (schemas.IMU,)).name
     own, metadata = own_and_user_metadata(log.metadata_records())
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}

@@ -75,7 +75,21 @@ READ = {
     "folders",
 }
 WORDS = {
-    *("format", "sequence", "compression", "imu", "truth", "rule", "no_rule", "init", "verify", "connect", "method", "set_"),
+    *(
+        "aid",
+        "format",
+        "sequence",
+        "compression",
+        "imu",
+        "truth",
+        "rule",
+        "no_rule",
+        "init",
+        "verify",
+        "connect",
+        "method",
+        "set_",
+    ),
     *(
         "sensor",
         "device",
