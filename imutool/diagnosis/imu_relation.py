@@ -35,7 +35,7 @@ def imu_relation(first: Recording, other: Recording, effects: Sequence[str], set
     """
     a, b = first.imu, other.imu
     t_ns = b.t_ns[(b.t_ns >= a.t_ns[0]) & (b.t_ns <= a.t_ns[-1])]
-    R = Rotation.align_vectors(*(_vectors(imu, t_ns) for imu in (b, a)))[0] if len(t_ns) > 1 else Rotation.identity()
+    R = Rotation.identity() if len(t_ns) < 2 else Rotation.align_vectors(_vectors(b, t_ns), _vectors(a, t_ns))[0]
     back = R.inv().as_matrix()
     turned = replace(first, imu=replace(a, gyro=a.gyro @ back, accel=a.accel @ back), truths={})
     pair = with_simulation(replace(other, truths={}), turned, settings)
