@@ -9,8 +9,8 @@ from decimal import Decimal, InvalidOperation
 from itertools import chain
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 
 LARGEST_NS = 2**63 - 1

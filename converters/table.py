@@ -12,8 +12,8 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.recording import Poses, Scalars, unit_quaternions

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import DataError, not_installed
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses

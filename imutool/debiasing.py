@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
 
 from imutool import __version__
+from imutool.array_types import Float64, Int64, UInt8
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel

@@ -9,28 +9,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 from msgspec import to_builtins
 
+from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias_start.correction import DebiasedImu, apply
+from imutool.bias_start.aided_path import aided_path
+from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.bias_start.stretches import measured_imu, read_stretches
-from imutool.bias_start.zero_velocity import zero_velocity_trajectory
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
+from imutool.inertial.aids import Aids, find_aids, parse_aids
 from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.log_info.conventions import warn_of_recordings
+from imutool.mcap_io.log import Log
 from imutool.recording import Imu, Poses, Recording
 
 RAW = "raw"
 DRIFT_S = 5.0
-PURE, ZUPT = "integration", "zupt"
+PURE, AIDED = "integration", "aided"
 RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
 Refused = Callable[[str, ImutoolError], None]
 
@@ -41,7 +43,7 @@ def evaluate(
     models: Sequence[str | Path] = (),
     init: str = "auto",
     smooth: bool = False,
-    zupt: bool = False,
+    aid: str | None = None,
     truth: str | None = None,
     imu: str | None = None,
     trajectories: Path | None = None,
@@ -53,19 +55,25 @@ def evaluate(
     A log whose clock jumps has these for each of its stretches, which are named NAME_1, NAME_2 and so on.
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
     `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
-    log; with `zupt` a second result each is dead reckoning that knows its stops (`zero_velocity`), of the same samples.
+    log. With `aid` a second result each is the smoothed path of the same samples with those aids (`aids.parse_aids`).
 
     Raises:
-        ConfigError: `smooth` with another `init`; two models of one name, files that exist, or nothing measured.
-        LogError, DataError: no IMU, no truth, or the two share no time.
+        ConfigError: `smooth` with another `init`, an unknown aid, two models of one name, files that exist, no sample measured.
+        LogError, DataError: no IMU, no truth, or the two share no time; an aid that the log lacks.
         ModelError: a model that cannot be used with this log.
     """
     if trajectories is not None:
         _refuse_twins(models)
+    asked = None if aid is None else parse_aids(aid)
     results = list[dict[str, Any]]()
-    for recording in read_stretches(log, imu=imu, truth=truth):
+    for stretch in read_stretches(log, imu=imu, truth=truth):
+        recording = replace(stretch, imu=measured_imu(stretch.imu, f"{log} {stretch.imu_topic}"))
+        aids = None
+        if asked is not None:
+            with Log(log) as opened:
+                aids = find_aids(opened, recording, asked)
         chosen = recording.with_truth(next(iter(recording.truths))) if truth is None and recording.truths else recording
-        results += _evaluated(chosen, log, models, init, smooth, zupt, trajectories, overwrite, refused)
+        results += _evaluated(chosen, log, models, init, smooth, aids, trajectories, overwrite, refused)
     return results
 
 
@@ -75,29 +83,29 @@ def _evaluated(
     models: Sequence[str | Path],
     init: str,
     smooth: bool,
-    zupt: bool,
+    aids: Aids | None,
     trajectories: Path | None,
     overwrite: bool,
     refused: Refused | None,
 ) -> list[dict[str, Any]]:
     """Results of one stretch of a log."""
-    recording = replace(recording, imu=measured_imu(recording.imu, f"{log} {recording.imu_topic}"))
     warn_of_recordings([recording])
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
-        found = _corrected(recording.imu, model, start)
+        found, std = _corrected(recording.imu, model, start)
         fit = judge(model, start, [relative_samples(recording.imu)], about) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
-        if zupt:
-            estimates[ZUPT] = zero_velocity_trajectory(_over(found.imu, true), StartPose.of(true), _left(start), smooth=smooth)
+        if aids is not None:
+            estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), _left(start, std), aids)
         for kind, estimate in estimates.items():
             results.append(
                 {
                     "log": recording.name,
                     "model": name,
                     "estimate": kind,
+                    "aids": aids.signals if aids and kind == AIDED else {},
                     "init": init if start else None,
                     "init_how": start.how if start else None,
                     "smooth": smooth,
@@ -129,22 +137,24 @@ def _over(imu: Imu, true: Poses) -> Imu:
     return rows
 
 
-def _left(start: InitialBias | None) -> BiasPrior:
-    """Prior of the residual bias: the start's standard deviation, or a wide one for raw samples."""
-    std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
-    return BiasPrior(np.zeros(6), std, AT_REST_STD)
+def _left(start: InitialBias | None, std: Float64[np.ndarray, "n 6"]) -> BiasPrior:
+    """Prior of the residual bias: as the start states, or less where the tracked bias became more certain."""
+    least = np.median(std, axis=0) if start is None else np.minimum(start.std, np.median(std, axis=0))
+    return BiasPrior(np.zeros(6), np.maximum(least, LEAST_STD), AT_REST_STD)
 
 
-def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> DebiasedImu:
-    """Samples corrected by a model; without one as they are."""
-    return apply(model, start, imu) if model and start else DebiasedImu(imu, np.zeros((len(imu), 6)))
+def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
+    """Samples corrected by a model, with the deviation of its bias; without one as they are, with a wide one."""
+    if model is None or start is None:
+        return DebiasedImu(imu, np.zeros((len(imu), 6))), np.tile(RAW_STD, (len(imu), 1))
+    return apply_with_std(model, start, imu)
 
 
 def runs(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
-    yield RAW, _corrected(recording.imu, None, None), None
+    yield RAW, _corrected(recording.imu, None, None)[0], None
     for name, model, start in started(recording, models, init, where):
         yield name, apply(model, start, recording.imu), start
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.config import build
 from imutool.errors import DataError
 from imutool.inertial.stationary import rest_stretches, white_noise

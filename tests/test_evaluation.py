@@ -12,16 +12,24 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import driven
 from support.evo import statistics
 
+from imutool import evaluation
 from imutool.bias import linear
-from imutool.bias.io import save
+from imutool.bias.io import find_model, save
+from imutool.bias_start.correction import apply_with_std
+from imutool.bias_start.initial_bias import LEAST_STD
+from imutool.bias_start.model_choice import find_initial_bias
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.conversion.run import convert
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.evaluation import evaluate, runs
 from imutool.inertial import metrics
+from imutool.inertial.aids import Aids
 from imutool.inertial.metrics import DISTANCES_M
-from imutool.inertial.strapdown import along_truth
+from imutool.inertial.strapdown import StartPose, along_truth, dead_reckon
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight
@@ -185,18 +193,66 @@ def test_taking_off_the_true_bias_helps(log: Path, recording: Recording) -> None
     assert static["init_how"] == "given"
 
 
-def test_knowing_its_stops_is_a_row_beside_pure_integration(log: Path, model: Path, tmp_path: Path) -> None:
+def test_an_aided_path_is_a_row_beside_pure_integration(log: Path, model: Path, tmp_path: Path) -> None:
     pure = evaluate(log, models=["static", model], init="auto")
-    both = evaluate(log, models=["static", model], init="auto", zupt=True, trajectories=tmp_path)
+    both = evaluate(log, models=["static", model], init="auto", aid="stops", trajectories=tmp_path)
     assert [(one["model"], one["estimate"]) for one in both] == [
-        (name, kind) for name in ("raw", "static", "linear_1") for kind in ("integration", "zupt")
+        (name, kind) for name in ("raw", "static", "linear_1") for kind in ("integration", "aided")
     ]
     assert both[::2] == pure
     for integrated, stopped in zip(both[::2], both[1::2], strict=True):
         assert stopped["ape_m"] < 0.5 * integrated["ape_m"], stopped["model"]
         assert stopped["samples"] == integrated["samples"]
-    assert {path.name for path in tmp_path.glob("*zupt*")} == {f"flight_1_{n}_zupt.tum" for n in ("raw", "static", "linear_1")}
+        assert (integrated["aids"], stopped["aids"]) == ({}, {"stops": ""})
+    assert {path.name for path in tmp_path.glob("*aided*")} == {
+        f"flight_1_{n}_aided.tum" for n in ("raw", "static", "linear_1")
+    }
     json.dumps(both, allow_nan=False)
+
+
+def test_what_tracking_found_out_narrows_the_prior_of_an_aided_path(
+    log: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bias that was tracked is known better than its start: else an unobservable heading wanders."""
+    priors = []
+
+    def path(imu: Imu, start: StartPose, prior: BiasPrior, _: Aids) -> Poses:
+        priors.append(prior)
+        return dead_reckon(imu, start)
+
+    monkeypatch.setattr(evaluation, "aided_path", path)
+    recording = read(log)
+    loaded = find_model(model, 200.0)
+    start = find_initial_bias("auto", loaded, recording)
+    evaluate(log, models=[model], aid="stops")
+    raw, known = (prior.std for prior in priors)
+    _, std = apply_with_std(loaded, start, recording.imu)
+    assert (known <= np.maximum(start.std, LEAST_STD)).all()
+    np.testing.assert_allclose(known, np.maximum(np.minimum(start.std, np.median(std, axis=0)), LEAST_STD), rtol=1e-12)
+    assert (known < start.std).any()
+    assert (raw > known).all()
+
+
+def test_all_aids_of_a_log_and_each_setting_of_its_clock(tmp_path: Path) -> None:
+    """A drive twice, with the clock set back between: wheels and barometer go with their own stretch."""
+    drive = driven.drive(duration_s=30.0)
+    topics = {
+        "/odom": driven.odometry(drive.vehicle),
+        "/air": driven.pressure(drive.vehicle.t_ns, np.zeros(len(drive.vehicle))),
+    }
+    path = driven.write(tmp_path / "drive.mcap", drive.imu, drive.truth, topics)
+    pure, aided = evaluate(path, models=["static"], aid="auto")[2:]
+    assert set(aided["aids"]) == {"stops", "barometer", "odometry", "ground"}
+    assert aided["ape_m"] < min(0.3, 0.05 * pure["ape_m"])
+    assert aided["rpe_m"]["10"] < 0.05 * pure["rpe_m"]["10"]
+    assert aided["velocity_rmse_m_s"] < 0.05 * pure["velocity_rmse_m_s"]
+    twice = driven.write(tmp_path / "twice.mcap", drive.imu, drive.truth, topics, again_ns=-7200 * 10**9)
+    found = [
+        one for one in evaluate(twice, models=["static"], aid="auto") if one["estimate"] == "aided" and one["model"] == "static"
+    ]
+    assert [one["log"] for one in found] == ["twice_1", "twice_2"]
+    for one in found:
+        assert one["ape_m"] == pytest.approx(aided["ape_m"], rel=1e-6)
 
 
 def test_smoothing_is_said_and_finds_its_own_start(log: Path, model: Path) -> None:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 # docs/architecture.md, Rooms: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
-    ("errors",),
+    ("array_types", "errors"),
     ("config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
     ("noise", "cleaning"),
@@ -31,7 +31,7 @@ TIERS = (
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(TIERS) for room in rooms}
-FOR_CONVERTERS = {"converters", "errors", "geometry", "recording", "bag"}
+FOR_CONVERTERS = {"converters", "array_types", "errors", "geometry", "recording", "bag"}
 
 
 def modules(folder: Path, package: str) -> dict[str, ast.Module]:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars, nanoseconds, seconds, unit_quaternions
+from imutool.recording.columns import quantile
 
 EPOCH_NS = 1_403_638_128_245_096_960  # in EuRoC's MH_04
 SECONDS = 2.0**-52  # relative: one rounding of the difference, one of the product
@@ -418,3 +419,10 @@ def test_a_recording_prints_a_line_for_each_topic_and_no_array() -> None:
         "  /odom: poses (odometry), not read",
     ]
     assert repr(make_imu(1)) == "Imu(1 rows, 0.000 s; gyro [1, 3], accel [1, 3])"
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_a_quantile_is_that_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 3))
+    for share in (0.0, 0.25, 0.5, 0.9, 1.0):
+        np.testing.assert_allclose(quantile(values, share), np.quantile(values, share, axis=0), rtol=1e-14)

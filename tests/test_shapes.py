@@ -10,8 +10,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
+from jaxtyping import Float64, TypeCheckError
 from support.shapes import check_shapes
+
+from imutool import array_types
+from imutool.inertial.preintegration import hat
 
 SOURCE = """
 from __future__ import annotations
@@ -45,6 +48,12 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleT
     check_shapes("checked_shapes")
     yield importlib.import_module("checked_shapes")
     del sys.modules["checked_shapes"]
+
+
+def test_the_types_of_the_package_are_those_of_jaxtyping_under_tests() -> None:
+    assert array_types.Float64 is Float64
+    with pytest.raises(TypeCheckError):
+        hat(np.zeros(4))
 
 
 def test_a_wrong_shape_is_refused_after_right_ones(package: ModuleType) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import overload
 
 import numpy as np
-from jaxtyping import Float64
 
 from imutool import debiasing, evaluation
 from imutool.api.logs import Progress
+from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel

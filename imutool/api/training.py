@@ -81,7 +81,7 @@ def evaluate(
     models: Sequence[str | Path] = (),
     init: str = "auto",
     smooth: bool = False,
-    zupt: bool = False,
+    aid: str | None = None,
     truth: str | None = None,
     imu: str | None = None,
     trajectories: str | Path | None = None,
@@ -94,7 +94,8 @@ def evaluate(
         models: Model files, names of models that ship, or `static`.
         init: Initial bias, as in `debias`.
         smooth: Smoothing, as in `debias`.
-        zupt: Also score dead reckoning with zero-velocity updates.
+        aid: Also score the smoothed path with these aids: `auto` (all that the log has), or some of `stops`, `barometer`,
+            `odometry` and `ground` with commas between; `barometer=TOPIC.field` and `odometry=TOPIC` name a topic.
         truth: Topic of the true poses; by default the first.
         imu: IMU topic; needed where the log has several.
         trajectories: Folder for trajectories in the TUM format.
@@ -122,7 +123,7 @@ def evaluate(
         models=models,
         init=init,
         smooth=smooth,
-        zupt=zupt,
+        aid=aid,
         truth=truth,
         imu=imu,
         trajectories=None if trajectories is None else local(trajectories, "trajectories"),

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.debiasing import DebiasedBlock
 from imutool.location import LogPath, local, location
 from imutool.mcap_io.codec.decode import ImuBatch

@@ -23,8 +23,8 @@ from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS, Array, BiasModel, Shapes, Stream, Vector6, matrices
 from imutool.bias.neural_stream import gelu
 from imutool.config import Settings

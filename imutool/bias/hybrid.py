@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias import neural_ode
 from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, DriftStream, Shapes, Stream, Vector6
 from imutool.config import Settings

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias.model import BiasModel, Shapes, Stream, Vector6, matrices
 from imutool.config import Settings
 from imutool.units import SENSORS

@@ -16,8 +16,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 

@@ -24,8 +24,8 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
 from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, erf, gelu
 from imutool.config import Settings

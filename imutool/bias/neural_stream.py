@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS, Array, Vector6
 from imutool.sensor.signals import low_pass
 from imutool.units import Sensor

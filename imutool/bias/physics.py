@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias import hybrid, static
 from imutool.bias.model import BiasModel, CovarianceModel, DriftStream, Shapes, Stream, Vector6
 from imutool.config import Settings

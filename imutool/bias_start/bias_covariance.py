@@ -22,8 +22,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS, BiasEstimate, BiasModel, Covariances
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.geometry.quaternion import unit

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.bias.model import Array, BiasModel, Vector6
 from imutool.bias_start.initial_bias import (
     LEAST_STD,

@@ -8,18 +8,19 @@ Samples, minus the model's motion-dependent bias, go through `imutool.inertial.i
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.preintegration import integrate
 from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
+from imutool.recording.columns import quantile
 
 BLOCK_S = 0.5
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
@@ -57,6 +58,14 @@ class FilteredBlock(NamedTuple):
     step: Step
 
 
+class Aiding(NamedTuple):
+    """Aids of a filter that keeps its pose: measurement per block, stops, walk of offsets."""
+
+    measure: Callable[[State, float], State]  # of the state at a time (s)
+    stops: bool
+    walk: Float64[np.ndarray, " _"]
+
+
 class _Block(NamedTuple):
     """Block of samples from one boundary to the next, both included; at rest the last belongs to the next block."""
 
@@ -72,9 +81,13 @@ class BiasFilter:
     With `ahead`, blocks wait until `OnlineRestDetector` knows whether a stop begins with them, which takes 1.5 s.
     """
 
-    def __init__(self, prior: BiasPrior, settings: FilterSettings | None = None, *, ahead: bool = False) -> None:
+    def __init__(
+        self, prior: BiasPrior, settings: FilterSettings | None = None, *, ahead: bool = False, aiding: Aiding | None = None
+    ) -> None:
         self.settings = settings or FilterSettings()
         self.state: State | None = None
+        self._aiding = aiding
+        self._walk = prior.walk if aiding is None else np.concatenate([prior.walk, aiding.walk])
         self._prior, self._rest_detector = prior, OnlineRestDetector()
         self._wait = self._rest_detector.blocks_needed - 1 if ahead else 0
         self._waiting: deque[tuple[_Block, bool]] = deque()
@@ -107,11 +120,10 @@ class BiasFilter:
 
     def _arrived(self, t: Float64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"]) -> Iterator[FilteredBlock]:
         dt = t[1:] - t[:-1]
-        ordered = np.sort(dt)  # `np.median` takes five times as long
-        median = 0.5 * (ordered[(len(dt) - 1) // 2] + ordered[len(dt) // 2])
-        late = dt > GAP_PERIODS * median if len(dt) > 1 else dt > BLOCK_S * 1.5
+        late = dt > GAP_PERIODS * quantile(dt, 0.5) if len(dt) > 1 else dt > BLOCK_S * 1.5
         block = _Block(t, u, float(dt.max()), float(dt[late].sum()))
         rests = self._rest_detector(u[:-1, :3], u[:-1, 3:], whole=not late.any())
+        rests = rests and (self._aiding is None or self._aiding.stops)
         self._waiting.append((block, rests))
         if rests:
             for i in range(max(0, len(self._waiting) - 1 - self._wait), len(self._waiting)):
@@ -125,17 +137,21 @@ class BiasFilter:
             prior = self._prior
             P = np.diag(np.concatenate([prior.std, prior.ground_std]) ** 2)
             self.state = inertial_filter.level(u[:, 3:].mean(axis=0), prior.mean, np.zeros(6), P, s)
-        x = self.state
-        if block.longest_s > GAP_S:
+        x, T = self.state, float(t[-1] - t[0])
+        if block.longest_s > GAP_S and self._aiding is not None:
+            step = inertial_filter.pause_step(x, T, self._walk)
+        elif block.longest_s > GAP_S:
             most = np.maximum(self._prior.std**2, np.diag(x.covariance(False)))
-            step = inertial_filter.reset_pose(x, u[-1, 3:], float(t[-1] - t[0]), self._prior.walk, most, s)
+            step = inertial_filter.reset_pose(x, u[-1, 3:], T, self._prior.walk, most, s)
         elif rests:
             resting = u[:-1]
             variance = resting[:, :3].var(axis=0) / len(resting)
-            step = inertial_filter.rest_step(x, resting.mean(axis=0), variance, float(t[-1] - t[0]), self._prior.walk, s)
+            step = inertial_filter.rest_step(x, resting.mean(axis=0), variance, T, self._walk, s)
         else:
             motion = integrate(t, u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:])
-            step = inertial_filter.motion_step(x, motion, block.missing_s, self._prior.walk, s)
+            step = inertial_filter.motion_step(x, motion, block.missing_s, self._walk, s)
+        if self._aiding is not None:
+            step = step._replace(after=self._aiding.measure(step.after, float(t[-1])))
         self.state = step.after
         return FilteredBlock(float(t[0]), float(t[-1]), rests, step)
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, relative_samples, tracked_from_prior

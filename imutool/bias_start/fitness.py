@@ -13,12 +13,12 @@ The thresholds come from `tests/bench/fit.py`: pieces of the training logs of th
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
@@ -29,6 +29,7 @@ from imutool.bias_start.prior_width import BiasPrior, supported_std
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
+from imutool.recording.columns import quantile
 
 CHECKED_S = 120.0  # of a log that the check reads
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
@@ -116,7 +117,7 @@ def _head(batches: Iterable[Samples]) -> Samples:
 
 def _wrong_gravity(samples: Samples) -> str:
     """Sentence on a mean specific force that is not gravity's; empty if it is."""
-    size = float(np.median(np.linalg.norm(samples[2], axis=1)))
+    size = float(quantile(np.linalg.norm(samples[2], axis=1), 0.5))
     low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
     if low <= size <= high:
         return ""
@@ -142,7 +143,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    innovations = np.array([_innovation(block) for block in blocks])
+    chi_square, log_likelihood = _innovations(blocks)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -150,19 +151,20 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     gain = np.where(shown, 1.0 - after / before, 1.0)
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
-    surprising = float((innovations[:, 0] > SURPRISING).mean())
-    return _Evidence(float(innovations[:, 1].sum()), surprising, difference, variance)
+    surprising = float((chi_square > SURPRISING).mean())
+    return _Evidence(float(log_likelihood.sum()), surprising, difference, variance)
 
 
-def _innovation(block: FilteredBlock) -> tuple[float, float]:
-    """Chi-square of a block's velocity, and its log-likelihood under Student's distribution."""
-    s, expected = FilterSettings(), block.step.expected
-    length_s = block.end_s - block.start_s
-    noise = s.rest_m_s**2 if block.resting else 2.0 * s.speed_m_s**2 * s.speed_correlation_s / length_s
-    S = expected.P[VELOCITY, VELOCITY] + noise * np.eye(3)
-    chi_square = float(expected.v_w @ np.linalg.solve(S, expected.v_w))
-    log_det = float(np.linalg.slogdet(S)[1])
-    return chi_square, -0.5 * (STUDENT + 3.0) * math.log1p(chi_square / STUDENT) - 0.5 * log_det
+def _innovations(blocks: Sequence[FilteredBlock]) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+    """Chi-square of each block's velocity, and its log-likelihood under Student's distribution."""
+    s = FilterSettings()
+    v = np.array([block.step.expected.v_w for block in blocks])
+    S = np.array([block.step.expected.P[VELOCITY, VELOCITY] for block in blocks])
+    bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s
+    noise = np.array([s.rest_m_s**2 if b.resting else bounded / (b.end_s - b.start_s) for b in blocks])
+    S += noise[:, None, None] * np.eye(3)
+    chi_square = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1)
+    return chi_square, -0.5 * (STUDENT + 3.0) * np.log1p(chi_square / STUDENT) - 0.5 * np.linalg.slogdet(S)[1]
 
 
 def _deviations(found: _Evidence, prior: BiasPrior) -> Vector6:
@@ -212,7 +214,7 @@ def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
     if ratio > MOST_NOISE:
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
-    rate_hz = 1.0 / float(np.median(np.diff(samples[0])))
+    rate_hz = 1.0 / float(quantile(np.diff(samples[0]), 0.5))
     if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
         sentences.append(f"samples at {rate_hz:.2f} Hz, in the training runs at {model.rate_hz:.2f} Hz")
     return sentences

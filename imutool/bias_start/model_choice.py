@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.bias import static
 from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.bias.model import COLUMNS, Vector6
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import State

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.errors import ConfigError, LogError

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
+from imutool.array_types import Float64
 from imutool.blind_cases.catalogue import AXES, CATALOGUE
 from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta, Times
 from imutool.blind_cases.envelope import Location, Marks, Rms

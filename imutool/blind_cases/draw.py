@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64
 from numpy.random import Generator
 
+from imutool.array_types import Float64
 from imutool.blind_cases import catalogue
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT, clipping
 from imutool.blind_cases.detectability import Detectability, detectable_misfit

@@ -14,9 +14,9 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
+from imutool.array_types import Float64
 from imutool.blind_cases.motion import Kinematics
 from imutool.recording import GRAVITY_M_S2
 

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
 

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from numpy.random import Generator
 from scipy.interpolate import make_interp_spline
 
+from imutool.array_types import Float64, Int64
 from imutool.blind_cases import catalogue
 from imutool.blind_cases.effects import Model, Reading, Six, Stage, Theta, Times
 from imutool.blind_cases.motion import Kinematics, Motion, Smoother

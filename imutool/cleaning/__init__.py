@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Bool
 
+from imutool.array_types import Bool
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.first_pass import Survey, UntrustedError, look, raw_batches, survey
 from imutool.cleaning.rule import CleaningSettings

@@ -17,14 +17,15 @@ from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, force_in_world, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
+from imutool.recording.columns import quantile
 
 SURE = 3.0  # standard errors of the log likelihood ratio
 CLEARLY = 0.5  # of the misfit of a zero reading, or of the log as it is, that of the best reading at most
@@ -171,7 +172,7 @@ def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m
     rate, first, last, number = _windows(step, mean)
     if not len(rate):
         return None
-    readings = _rate_readings(float(np.quantile(np.linalg.norm(rate, axis=2), 0.9)))
+    readings = _rate_readings(float(quantile(np.linalg.norm(rate, axis=2).ravel(), 0.9)))
     if not readings:
         return None
     choice = _choose(_carried(rate, first, last, readings), number)
@@ -187,12 +188,12 @@ def _windows(
     """Windows that turn: their angular rates, the specific force at both ends, and the number of their block."""
     starts = np.arange(1, len(step) - WINDOW - 1)
     starts = starts[step[starts + WINDOW + 1] - step[starts - 1] == WINDOW + 2]
-    rate = mean[:, :3] - np.median(mean[:, :3], axis=0)
+    rate = mean[:, :3] - quantile(mean[:, :3], 0.5)
     rows = starts[:, None] + np.arange(WINDOW + 1)
     turned = np.linalg.norm(rate[rows].sum(axis=1), axis=1)
     if not len(starts) or not turned.max() > 0:
         return np.zeros((0, WINDOW, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int64)
-    use = np.flatnonzero(turned > TURNING * np.quantile(turned, 0.9))
+    use = np.flatnonzero(turned > TURNING * quantile(turned, 0.9))
     starts = starts[use[:: max(1, -(-len(use) // MOST_WINDOWS))]]
     rows = starts[:, None] + np.arange(WINDOW + 1)
     smooth = (mean[:-2, 3:] + mean[1:-1, 3:] + mean[2:, 3:]) / 3.0

@@ -8,8 +8,8 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Int64
 
+from imutool.array_types import Int64
 from imutool.cleaning.samples import Numbers
 from imutool.report import Section
 

@@ -9,9 +9,9 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
 from imutool import registry
+from imutool.array_types import Bool, Float64
 from imutool.cleaning.conventions import axis_names
 from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, verdict
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary

@@ -9,10 +9,10 @@ from functools import cache, cached_property
 from typing import Annotated, ClassVar
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from msgspec import Meta
 
 from imutool import registry
+from imutool.array_types import Float64, Int64
 from imutool.cleaning.conventions import Conventions, judge
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.samples import Motion, Numbers, Samples

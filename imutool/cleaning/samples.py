@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import nanoseconds
 

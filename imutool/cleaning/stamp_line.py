@@ -13,8 +13,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.recording import nanoseconds
 
 WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds

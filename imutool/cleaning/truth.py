@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.cleaning.samples import STEP_NS
 from imutool.errors import LogError
 from imutool.geometry import quaternion

@@ -10,6 +10,7 @@ import numpy as np
 from imutool.cleaning.samples import Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.recording import GRAVITY_M_S2, seconds
+from imutool.recording.columns import quantile
 
 DEGREES = 180.0 / np.pi
 RATES: Mapping[str, float] = {  # rad/s of one unit
@@ -75,8 +76,8 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     calm = np.flatnonzero(whole)[np.argsort(scatter[whole])][: max(1, round(CALM_SHARE * count))]
     calm = calm[scatter[calm] < CALM_SCATTER]
     if len(calm):
-        return float(np.median(level[calm])), True
-    return float(np.median(level[whole] if whole.any() else np.linalg.norm(mean[:, 3:], axis=1))), False
+        return float(quantile(level[calm], 0.5)), True
+    return float(quantile(level[whole] if whole.any() else np.linalg.norm(mean[:, 3:], axis=1), 0.5)), False
 
 
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:

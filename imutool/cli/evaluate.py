@@ -20,18 +20,21 @@ from imutool.report import UNSET, Report, Section, UnsetType
 logger = logging.getLogger(__name__)
 
 ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
+AID_HELP = "Also score the smoothed path with stops, barometer, odometry, ground; auto: all that the log has."
 TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
 class Score(Section, frozen=True, kw_only=True):
     """Scores of an estimate of a log; degrees, metres, biases in rad/s and m/s².
 
-    Relative errors are keyed by their distance in metres; a figure that the log does not show is null.
+    Relative errors are keyed by their distance in metres; a figure that the log does not show is null. `aids` are the topics
+    that an aided path used, by kind.
     """
 
     log: str
     model: str
-    estimate: Literal["integration", "zupt"]
+    estimate: Literal["integration", "aided"]
+    aids: dict[str, str]
     init: str | None
     init_how: str | None
     smooth: bool
@@ -70,7 +73,8 @@ def evaluate(
     model: Models = None,
     init: Init = "auto",
     smooth: Smooth = False,
-    zupt: Annotated[bool, typer.Option("--zupt", help="Also score dead reckoning with zero-velocity updates.")] = False,
+    aid: Annotated[str | None, typer.Option(metavar="KIND,...", help=AID_HELP)] = None,
+    zupt: Annotated[bool, typer.Option("--zupt", help="The same as --aid stops.")] = False,
     truth: Truth = None,
     imu: Imu = None,
     trajectories: Annotated[
@@ -103,22 +107,21 @@ def evaluate(
             first = len(results)
             refused: dict[str, ImutoolError] = {}
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
-            more: dict[str, Any] = {"zupt": zupt, "trajectories": trajectories, "overwrite": overwrite}
-            more["refused"] = refused.__setitem__
-            results += run(log, models=model or (), **read, **more)
+            more: dict[str, Any] = {"trajectories": trajectories, "overwrite": overwrite, "refused": refused.__setitem__}
+            results += run(log, models=model or (), aid=aid or ("stops" if zupt else None), **read, **more)
             errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
                 run_data = load(log, models=scored, **read)
-                loaded.append(replace(run_data, notes=(*run_data.notes, *_fits(results[first:]), *_stops(results[first:]))))
+                loaded.append(replace(run_data, notes=(*run_data.notes, *_fits(results[first:]), *_aided(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=overwrite)
         tell(len(logs), len(logs), "")
     if not write_json(Evaluation(convert(results, list[Score])), json_to, overwrite=overwrite):
-        rows = [{**row, "model": f"{row['model']} zupt"} if row["estimate"] == "zupt" else row for row in results]
+        rows = [{**row, "model": f"{row['model']} aided"} if row["estimate"] == "aided" else row for row in results]
         figures(rows, aligned=aligned)
-        for sentence in [*_fits(results), *([] if report is None else [f"Report: {report}"])]:
+        for sentence in [*_used(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
     _raise_first(errors)
 
@@ -143,16 +146,21 @@ def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
     return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
 
 
-def _stops(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences about the scores with zero-velocity updates.
-
-    The report draws pure integration.
-    """
-    return [
-        f"With zero-velocity updates {row['model']} has an orientation error of {row['aoe_deg']:.2f}° and a position error of "
-        f"{row['ape_m']:.2f} m."
+def _aided(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Sentences about the scores of aided paths, for a report that draws pure integration."""
+    return _used(results) + [
+        f"Aided, {row['model']} has an orientation error of {row['aoe_deg']:.2f}°, a position error of {row['ape_m']:.2f} m "
+        f"and a velocity error of {row['velocity_rmse_m_s']:.2f} m/s."
         for row in results
-        if row["estimate"] == "zupt"
+        if row["estimate"] == "aided"
+    ]
+
+
+def _used(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Sentences about the aids of each log."""
+    used = {row["log"]: row["aids"] for row in results if row["aids"]}
+    return [
+        f"{log}, aids: {', '.join(f'{kind} {signal}'.strip() for kind, signal in aids.items())}" for log, aids in used.items()
     ]
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from imutool import registry
+from imutool.array_types import Float64, Int64
 from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
 from imutool.cleaning.conventions import axis_names
 from imutool.cleaning.stamp_line import WRAPS, read_stamps, restamped

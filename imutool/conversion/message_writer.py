@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
 
 import imutool
+from imutool.array_types import Shaped, UInt8
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.errors import DataError, not_installed
 from imutool.location import Location

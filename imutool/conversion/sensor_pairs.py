@@ -7,8 +7,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu

@@ -12,10 +12,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis, Traces
 from imutool.diagnosis.wording.quantity import symbol
 from imutool.errors import ConfigError

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 from scipy.linalg import hankel
 from scipy.signal import welch
 from scipy.stats import chi2, ttest_1samp
 from scipy.stats import f as fisher
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import noise_std

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, AlignedLog, Pair, Variables
 from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool
 
+from imutool.array_types import Bool
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.alignment import same_motion, with_simulation, with_truth

@@ -7,17 +7,18 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.diagnosis.compare_findings import remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
-from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
+from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, level
 from imutool.diagnosis.held_out import (
     gains,
     held_out_rms,
@@ -33,6 +34,7 @@ from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Locate
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
+from imutool.sensor import catalogue
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS, UNITS
 
@@ -67,7 +69,7 @@ def summarize(
         timestamps.saturated(pairs, after, selection.tried) + timestamps.dropped(pairs) + timestamps.rounded(pairs, sample)
     )
     if not exact:
-        all_findings += late_stamps(pairs)
+        all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
     findings = [finding for finding in all_findings if not shared(finding, sim_findings)]
@@ -99,6 +101,25 @@ def summarize(
         closer=gains(logs, before, after),
         traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
     )
+
+
+def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
+    """Vibration faster than the band of the poses, from the longest stretch of one log.
+
+    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise.
+    """
+    (vibration,) = catalogue.diagnosed(["vibration"])
+    pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
+    several = len({log.pair.name for log in logs}) > 1
+    if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
+        return []
+    unbanded = replace(pair, real=pair.real - expected(pair, chosen) + expected(pair, ()), band_hz=None)
+    noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
+    residual = unbanded.real - expected(unbanded, ())
+    log = WhitenedImu(unbanded, level(residual, pair.usable, 1.0 / pair.period_s, noise))
+    found = select_effects([log], [vibration])
+    faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
+    return [finding_of([log], found, one, noise_floor([log])) for one in faster]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import LogError
 from imutool.exporting import ExportReport, Progress
 from imutool.mcap_io.codec import schemas

@@ -14,9 +14,9 @@ from xml.sax.saxutils import quoteattr
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.errors import ConfigError
 from imutool.exporting import ExportReport
 from imutool.mcap_io.storage.target import Target

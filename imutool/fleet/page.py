@@ -10,9 +10,9 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from jaxtyping import Float64
 
 from imutool import __version__
+from imutool.array_types import Float64
 from imutool.fleet.results import MOST_ROWS, TROUBLE, Statistics
 from imutool.fleet.robots import FEWEST, Comparison, Outlier
 from imutool.fleet.task import Result, Settings

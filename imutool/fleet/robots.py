@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import value as value_text
 from imutool.errors import ConfigError

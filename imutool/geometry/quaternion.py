@@ -8,7 +8,8 @@ Hamilton's convention: `multiply(a, b)` turns first by b, then by a, and a row o
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
+
+from imutool.array_types import Float64
 
 Quaternions = Float64[np.ndarray, "n 4"]
 Vectors = Float64[np.ndarray, "n 3"]

@@ -23,8 +23,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from imutool.array_types import Bool, Float, Int
 
 Vectors = Float[Tensor, "*batch 3"]
 Rotations = Float[Tensor, "*batch 3 3"]

@@ -14,8 +14,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.geometry import quaternion
 from imutool.inertial.preintegration import EYE, hat
 from imutool.inertial.strapdown import GRAVITY_W

@@ -23,13 +23,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 
+from imutool.array_types import Float64
 from imutool.config import Settings
 from imutool.inertial.preintegration import EYE, Increment, Matrix3, Vector3, hat
 from imutool.recording import GRAVITY_M_S2
@@ -38,7 +38,7 @@ TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 POSE, BIAS, GROUND = slice(0, 9), slice(9, 15), slice(15, 21)
 SIZE = 21
 G_W = np.array([0.0, 0.0, -GRAVITY_M_S2])
-HAT_G, UNCHANGED = hat(G_W), np.eye(SIZE)
+HAT_G = hat(G_W)
 STOPPED = np.zeros((3, SIZE))  # rows of d(velocity)/d(error)
 STOPPED[:, VELOCITY] = np.eye(3)
 STILL = np.zeros((3, SIZE))  # rows of d(gyro bias at rest)/d(error)
@@ -48,10 +48,12 @@ SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
 LEAST_FORCE_M_S2 = 1e-6  # below, a mean specific force has no direction
 LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance invertible
 MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
+PAUSE_RAD, PAUSE_M_S, PAUSE_M = 0.3, 3.0, 1e3  # of turn, velocity and (at most) position over a gap in which the pose stays
 
-Covariance = Float64[np.ndarray, "21 21"]
+Covariance = Float64[np.ndarray, "_ _"]  # 21, and one for each offset
 Vector6 = Float64[np.ndarray, "6"]
-Error = Float64[np.ndarray, "21"]
+Error = Float64[np.ndarray, " _"]
+Walk = Float64[np.ndarray, " _"]  # of b, then of the offsets, per second^1/2
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -70,7 +72,7 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class State:
-    """Filter state: pose, bias b in motion, offset d at rest, and covariance.
+    """Filter state: pose, bias b in motion, offset d at rest, covariance, other offsets.
 
     Biases are gyro (rad/s), then accel (m/s²).
     """
@@ -81,6 +83,7 @@ class State:
     bias: Vector6
     ground: Vector6
     P: Covariance
+    offsets: Float64[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))  # of other sensors
 
     def rest_bias(self, resting: bool) -> Vector6:
         """Bias of the sensor, at rest or in motion."""
@@ -96,7 +99,8 @@ class State:
         """State with an added error e: Exp(e) of the pose, and sums."""
         E, J = _turn(e[TURN])
         v, p = (E @ x + J @ xi for x, xi in ((self.v_w, e[VELOCITY]), (self.p_wb, e[POSITION])))
-        return State(E @ self.R_wb, v, p, self.bias + e[BIAS], self.ground + e[GROUND], P)
+        bias, ground, offsets = self.bias + e[BIAS], self.ground + e[GROUND], self.offsets + e[SIZE:]
+        return State(E @ self.R_wb, v, p, bias, ground, P, offsets)
 
     def minus(self, other: State) -> Error:
         """Error e with `self == other.moved(e)`."""
@@ -104,7 +108,7 @@ class State:
         xi = _log(E)
         J = _turn(xi)[1]
         v, p = (np.linalg.solve(J, a - E @ b) for a, b in ((self.v_w, other.v_w), (self.p_wb, other.p_wb)))
-        return np.concatenate([xi, v, p, self.bias - other.bias, self.ground - other.ground])
+        return np.concatenate([xi, v, p, self.bias - other.bias, self.ground - other.ground, self.offsets - other.offsets])
 
 
 class Step(NamedTuple):
@@ -140,12 +144,12 @@ def level(accel: Vector3, bias: Vector6, ground: Vector6, P_bias: Float64[np.nda
     return State(_turn(turn)[0], np.zeros(3), np.zeros(3), bias, ground, P)
 
 
-def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s: FilterSettings) -> Step:
+def motion_step(x: State, motion: Increment, missing_s: float, walk: Walk, s: FilterSettings) -> Step:
     """Filter step over a block in motion.
 
     Prediction with the bias of `x`, then the bounded velocity.
 
-    `walk` is the random walk of b per second^1/2.
+    `walk` is the random walk of b and of the offsets per second^1/2.
     """
     T = motion.duration_s
     R = x.R_wb @ motion.R
@@ -160,7 +164,7 @@ def motion_step(x: State, motion: Increment, missing_s: float, walk: Vector6, s:
     return step._replace(after=update(step.expected, STOPPED, v, np.full(3, noise)))
 
 
-def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Vector6, s: FilterSettings) -> Step:
+def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Walk, s: FilterSettings) -> Step:
     """Filter step over a block at rest.
 
     From the samples' mean and the variance of the gyro's mean.
@@ -183,7 +187,7 @@ def _predict(
     by_bias: Float64[np.ndarray, "9 6"],
     T: float,
     noise: tuple[float, float],
-    walk: Vector6,
+    walk: Walk,
     *,
     resting: bool,
 ) -> Step:
@@ -195,7 +199,7 @@ def _predict(
     V, X = hat(v), hat(p)
     by_bias_w[1] += V @ turned
     by_bias_w[2] += X @ turned
-    F = UNCHANGED.copy()
+    F = np.eye(len(x.P))
     F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
     F[POSE, BIAS] = by_bias_w.reshape(9, 6)
     if resting:
@@ -205,18 +209,20 @@ def _predict(
     by_noise[TURN, :3], by_noise[VELOCITY, :3], by_noise[POSITION, :3] = EYE, V, X
     by_noise[VELOCITY, 3:], by_noise[POSITION, 3:] = EYE, 0.5 * T * EYE
     P[POSE, POSE] += (by_noise * np.repeat(noise, 3)) @ by_noise.T
-    variances = P.reshape(-1)[:: SIZE + 1]
+    variances = P.reshape(-1)[:: len(P) + 1]
     variances += LEAST_VARIANCE
-    variances[BIAS] += walk**2 * T
-    expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T))
+    variances[BIAS] += walk[:6] ** 2 * T
+    variances[SIZE:] += walk[6:] ** 2 * T
+    expected = State(R, v, p, x.bias, x.ground, 0.5 * (P + P.T), x.offsets)
     return Step(x, expected, F, expected)
 
 
-def update(x: State, H: Float64[np.ndarray, "k 21"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
+def update(x: State, H: Float64[np.ndarray, "k m"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
     """Kalman update by z = H e + n.
 
-    With e the error of the estimate and `noise` the variances of n.
+    With e the first m errors of the estimate and `noise` the variances of n.
     """
+    H = H if H.shape[1] == len(x.P) else np.pad(H, ((0, 0), (0, len(x.P) - H.shape[1])))
     K, P = gain(x.P, H, noise)
     return x.moved(-K @ z, P)
 
@@ -247,6 +253,14 @@ def smooth(steps: Sequence[Step]) -> list[State]:
         later = step.before.moved(C @ later.minus(step.expected), 0.5 * (P + P.T))
         states.append(later)
     return states[::-1]
+
+
+def pause_step(x: State, T: float, walk: Walk) -> Step:
+    """Step over a gap of T seconds in the samples: the state stays, less certain of its pose."""
+    std = np.repeat([PAUSE_RAD, PAUSE_M_S, min(PAUSE_M_S * T, PAUSE_M)], 3)
+    noise = np.concatenate([std**2, walk[:6] ** 2 * T, np.zeros(6), walk[6:] ** 2 * T]) + LEAST_VARIANCE
+    expected = replace(x, P=x.P + np.diag(noise))
+    return Step(x, expected, np.eye(len(x.P)), expected)
 
 
 def reset_pose(x: State, accel: Vector3, T: float, walk: Vector6, most: Vector6, s: FilterSettings) -> Step:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
 
+from imutool.array_types import Float, Float64
 from imutool.errors import DataError, NumericsError
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Times, seconds
 

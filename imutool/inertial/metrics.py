@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
 from imutool.mcap_io.storage.target import Target

@@ -13,7 +13,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+
+from imutool.array_types import Float64
 
 Vector3 = Float64[np.ndarray, "3"]
 Matrix3 = Float64[np.ndarray, "3 3"]

@@ -19,12 +19,12 @@ from collections.abc import Iterable
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 from msgspec import Meta
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
-from imutool.recording.columns import true_ranges
+from imutool.recording.columns import quantile, true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
@@ -194,8 +194,7 @@ class OnlineRestDetector:
         if not (calm and quiet and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
             return False
         self._means.append(centre)
-        median = np.median(np.array(self._means), axis=0)
-        return bool(np.linalg.norm(centre - median) <= s.gyro_agreement_rad_s)
+        return bool(np.linalg.norm(centre - quantile(np.array(self._means), 0.5)) <= s.gyro_agreement_rad_s)
 
 
 def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
@@ -210,7 +209,7 @@ def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]
     if len(second) < NOISE_BLOCK:
         return np.zeros(values.shape[1])
     blocks = second[: len(second) // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK, values.shape[1]).mean(axis=1)
-    return np.asarray(np.sqrt(np.quantile(blocks, CALMEST, axis=0) / 6.0))
+    return np.asarray(np.sqrt(quantile(blocks, CALMEST) / 6.0))
 
 
 def _window_statistics(

@@ -11,9 +11,9 @@ Users: the constant bias (`bias_start.bias_from_truth`), the calibration (`train
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from imutool.array_types import Float
 from imutool.geometry import so3
 
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals

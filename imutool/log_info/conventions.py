@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
 from imutool.cleaning.rule import TopicSummary

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning import raw_batches
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64, UInt64
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex
 
+from imutool.array_types import Int64, UInt64
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.messages import MESSAGE, Messages

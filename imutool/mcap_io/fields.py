@@ -10,15 +10,15 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
 
+from imutool.array_types import Float64, Int64, UInt8
 from imutool.errors import LogError, did_you_mean
 from imutool.location import Location
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.messages import Rows
+from imutool.mcap_io.codec.ros2_definition import Leaf
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import DERIVED_KEY, UNIT_KEY, StampCheck, Topic
 
@@ -52,12 +52,24 @@ def read_field(path: Location, signal: str) -> Fields:
     """
     with Log(path) as log:
         topic, inside = split(log, signal)
-        reader = _Reader(log, log.topics[topic], (inside,))
-        for _, rows in log.rows([topic]):
-            with log.named(topic):
-                reader.take(rows)
+        reader = _read(log, topic, (inside,))
         with log.named(topic):
             return reader.whole(inside)
+
+
+def numbers(log: Log, topic: str, paths: tuple[str, ...]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
+    """Stamps and numbers of some fields of a topic, unchecked."""
+    reader = _read(log, topic, paths)
+    return reader.t_ns(), np.concatenate([np.zeros((0, len(paths))), *reader.values])
+
+
+def _read(log: Log, topic: str, paths: tuple[str, ...]) -> _Reader:
+    """Reader of some fields of a topic, after its messages."""
+    reader = _Reader(log, log.topics[topic], paths)
+    for _, rows in log.rows([topic]):
+        with log.named(topic):
+            reader.take(rows)
+    return reader
 
 
 def split(log: Log, signal: str) -> tuple[str, str]:
@@ -80,9 +92,7 @@ def split(log: Log, signal: str) -> tuple[str, str]:
 
 
 def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
-    """Paths of the numbers in a topic's first message, without stamps.
-
-    `long` arrays are listed by their first elements, else left out.
+    """Paths of the numbers in a topic's first message, without stamps; `long` arrays if asked.
 
     Raises:
         LogError: no definition or another encoding than ros2msg and cdr.
@@ -164,11 +174,6 @@ def _listed(names: Collection[str]) -> str:
     return ", ".join(shown) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "") if shown else "no number"
 
 
-class _Place(NamedTuple):
-    offset: int
-    kind: str
-
-
 @dataclass(eq=False)
 class _Reader:
     """Collects some fields of one topic; without `strict`, missing fields become NaN."""
@@ -198,7 +203,7 @@ class _Reader:
             self.values.append(columns)
             self.sequences.append(cut.sequence)
 
-    def _runs(self, payload: UInt8[np.ndarray, "n L"]) -> Iterator[tuple[slice, Mapping[str, _Place], str]]:
+    def _runs(self, payload: UInt8[np.ndarray, "n L"]) -> Iterator[tuple[slice, Mapping[str, Leaf], str]]:
         """Stretches of messages with the same field offsets, found by one walk each."""
         pending = [(0, len(payload))] if len(payload) else []
         while pending:
@@ -214,7 +219,7 @@ class _Reader:
             yield slice(first, edges[1]), places, walk.order
             pending += reversed(list(pairwise(edges[1:])))
 
-    def _places(self, walk: ros2_definition.Walk) -> dict[str, _Place]:
+    def _places(self, walk: ros2_definition.Walk) -> dict[str, Leaf]:
         """Offsets of the wanted fields and of the header's stamp; the walk ends at the last.
 
         Raises:
@@ -224,14 +229,13 @@ class _Reader:
         for path in self.paths:
             bare, index = _LAST.fullmatch(path).groups()  # type: ignore[union-attr]  # it matches any text
             asked.setdefault(bare, []).append((path, None if index is None else int(index)))
-        found: dict[str, _Place] = {}
+        found: dict[str, Leaf] = {}
         for leaf in walk.leaves():
             if leaf.path in ("header.stamp.sec", "header.stamp.nanosec"):
-                found[f"stamp {leaf.path}"] = _Place(leaf.offset, leaf.kind)
+                found[f"stamp {leaf.path}"] = leaf
             for path, index in asked.get(leaf.path, ()):
-                inside = index is None if leaf.length is None else index is not None and index < leaf.length
-                if inside:
-                    found[path] = _Place(leaf.offset + int(leaf.kind[1]) * (index or 0), leaf.kind)
+                if (index is None) == (leaf.length is None) and (leaf.length is None or (index or 0) < leaf.length):
+                    found[path] = leaf._replace(offset=leaf.offset + int(leaf.kind[1]) * (index or 0))
             if all(path in found for path in self.paths):
                 break  # what comes behind need not lie alike
         missing = [path for path in self.paths if path not in found]
@@ -249,8 +253,8 @@ class _Reader:
 
     def t_ns(self) -> Int64[np.ndarray, " n"]:
         """Header stamps; log times where there is no header or all stamps are zero."""
-        stamp_ns = np.concatenate(self.stamps)
-        return stamp_ns if stamp_ns.any() else np.concatenate(self.log_times)
+        stamp_ns, log_ns = (np.concatenate([np.zeros(0, np.int64), *parts]) for parts in (self.stamps, self.log_times))
+        return stamp_ns if stamp_ns.any() else log_ns
 
     def whole(self, path: str) -> Fields:
         """A field over the whole log.
@@ -282,12 +286,12 @@ class _Reader:
         return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
 
 
-def _column(payload: UInt8[np.ndarray, "n L"], place: _Place, order: str) -> np.ndarray:
+def _column(payload: UInt8[np.ndarray, "n L"], place: Leaf, order: str) -> np.ndarray:
     cut = np.ascontiguousarray(payload[:, place.offset : place.offset + int(place.kind[1])])
     return cut.view(order + place.kind)[:, 0]
 
 
-def _stamps(rows: Rows, places: Mapping[str, _Place], order: str) -> Int64[np.ndarray, " n"]:
+def _stamps(rows: Rows, places: Mapping[str, Leaf], order: str) -> Int64[np.ndarray, " n"]:
     """Header stamps, zeros where there is no header."""
     keys = ("stamp header.stamp.sec", "stamp header.stamp.nanosec")
     if not all(key in places for key in keys):

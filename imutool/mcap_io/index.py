@@ -10,10 +10,10 @@ import struct
 from collections import Counter
 
 import numpy as np
-from jaxtyping import UInt64
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
+from imutool.array_types import UInt64
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import (
     HEAD_BYTES,

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from types import MappingProxyType, TracebackType
 
 import numpy as np
-from jaxtyping import Int64
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
+from imutool.array_types import Int64
 from imutool.errors import DataError, LogError
 from imutool.location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt32
 
+from imutool.array_types import Float64, Int64, UInt32
 from imutool.errors import LogError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
@@ -87,7 +87,7 @@ def read_recordings(
     Raises:
         LogError: as `read`.
     """
-    imu_topic = log.topic(log.only_imu() if imu is None else imu, (schemas.IMU,)).name
+    imu_topic = imu if imu and samples is not None else log.topic(imu or log.only_imu(), (schemas.IMU,)).name
     own, metadata = own_and_user_metadata(log.metadata_records())
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}

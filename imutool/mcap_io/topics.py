@@ -8,8 +8,8 @@ from functools import partial
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, Shaped, UInt8, UInt32
 
+from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8, UInt32
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import (

@@ -14,9 +14,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64, Shaped, UInt8
 
 import imutool
+from imutool.array_types import Int64, Shaped, UInt8
 from imutool.errors import DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas

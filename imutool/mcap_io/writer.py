@@ -9,7 +9,6 @@ from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64, UInt16
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -27,6 +26,7 @@ from mcap.records import (
 )
 
 import imutool
+from imutool.array_types import Int64, UInt16
 from imutool.errors import DataError
 from imutool.location import Location
 from imutool.mcap_io.codec import messages, records

@@ -20,8 +20,8 @@ from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.errors import not_installed
 from imutool.units import Sensor
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from msgspec import Meta
 from scipy.special import digamma, polygamma
 
+from imutool.array_types import Float64, Int64
 from imutool.config import Settings
 
 SAME_RATE = 0.01  # by which two rates may differ and be one

@@ -18,9 +18,9 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 
+from imutool.array_types import Float64
 from imutool.config import Settings, build, toml
 from imutool.errors import ConfigError, did_you_mean
 from imutool.mcap_io.storage.target import Target

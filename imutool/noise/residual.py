@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS

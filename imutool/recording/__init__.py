@@ -13,8 +13,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording.columns import Columns, clock_jumps

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Shaped
 
+from imutool.array_types import Shaped
 from imutool.recording import Imu, Poses, Scalars, Times
 
 KINDS = ("truth", "estimate", "odometry", "unknown")  # what poses are worth

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.location import Location
 from imutool.mcap_io.codec.schemas import IMU, TF
 from imutool.mcap_io.fields import Fields, others

@@ -22,8 +22,8 @@ from enum import IntEnum
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 from imutool.sensor.signals import Signals

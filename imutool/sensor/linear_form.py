@@ -13,8 +13,8 @@ from functools import cache, lru_cache
 from random import Random
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import COUNT, Signals

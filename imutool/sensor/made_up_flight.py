@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 from numpy.random import Generator, default_rng
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from imutool import config
+from imutool.array_types import Float64
 from imutool.errors import ConfigError
 from imutool.inertial.kinematics import DEGREE, Trajectory, Vectors, continuous
 from imutool.recording import Imu, Poses, Recording, Scalars, Times, seconds

@@ -14,8 +14,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording import Recording, seconds
 from imutool.sensor.signals import FILTERED, SignalFilter, Signals

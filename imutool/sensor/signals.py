@@ -13,7 +13,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+
+from imutool.array_types import Float64
 
 SLOW_S = 0.1  # of the samples: what is faster counts as vibration
 TURN_S = 0.02  # of the rate whose derivative is the angular acceleration

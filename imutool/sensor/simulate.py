@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
 from imutool.mcap_io.codec.decode import PoseBatch
 from imutool.mcap_io.log import Log

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
 from scipy.ndimage import median_filter, percentile_filter
 
+from imutool.array_types import Bool, Float, Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.kinematics import G_W, Trajectory, continuous
 from imutool.recording import GRAVITY_M_S2, Poses, seconds

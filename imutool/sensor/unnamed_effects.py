@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples

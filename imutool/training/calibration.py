@@ -19,10 +19,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.stats import chi2
 from torch import Tensor
 
+from imutool.array_types import Float
 from imutool.bias import neural_ode
 from imutool.bias.hybrid import Config
 from imutool.bias.networks import hybrid

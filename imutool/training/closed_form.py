@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
+from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.errors import DataError

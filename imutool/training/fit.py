@@ -16,11 +16,11 @@ from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
+from imutool.array_types import Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.config import build

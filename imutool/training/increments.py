@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from imutool.array_types import Bool, Float, Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import Segment
 from imutool.errors import DataError

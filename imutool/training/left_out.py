@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.hybrid import Config
 from imutool.bias.model import BiasModel

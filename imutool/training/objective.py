@@ -15,9 +15,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.geometry import so3

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from imutool.array_types import Bool, Float, Int
 from imutool.bias.networks import static
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias_start.stretches import StretchClock

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
 from scipy.stats import chi2
 from torch import Tensor
 
+from imutool.array_types import Float, Float64
 from imutool.bias.model import COLUMNS, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias_start.bias_at_rest import rest_differences

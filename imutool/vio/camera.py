@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.recording import Poses
 
 Points = Float64[np.ndarray, "n 3"]

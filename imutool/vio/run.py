@@ -14,11 +14,11 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Int64
 from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from imutool import config
+from imutool.array_types import Bool, Int64
 from imutool.errors import DataError, NumericsError
 from imutool.evaluation import runs
 from imutool.inertial import metrics

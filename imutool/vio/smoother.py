@@ -16,11 +16,11 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
 from imutool import config
+from imutool.array_types import Float64, Int64
 from imutool.errors import NumericsError, not_installed
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds

@@ -213,6 +213,25 @@ def test_a_clock_set_back_costs_what_comes_twice(made):
     assert survey.missing == 0
 
 
+@pytest.mark.parametrize("by_ns", [-3_000_000_000, -500_000_000, -501_700_000, -100_001_000])
+def test_motion_that_is_missing_where_the_clock_was_set_back_is_said(by_ns, made):
+    """The recorder's clock too: stamps that came twice were called duplicates, and the lost motion was not told."""
+    back = shifted(made, slice(4000, None), by_ns)
+    survey = look(back._replace(log_time=back.stamp_ns))
+    (one,) = (each for each in survey.findings if each.rule == "time_back")
+    assert one.values["set_back"] == 1
+    assert one.values["missing_s"] == pytest.approx(-by_ns * 1e-9, abs=0.006)
+    assert "the clock was set back" in one.what
+    assert found(survey).get("duplicates", 0) <= 1
+
+
+def test_a_burst_that_comes_late_is_no_clock_set_back(made):
+    order = np.r_[0:4000, 4050:4100, 4000:4050, 4100 : len(made.stamp_ns)]
+    burst = pick(made, order)
+    survey = look(burst._replace(log_time=np.sort(burst.log_time)))
+    assert "set_back" not in only(survey, "time_back").values
+
+
 @pytest.mark.parametrize("part", [slice(0, 1500), slice(6000, None)], ids=["before", "after"])
 @pytest.mark.parametrize("by", [-HOUR_NS * 24 * 400, HOUR_NS, 30 * HOUR_NS])
 def test_of_two_settings_of_the_clock_the_longer_part_stays(part, by, made):

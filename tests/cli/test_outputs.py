@@ -76,22 +76,8 @@ READ = {
 }
 WORDS = {
     *("format", "sequence", "compression", "imu", "truth", "rule", "no_rule", "init", "verify", "connect", "method", "set_"),
-    *(
-        "sensor",
-        "device",
-        "align",
-        "at",
-        "signal",
-        "kind",
-        "size",
-        "damaged",
-        "name",
-        "address",
-        "memory",
-        "robot_from",
-        "encoding",
-        "by",
-    ),
+    *("sensor", "device", "align", "at", "signal", "kind", "size", "damaged", "name", "address", "memory", "robot_from"),
+    *("encoding", "by", "aid"),
 }
 
 

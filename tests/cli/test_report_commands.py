@@ -41,7 +41,7 @@ def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_evaluate_writes_the_numbers_of_its_table(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    words = ["--model", logs / "linear.safetensors", "--zupt", "--report", "page.html", "--json", "said.json"]
+    words = ["--model", logs / "linear.safetensors", "--aid", "auto", "--report", "page.html", "--json", "said.json"]
     done = run("evaluate", logs / "flight_2.mcap", *words)
     assert done.exit_code == 0, done.output
     assert "Report: page.html" in done.stdout
@@ -53,8 +53,8 @@ def test_evaluate_writes_the_numbers_of_its_table(logs: Path, tmp_path: Path, mo
         for name in ("aoe_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s"):
             assert f'title="{one[name]!r}"' in page
     for one in results:
-        if one["estimate"] == "zupt":
-            assert f"With zero-velocity updates {one['model']} has an orientation error of {one['aoe_deg']:.2f}°" in page
+        if one["estimate"] == "aided":
+            assert f"Aided, {one['model']} has an orientation error of {one['aoe_deg']:.2f}°" in page
 
 
 def test_debias_writes_a_page_of_the_new_log_and_refuses_before_the_work(logs: Path, tmp_path: Path) -> None:

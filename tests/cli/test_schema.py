@@ -32,7 +32,7 @@ LINES: dict[str, Sequence[str]] = {
     "repair": ["repair", "damaged.mcap", "out.mcap"],
     "debias": ["debias", "{}/flight_2.mcap", "out.mcap", "--clean", "--save-view", "out.rrd", "--report", "out.html"],
     "train": ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
-    "evaluate": ["evaluate", "{}/flight_2.mcap", "--model", "static", "--zupt"],
+    "evaluate": ["evaluate", "{}/flight_2.mcap", "--model", "static", "--aid", "stops,ground"],
     "view": ["view", "{}/flight_2.mcap", "--html", "out.html"],
     "live": ["live", "--from", "{}/flight_2.mcap", "--speed", "100", "--no-view"],
     "vio": ["vio", "{}/flight_2.mcap", "--model", "static", "--duration", "6", "--no-bias-states"],

@@ -26,6 +26,7 @@ SURE = 4.5
 SIM_HZ = 200.0
 LSB = np.repeat([0.01, 0.1], 3)  # coarser than the noise
 ALMOST = 0.98
+POSES_HZ = 25.0
 
 
 class Logs(NamedTuple):
@@ -201,6 +202,15 @@ def test_poses_too_slow_to_be_differentiated_leave_what_samples_show_by_themselv
     assert {"lever_arm", "gyro_scale", "clock_offset"} <= set(d.not_identifiable)
     assert to_physics_file(d).bias is None  # nobody knows it
     assert json_values(d.report)["bias"] == {"gyro": None, "accel": None}
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 0.05])
+def test_a_vibration_faster_than_the_poses_know_the_motion_is_named(tmp_path: Path, amplitude: float) -> None:
+    line = {"vibration": [31.7, amplitude, 0.0, 0.0, -amplitude, *[0.0] * 8]}
+    logs = moving(tmp_path, line if amplitude else {}, poses_s=planted.clock(rate_hz=POSES_HZ))
+    d = diagnose([logs.real])
+    assert effects(d) == (["vibration"] if amplitude else [])
+    assert not amplitude or near(d, "vibration", {"f": 31.7, "accel_sin_x": amplitude, "accel_cos_y": -amplitude})
 
 
 def test_poses_of_a_part_answer_for_that_part(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imutool.array_types import Float
 from imutool.bias.conv import EPSILON, Config, Model
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.config import Settings

@@ -10,9 +10,9 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
 from torch import Tensor
 
+from imutool.array_types import Float, Float64
 from imutool.bias.hybrid import Config, Model
 from imutool.bias.networks import neural_ode
 from imutool.bias.networks.network import BiasNetwork, Segment

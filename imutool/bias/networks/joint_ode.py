@@ -14,10 +14,10 @@ depend on R: inference integrates only the bias, by Euler, which is the solver o
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
+from imutool.array_types import Float
 from imutool.bias.networks.network import Segment
 from imutool.bias.networks.ode import HermitePath, Method, integrate
 

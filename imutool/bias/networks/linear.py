@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
+from imutool.array_types import Float
 from imutool.bias.linear import Config, Model
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.config import Settings

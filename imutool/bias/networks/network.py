@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from imutool import registry
+from imutool.array_types import Float
 from imutool.bias.model import COLUMNS, STATISTICS, BiasModel
 from imutool.config import Settings
 from imutool.inertial.windows import end_attitude

@@ -10,10 +10,10 @@ import math
 from typing import ClassVar, TypeVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
+from imutool.array_types import Float
 from imutool.bias.networks import joint_ode
 from imutool.bias.networks.joint_ode import JointField
 from imutool.bias.networks.network import BiasNetwork, Segment

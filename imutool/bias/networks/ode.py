@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Num
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
+from imutool.array_types import Bool, Float, Num
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import so3
 

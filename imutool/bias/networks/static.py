@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from imutool.array_types import Float
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.static import UNTRAINED, Config, Model
 from imutool.config import Settings

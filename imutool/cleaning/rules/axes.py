@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.cleaning.conventions import Conventions, Reading, axis_names
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.rule import Rule, TopicSummary

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples

@@ -16,7 +16,8 @@ MEMORY = 1024  # messages: what a recorder sends again, it sends soon
 class Duplicates(Rule):
     """Rule for duplicates: it keeps the first of equal stamps.
 
-    A message sent again later is a duplicate too, not time that goes back.
+    A message sent again later is a duplicate too, not time that goes back. Another message with an earlier stamp is left to the
+    rule for those.
     """
 
     place = 10
@@ -35,8 +36,10 @@ class Duplicates(Rule):
             original = first[which]
             again = original[seen:] != np.arange(seen, len(both.number))
             if again.any():
-                same = both.values[seen:][again].view(np.int64) == both.values[original[seen:][again]].view(np.int64)
-                self._same += int(same.all(axis=1).sum())
+                values = both.values.view(np.int64)
+                same = (values[seen:] == values[original[seen:]]).all(axis=1)
+                again &= same | (both.stamp_ns == np.maximum.accumulate(both.stamp_ns))[seen:]
+                self._same += int((same & again).sum())
                 self._places.add(samples.number[again], samples.stamp_ns[again])
                 self.dropped.append(samples.number[again])
             left = samples.where(~again)

@@ -3,8 +3,10 @@
 A sample is *ahead* when most of the next samples come before it: then it is the one that is wrong, and without this a single
 stamp of the year 2100 would cost the rest of the log. A sample is *late* when it does not come after all that were kept.
 
-Where the clock goes back by more than a second and stays there, or forward by more than a day, an *epoch* ends. Of several
-epochs those are kept that together hold most samples in increasing time; that needs the whole log, so such a log is read twice.
+Late samples in a row, after which the stamps go on where the row ended, are motion on earlier times: the clock was set
+back, and what is dropped is missing. Where the clock goes back by more than a second and stays there, or forward by more than a
+day, an *epoch* ends. Of several epochs those are kept that together hold most samples in increasing time; that needs the whole
+log, so such a log is read twice.
 """
 
 from __future__ import annotations
@@ -13,9 +15,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
+from imutool.array_types import Bool, Int64
 from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples, padded
@@ -26,6 +28,7 @@ AHEAD = 32  # samples asked whether one is ahead of them
 SET_BACK_NS = nanoseconds(1.0)
 LONGEST_PAUSE_NS = nanoseconds(86400.0)
 MAX_EPOCHS = 1000
+SET_BACK = 8  # late samples in a row, at least, of a clock that was set back
 
 
 @dataclass
@@ -54,7 +57,9 @@ class NonMonotonic(Rule):
         self._skip = skip
         self.epochs: list[Epoch] = []
         self._late, self._ahead, self._other = Intervals(), Intervals(), Intervals()
-        self._furthest_s, self._set_back = 0.0, 0
+        self._furthest_s = 0.0
+        self._run: tuple[int, int, int] | None = None  # of late samples up to the last one: count, how far back, last stamp
+        self.set_back_ns: list[int] = []
         self._last: int | None = None
         self._late_ns: list[Int64[np.ndarray, " n"]] = []
 
@@ -96,12 +101,28 @@ class NonMonotonic(Rule):
             if behind.any():
                 away = (before[: end - first] - stamp[first:end])[behind]
                 self._furthest_s = max(self._furthest_s, float(away.max()) * 1e-9)
+            self._note_set_backs(stamp[first:end], before[: end - first], behind)
             self._extend(samples, first, end, ~behind)
             if end < len(stamp):
                 self.epochs.append(Epoch(int(samples.number[end]), 0, int(stamp[end]), int(stamp[end]), 0))
                 self._last = int(stamp[end]) - 1
             first = end
         return late
+
+    def _note_set_backs(
+        self, stamp: Int64[np.ndarray, " n"], before: Int64[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]
+    ) -> None:
+        """Notes late samples in a row after which the stamps go on from the last of them."""
+        if not behind.any() and self._run is None:
+            return
+        for first, end in true_ranges(behind) if behind[0] else [(0, 0), *true_ranges(behind)]:
+            count, back_ns, last_ns = self._run if self._run and first == 0 else (0, 0, 0)
+            if end > first:
+                back_ns = back_ns or int(before[first] - stamp[first])
+                count, last_ns = count + end - first, int(stamp[end - 1])
+            self._run = (count, back_ns, last_ns) if end == len(stamp) else None
+            if self._run is None and count >= SET_BACK and stamp[end] - last_ns < back_ns / 2:
+                self.set_back_ns.append(back_ns)
 
     def _epoch_ends(self, stamp: Int64[np.ndarray, " n"], before: Int64[np.ndarray, " n"]) -> int:
         """The row with which another epoch begins; the number of rows where none does."""
@@ -134,8 +155,12 @@ class NonMonotonic(Rule):
         """Late samples, samples ahead, and epochs left out."""
         if self._late.count:
             whole.late_ns = np.sort(np.concatenate(self._late_ns))
-            values = {"furthest_back_s": self._furthest_s}
+            values: dict[str, float] = {"furthest_back_s": self._furthest_s}
             what = "samples whose stamp goes back"
+            if self.set_back_ns:
+                missing_s = sum(self.set_back_ns) * 1e-9
+                values |= {"set_back": len(self.set_back_ns), "missing_s": missing_s}
+                what += f"; the clock was set back, and {missing_s:.3g} s of motion are missing"
             yield Finding("time_back", "warning", what, **self._late.where(), values=values, action="dropped")
         if self._ahead.count:
             what = "samples with a stamp ahead of those that follow"

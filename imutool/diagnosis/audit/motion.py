@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.result import Estimate
 from imutool.errors import DataError

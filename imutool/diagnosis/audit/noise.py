@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.ndimage import median_filter
 from scipy.signal import welch
 from scipy.stats import chi2
 
+from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.estimation.timestamps import grid, limits
 from imutool.diagnosis.result import Estimate

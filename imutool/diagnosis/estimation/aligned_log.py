@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.settings import DiagnoseSettings, SplitSettings
 from imutool.recording import Poses
 from imutool.sensor.effect import Effect, SignalState, Theta

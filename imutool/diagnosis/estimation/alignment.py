@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import label, maximum, uniform_filter1d
 from scipy.signal import correlate, correlation_lags
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError

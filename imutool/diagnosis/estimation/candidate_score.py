@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
 
+from imutool.array_types import Float, Float64, Int64
 from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters_of, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
 from imutool.diagnosis.estimation.significance import log_p_value

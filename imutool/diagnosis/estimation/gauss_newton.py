@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, bound, free, step_of
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import FitSettings

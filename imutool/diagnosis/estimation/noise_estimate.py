@@ -12,9 +12,9 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.signal import csd, welch
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
@@ -164,12 +164,12 @@ def known_band_hz(
         if low >= most_hz:
             break
         band = (f_hz >= low) & (f_hz < high)
-        for part in (slice(0, 3), slice(3, 6)):
-            e, r, x = (float(abs(density[band, part].sum())) for density in (power, recorded, cross))
-            if not e * r:  # a channel that never moves
+        for axis in range(real.shape[1]):  # a lively axis must not hide a quiet one, which follows poorly
+            e, r, x = (float(abs(density[band, axis].sum())) for density in (power, recorded, cross))
+            if not e * r:  # an axis that never moves
                 continue
-            gain, coherence = x / e, x * x / (e * r)
-            std = np.sqrt((1.0 - coherence) / (2.0 * 3.0 * duration_s * (high - low))) * np.sqrt(r / e)
+            gain, coherence = x / e, min(1.0, x * x / (e * r))
+            std = np.sqrt((1.0 - coherence) / (2.0 * duration_s * (high - low))) * np.sqrt(r / e)
             diluted = min(1.0 - gain - settings.sigma * std, 1.0 - coherence) > settings.diluted_share
             if low >= settings.least_hz and diluted:
                 return low

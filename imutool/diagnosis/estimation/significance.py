@@ -14,19 +14,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.linalg import solve_triangular
 from scipy.special import gammaincc, gammainccinv, gammaln
 from scipy.stats import f as fisher
 from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors, with_value
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.units import AXES
 
 TAIL = 300.0  # half the gain, above which the tail itself underflows
 FIXED_STD = 1e-6  # deviation of a parameter that is taken as it is
+SCALES = {"gyro": "gyro_scale", "accel": "accel_scale"}  # by signal: its columns are x, y, z as the parameters are
 Matrix = Float64[np.ndarray, "p p"]
 
 
@@ -124,7 +126,33 @@ def scatter(logs: Sequence[WhitenedLog], found: Fit, part: str, block_s: float) 
         shares.append(share)
     outer = solve_triangular(lower, np.eye(len(lower)), lower=True)  # covariance by information: outer.T @ outer
     by_blocks, by_information = outer.T @ middle @ outer, outer.T @ outer
-    return _by_effect(found, by_blocks, by_information, [outer.T @ share @ outer for share in shares], settings.prior_blocks)
+    out = _by_effect(found, by_blocks, by_information, [outer.T @ share @ outer for share in shares], settings.prior_blocks)
+    for key, diluted in _dilution(logs, found, part, by_information).items():
+        out.std[key] = np.hypot(out.std[key], diluted)
+    return out
+
+
+def _dilution(
+    logs: Sequence[WhitenedLog], found: Fit, part: str, by_information: Matrix
+) -> dict[str, Float64[np.ndarray, " _"]]:
+    """Regression dilution of scale factors beside poses, by effect: at most the squares left over the information.
+
+    The error e of the expectation f + e is in the residual as well: E[(f + e) (-e)] = -E[e²], alike in every block of time
+    (Fuller, Measurement Error Models, 1987, eq. 1.1.7).
+    """
+    if all(log.pair.exact for log in logs):
+        return {}
+    squares = np.zeros(logs[0].pair.columns)
+    for k, log in enumerate(logs):
+        rows = log.rows(part)
+        squares += ((log.residual(found.passes[k].expected)[rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
+    out = {}
+    for effect, _ in found.chosen:
+        for signal, columns in logs[0].pair.signals.items():
+            if effect.name == SCALES.get(signal):
+                column = [columns.start + AXES.index(parameter.name) for parameter in effect.parameters]
+                out[effect.key] = squares[column] * np.diag(by_information)[found.place(effect.key)]
+    return out
 
 
 def _begins(found: Fit) -> Bool[np.ndarray, " p"]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.signal import savgol_filter
 from scipy.stats import binom, norm
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.diagnosis.settings import TimestampSettings

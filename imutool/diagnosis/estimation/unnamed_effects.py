@@ -14,9 +14,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta

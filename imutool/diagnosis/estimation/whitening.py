@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
 from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.signal import firwin, lfilter, periodogram
 
+from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Pair
 from imutool.diagnosis.settings import NoiseSettings
 
@@ -177,7 +177,7 @@ def whitener(
 def level(
     residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, settings: NoiseSettings
 ) -> Whitener:
-    """Whitening filters of a sensor beside an exact simulation.
+    """Whitening filters of a sensor beside an exact simulation, or above the band of its poses.
 
     As `whitener`, but below `motion_hz` the noise is taken to be what it is above.
 

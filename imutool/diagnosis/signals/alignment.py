@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from scipy.signal import correlate, correlation_lags
 
+from imutool.array_types import Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks, Variables, split
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.diagnosis.signals.ideal_signal import (

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.signal import lfilter
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
 from imutool.diagnosis.signals.alignment import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta

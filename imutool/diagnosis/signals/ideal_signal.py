@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from scipy.interpolate import make_interp_spline
 from scipy.signal import firwin, welch
 
+from imutool.array_types import Float64, Int64
 from imutool.diagnosis.estimation.alignment import wiener_filter
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings

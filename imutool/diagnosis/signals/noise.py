@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.ndimage import median_filter
 from scipy.signal import welch
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.noise_estimate import ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis

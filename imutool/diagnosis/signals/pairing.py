@@ -17,7 +17,7 @@ from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.quantities import in_one_unit, metres, unwrapped
 from imutool.geometry import quaternion
 from imutool.location import Location
-from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, TF, TWIST
+from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, PRESSURE, TF, TWIST
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording.columns import longest_run
@@ -28,7 +28,7 @@ SAME = 1e-12  # relative difference of two copies
 LEAST_COPIED = 0.9  # of the longer log, that two copies share
 LISTED = 12
 JOINTS, MAGNETIC = "sensor_msgs/msg/JointState", "sensor_msgs/msg/MagneticField"
-GNSS, PRESSURE = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/FluidPressure"
+GNSS = "sensor_msgs/msg/NavSatFix"
 RANGE, TEMPERATURE = "sensor_msgs/msg/Range", "sensor_msgs/msg/Temperature"
 ELSEWHERE = frozenset(
     {IMU, POSE, TF, TWIST, "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"}

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.observability import unobservable
+from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import held_out_rms, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings
@@ -103,20 +104,38 @@ def diagnose_signal(
     return _summarized(log, candidates, selection, lsb, settings)
 
 
+def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
+    """Selection with friction fitted where its joint slides, if any joint has some."""
+    if all(joint_effort.with_stiction(effect) is effect for effect, _ in selection.whole.chosen):
+        return selection
+    chosen = [
+        tuple((joint_effort.with_stiction(effect), theta) for effect, theta in one.chosen)
+        for one in (selection.fitted, selection.whole)
+    ]
+    fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")
+    stds = scatter([log], whole, "all", settings.search.robust_block_s).std
+    effects = {effect.key: (effect, theta) for effect, theta in whole.chosen}
+    selected = [
+        replace(one, effect=effects[one.effect.key][0], theta=effects[one.effect.key][1], std=stds[one.effect.key])
+        for one in selection.selected
+    ]
+    return replace(selection, selected=tuple(selected), fitted=fitted, whole=whole)
+
+
 def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Selection:
     """Effects of the catalogue, channels that drive and terms of equations; a curve where none of them stands out."""
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
-    named = select_effects([log], candidates, [driven], always=always)
+    named = _with_stiction(log, select_effects([log], candidates, [driven], always=always), signal.settings)
     if named.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
         return named  # a term may fit as well as a name, and says less
     equations = [effect for k in columns for effect in terms(signal, k)]
-    selection = select_effects([log], candidates, [driven, equations], always=always)
+    selection = _with_stiction(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
     if selection.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
         return selection
     curves = [effect for k in columns for effect in common.unknown(signal, k)]
-    curved = select_effects([log], candidates, [driven, curves], always=always)
+    curved = _with_stiction(log, select_effects([log], candidates, [driven, curves], always=always), signal.settings)
     before = fit([log], always, part="all").objective
     gain = selection.whole.objective - curved.whole.objective
     return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection
@@ -140,6 +159,8 @@ def _summarized(
     selection, small = _above_model_error(log, selection, level)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
     findings = [_with_python(finding_of(logs, selection, selected, level)) for selected in selection.selected]
+    if pair.band_hz is not None:  # dynamics that were learnt are known to a share
+        findings = [_with_learnt_error(finding) for finding in findings]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
     located = locate_findings([pair], [before], [after], level, (), p_values, settings.localization) if findings else []
     floor = level.copy()
@@ -151,7 +172,7 @@ def _summarized(
             floor[k] = np.hypot(level[k], lsb[k] / np.sqrt(12.0))
     offsets = dict(_offsets(pair, selection))
     findings += _constants(pair, offsets, level)
-    if pair.band_hz is not None:  # dynamics that were learnt are known to a per cent
+    if pair.band_hz is not None:
         floor = level = np.hypot(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
         )
@@ -180,6 +201,15 @@ def _with_python(finding: Finding) -> Finding:
     if finding.kind != "unknown" or finding.curve is not None:
         return finding
     return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
+
+
+def _with_learnt_error(finding: Finding) -> Finding:
+    """Finding with no parameter surer than the dynamics against which it was measured."""
+    parameters = {
+        name: msgspec.structs.replace(one, std=float(np.hypot(one.std, LEARNT_ERROR * one.value)))
+        for name, one in finding.parameters.items()
+    }
+    return msgspec.structs.replace(finding, parameters=parameters)
 
 
 def _above_model_error(log: WhitenedLog, selection: Selection, level: Float64[np.ndarray, " k"]) -> tuple[Selection, list[str]]:

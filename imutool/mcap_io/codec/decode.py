@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8, UInt32
 
+from imutool.array_types import Float64, Int64, UInt8, UInt32
 from imutool.errors import LogError
 from imutool.mcap_io.codec.schemas import (
     ACCEL,

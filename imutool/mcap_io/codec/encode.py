@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
 
+from imutool.array_types import Float64, Int64, UInt8
 from imutool.errors import DataError
 from imutool.mcap_io.codec.schemas import (
     ACCEL,
@@ -179,7 +179,9 @@ def encode_twist(
     _put_stamp(rows, layout, stamp_ns)
     numbers = _numbers_of(rows, layout)
     numbers[:, :3], numbers[:, 3:6] = linear, angular
-    numbers[:, 6:] = np.roll(covariance, (3, 3), axis=(1, 2)).reshape(len(stamp_ns), 36)
+    halves, swapped = numbers[:, 6:].reshape(-1, 2, 3, 2, 3), covariance.reshape(-1, 2, 3, 2, 3)
+    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        halves[:, row, :, column] = swapped[:, 1 - row, :, 1 - column]
     return rows
 
 

@@ -9,8 +9,8 @@ from posixpath import commonpath
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, Shaped, UInt8
 
+from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import Messages, Rows, columns

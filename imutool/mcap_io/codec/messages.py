@@ -11,9 +11,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64, Shaped, UInt8, UInt16, UInt32, UInt64
 from mcap.opcode import Opcode
 
+from imutool.array_types import Bool, Int64, Shaped, UInt8, UInt16, UInt32, UInt64
 from imutool.errors import LogError
 from imutool.mcap_io.codec.records import HEAD
 

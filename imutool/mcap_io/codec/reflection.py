@@ -16,8 +16,8 @@ from itertools import groupby
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Shaped, UInt8
 
+from imutool.array_types import Bool, Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu

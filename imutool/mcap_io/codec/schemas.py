@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import UInt8
 
+from imutool.array_types import UInt8
 from imutool.errors import LogError
 
 IMU = "sensor_msgs/msg/Imu"
@@ -28,6 +28,8 @@ IMAGE = "sensor_msgs/msg/CompressedImage"
 FLOAT = "std_msgs/msg/Float64"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
+PRESSURE = "sensor_msgs/msg/FluidPressure"
+MESSAGE_TWISTS = {"geometry_msgs/msg/TwistStamped": "twist", TWIST: "twist.twist", ODOMETRY: "twist.twist"}  # the twist's field
 
 NS_PER_S = 1_000_000_000
 

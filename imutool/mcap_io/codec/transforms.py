@@ -9,8 +9,8 @@ from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 
+from imutool.array_types import Bool
 from imutool.mcap_io.codec.encode import encode_transforms
 from imutool.mcap_io.codec.joined_imu import Cut
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages

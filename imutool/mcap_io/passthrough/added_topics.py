@@ -8,8 +8,8 @@ from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64, UInt8, UInt16
 
+from imutool.array_types import Int64, UInt8, UInt16
 from imutool.errors import LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuBatch

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
 
+from imutool.array_types import Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import MessageBlock, MessageIndexes, parse_message_indexes
 from imutool.mcap_io.codec import messages, records

@@ -9,10 +9,10 @@ from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from imutool.array_types import Bool, Int64
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages, records

@@ -12,10 +12,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt64
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Header
 
+from imutool.array_types import UInt64
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import HEAD_BYTES, Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records

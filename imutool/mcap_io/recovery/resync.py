@@ -10,7 +10,6 @@ import struct
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -26,6 +25,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from imutool.array_types import Int64
 from imutool.errors import LogError
 from imutool.mcap_io.blocks import Attachment
 from imutool.mcap_io.codec import messages, records

@@ -9,10 +9,10 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt64
 from mcap.opcode import Opcode
 from mcap.records import Header
 
+from imutool.array_types import UInt64
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD

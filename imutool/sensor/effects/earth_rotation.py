@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, attitude_of, starts_at
 from imutool.sensor.samples import IdealMotion
 

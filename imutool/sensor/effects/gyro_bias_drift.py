@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, each_axis, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor

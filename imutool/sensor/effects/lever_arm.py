@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.inertial.kinematics import lever_acceleration
 from imutool.sensor.effect import CompiledEffect, Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import IdealMotion

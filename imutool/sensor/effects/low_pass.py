@@ -16,9 +16,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex128, Float64
 from scipy.signal import lfilter
 
+from imutool.array_types import Complex128, Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
 from imutool.sensor.samples import IdealMotion
 

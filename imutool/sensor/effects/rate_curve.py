@@ -10,8 +10,8 @@ from __future__ import annotations
 from bisect import bisect_right
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import GYRO, GYRO_SLOW, Signals

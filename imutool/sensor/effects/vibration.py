@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from jaxtyping import Complex128, Float64
 
+from imutool.array_types import Complex128, Float64
 from imutool.sensor.robot_effects.signal_samples import Column, Columns, State
 
 GRAVITY_M_S2 = 9.81

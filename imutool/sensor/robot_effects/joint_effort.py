@@ -15,17 +15,19 @@ Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from scipy.ndimage import binary_opening
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.joint_dynamics import chain_columns, mass_coefficients
 from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples, State
 
 STEEP, LEAST_STEEP = 3.0, 1e-3  # of the velocity's noise and size, within which its sign turns
+AT_REST, LEAST_REST = 4.0, 3  # of that velocity, and samples: a joint that turns round is faster
 PLAUSIBLE_SHARE = 0.5  # of the effort's standard deviation
 STRIBECK = (0.03, 0.1, 0.3)  # velocities to start from, over the standard deviation
 SLOWEST = 0.5  # a faster fall is Coulomb friction, over the standard deviation
@@ -37,16 +39,33 @@ class _Friction:
     steep: float
     kind: str
     slowest: float
+    command: str = ""
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         if self.kind == "viscous":
             return s.with_added(self.joint, theta[0] * s.state[f"dq{self.joint}"])
         velocity = s.state[f"v{self.joint}"]
         sign = np.clip(velocity / self.steep, -1.0, 1.0)
-        return s.with_added(self.joint, theta[0] * sign * (self._near_rest(velocity, theta) if len(theta) > 1 else 1.0))
+        force = theta[0] * sign * (self._near_rest(velocity, theta) if len(theta) > 1 else 1.0)
+        if self.command:
+            rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(LEAST_REST, bool))
+            held = np.clip(s.channel(self.command) - s.y[:, self.joint], -np.abs(theta[0]), np.abs(theta[0]))
+            force = np.where(rests, held, force)
+        return s.with_added(self.joint, force)
 
     def _near_rest(self, velocity: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
         return np.asarray(np.exp(-((velocity / min(theta[1], self.slowest)) ** 2)))
+
+
+def with_stiction(effect: Effect) -> Effect:
+    """Coulomb friction that holds a joint at rest; any other effect as it is.
+
+    At rest the force is what the command leaves over, up to the level (eq. 3 of the survey): sliding alone shows the level. It
+    follows the recording there, and can therefore not be searched for.
+    """
+    if effect.name != "coulomb_friction" or not isinstance(effect.forward, _Friction):
+        return effect
+    return replace(effect, forward=replace(effect.forward, command=effect.sensors[0]), linear=False)
 
 
 def friction_effects(scale: Scale) -> Iterator[Effect]:

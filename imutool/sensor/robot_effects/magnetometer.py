@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import SignalSamples

@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.ndimage import map_coordinates, spline_filter
+
+from imutool.array_types import Float64
 
 Column = Float64[np.ndarray, "_"]
 Columns = Float64[np.ndarray, "_ k"]

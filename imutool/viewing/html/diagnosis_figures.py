@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.signal import fftconvolve, welch
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
 from imutool.diagnosis.wording.effect_sentences import signals

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.diagnosis.result import Diagnosis, Traces
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses

@@ -13,8 +13,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
+from imutool.array_types import Bool, Float64
 from imutool.errors import not_installed
 from imutool.recording.columns import true_ranges
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text

@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.viewing.html.drawing import (
     DecimatedLine,
     Panel,

@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.recording import Poses
 from imutool.units import AXES
 from imutool.viewing.html.drawing import Panel, Picture, legend

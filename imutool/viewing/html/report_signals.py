@@ -8,8 +8,8 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.inertial import stationary
 from imutool.noise import allan
 from imutool.noise.allan import Curve

@@ -10,10 +10,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, Int64
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Scalars, Times, nanoseconds, seconds

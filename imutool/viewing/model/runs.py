@@ -12,9 +12,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 
 from imutool import __version__
+from imutool.array_types import Bool
 from imutool.errors import ConfigError
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_truth, with_velocity

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Bool, Float64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.inertial.metrics import align

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.diagnosis.result import Diagnosis, Located, Traces
 from imutool.diagnosis.wording.conclusion import lines, location_text
 from imutool.mcap_io.storage.target import Target

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.viewing.model.run_data import RunData, round_up_125
 from imutool.viewing.rerun.sdk import ELAPSED, TIMELINES
 

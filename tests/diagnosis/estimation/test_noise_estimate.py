@@ -92,6 +92,14 @@ def test_poses_that_err_faster_than_a_frequency_end_the_band_there() -> None:
     assert ends_hz < BAND_HZ
 
 
+def test_a_quiet_axis_that_poses_do_not_know_ends_the_band_next_to_lively_ones() -> None:
+    felt = replace(FELT, accel=FELT.accel * [6.0, 0.3, 6.0])
+    wrong = planted.ideal(felt)
+    wrong[:, 4] += errors(3.0, 0.5)[:, 1]
+    ends_hz = known_band_hz(planted.ideal(felt), planted.ideal(felt) - wrong, planted.RATE_HZ, BAND_HZ, BAND)
+    assert 1.25 <= ends_hz <= 3.0
+
+
 def test_a_sensor_that_is_too_slow_leaves_the_band_as_it_is() -> None:
     pair = beside_poses({"low_pass": [6.0]})
     assert known_band_hz(pair.real, pair.real - planted.ideal(FELT), planted.RATE_HZ, BAND_HZ, BAND) == BAND_HZ

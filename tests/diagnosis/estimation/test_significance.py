@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.signal import lfilter
 from support import planted
 
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.significance import Scatter, log_p_value, scatter
-from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
 FELT = planted.shaken(duration_s=45.0)
 BLOCK_S = 5.0
@@ -55,6 +57,18 @@ def test_noise_that_lasts_spreads_as_the_blocks_say_and_more_than_the_informatio
         honest.append(z(found, seen.std["gyro_scale"]))
     assert np.std(stated) > 1.5
     assert SPREAD[0] < np.std(honest) < SPREAD[1]
+
+
+def test_poses_that_err_make_a_scale_as_unsure_as_they_dilute_it() -> None:
+    error = 0.2 * np.random.default_rng(3).normal(size=FELT.gyro.shape)  # rad/s, of the expectation
+    pair = replace(planted.pair(FELT), ideal=replace(FELT, gyro=FELT.gyro + error), against="poses")
+    log = WhitenedLog(pair, Whitener(np.ones((6, 1)), np.array([0.2] * 3 + [0.03] * 3)))
+    found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
+    diluted, stated = found.chosen[0][1], scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
+    simulated = WhitenedLog(replace(pair, against="simulation"), log.whiten)
+    blocks = scatter([simulated], replace(found, logs=(simulated,)), "all", BLOCK_S).std["gyro_scale"]
+    assert (diluted < -5.0 * blocks).all()  # there is no scale
+    assert (np.abs(diluted) < 1.5 * stated).all()
 
 
 def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:

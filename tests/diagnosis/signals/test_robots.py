@@ -55,8 +55,11 @@ def test_a_ripple_up_to_the_end_of_the_band_leaves_spectrum_for_the_noise(tmp_pa
 
 
 def test_an_arm_is_diagnosed_from_the_command_line_with_its_page(imutool: Run, tmp_path: Path) -> None:
-    """A dry friction in MuJoCo: the command finds topics and fields by itself, and the page draws them."""
-    conceal_robot(tmp_path, 3, "arm", "single", "coulomb_friction")
+    """A dry friction in MuJoCo: the command finds topics and fields by itself, and the page draws them.
+
+    The joint rests for a fifth of the time, held by less than the friction's level.
+    """
+    conceal_robot(tmp_path, 12036, "arm", "single", "coulomb_friction")
     done = imutool("diagnose", tmp_path / "real.mcap", "--sim", tmp_path / "sim.mcap", "-o", tmp_path / "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
@@ -64,7 +67,7 @@ def test_an_arm_is_diagnosed_from_the_command_line_with_its_page(imutool: Run, t
     (finding,) = found["findings"]
     assert (finding["effect"], finding["signal"]) == ("coulomb_friction", planted["column"])
     level = finding["parameters"]["level"]
-    assert abs(level["value"] - planted["parameters"]["level"]) < SURE * level["std"]
+    assert abs(level["value"] - planted["parameters"]["level"]) < SURE * level["std"] < 0.02 * level["value"]
     assert found["bias"] == {"gyro": None, "accel": None}
     page = (tmp_path / "out" / "report.html").read_text()
     assert "lacks dry friction" in page

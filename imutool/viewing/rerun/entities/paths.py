@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
+from imutool.array_types import Float64, Int64
 from imutool.recording import Poses, Times, nanoseconds
 from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, round_up_125, split_at_gaps
 from imutool.viewing.model.trajectory_error import Errors

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.recording import Times
 from imutool.units import AXES
 from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows

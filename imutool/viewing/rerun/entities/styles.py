@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64, UInt8
 
+from imutool.array_types import Float64, UInt8
 from imutool.units import AXES
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.rerun.sdk import Role
