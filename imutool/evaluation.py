@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from msgspec import to_builtins
 
-from imutool.array_types import Bool
+from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
 from imutool.bias_start.aided_path import aided_path
-from imutool.bias_start.correction import DebiasedImu, apply
+from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
@@ -92,13 +92,13 @@ def _evaluated(
     warn_of_recordings([recording])
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
-        found = _corrected(recording.imu, model, start)
+        found, std = _corrected(recording.imu, model, start)
         fit = judge(model, start, [relative_samples(recording.imu)], about) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
         if aids is not None:
-            estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), _left(start), aids)
+            estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), _left(start, std), aids)
         for kind, estimate in estimates.items():
             results.append(
                 {
@@ -137,22 +137,24 @@ def _over(imu: Imu, true: Poses) -> Imu:
     return rows
 
 
-def _left(start: InitialBias | None) -> BiasPrior:
-    """Prior of the residual bias: the start's standard deviation, or a wide one for raw samples."""
-    std = np.array(RAW_STD) if start is None else np.maximum(start.std, LEAST_STD)
-    return BiasPrior(np.zeros(6), std, AT_REST_STD)
+def _left(start: InitialBias | None, std: Float64[np.ndarray, "n 6"]) -> BiasPrior:
+    """Prior of the residual bias: as the start states, or less where the tracked bias became more certain."""
+    least = np.median(std, axis=0) if start is None else np.minimum(start.std, np.median(std, axis=0))
+    return BiasPrior(np.zeros(6), np.maximum(least, LEAST_STD), AT_REST_STD)
 
 
-def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> DebiasedImu:
-    """Samples corrected by a model; without one as they are."""
-    return apply(model, start, imu) if model and start else DebiasedImu(imu, np.zeros((len(imu), 6)))
+def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
+    """Samples corrected by a model, with the deviation of its bias; without one as they are, with a wide one."""
+    if model is None or start is None:
+        return DebiasedImu(imu, np.zeros((len(imu), 6))), np.tile(RAW_STD, (len(imu), 1))
+    return apply_with_std(model, start, imu)
 
 
 def runs(
     recording: Recording, models: Sequence[str | Path], init: str, where: str | Path
 ) -> Iterator[tuple[str, DebiasedImu, InitialBias | None]]:
     """Samples as recorded, then corrected by each model: name, samples and bias, initial bias."""
-    yield RAW, _corrected(recording.imu, None, None), None
+    yield RAW, _corrected(recording.imu, None, None)[0], None
     for name, model, start in started(recording, models, init, where):
         yield name, apply(model, start, recording.imu), start
 

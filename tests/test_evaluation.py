@@ -15,14 +15,21 @@ from scipy.spatial.transform import Rotation
 from support import driven
 from support.evo import statistics
 
+from imutool import evaluation
 from imutool.bias import linear
-from imutool.bias.io import save
+from imutool.bias.io import find_model, save
+from imutool.bias_start.correction import apply_with_std
+from imutool.bias_start.initial_bias import LEAST_STD
+from imutool.bias_start.model_choice import find_initial_bias
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.conversion.run import convert
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.evaluation import evaluate, runs
 from imutool.inertial import metrics
+from imutool.inertial.aids import Aids
 from imutool.inertial.metrics import DISTANCES_M
-from imutool.inertial.strapdown import along_truth
+from imutool.inertial.strapdown import StartPose, along_truth, dead_reckon
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight
@@ -201,6 +208,29 @@ def test_an_aided_path_is_a_row_beside_pure_integration(log: Path, model: Path, 
         f"flight_1_{n}_aided.tum" for n in ("raw", "static", "linear_1")
     }
     json.dumps(both, allow_nan=False)
+
+
+def test_what_tracking_found_out_narrows_the_prior_of_an_aided_path(
+    log: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bias that was tracked is known better than its start: else an unobservable heading wanders."""
+    priors = []
+
+    def path(imu: Imu, start: StartPose, prior: BiasPrior, _: Aids) -> Poses:
+        priors.append(prior)
+        return dead_reckon(imu, start)
+
+    monkeypatch.setattr(evaluation, "aided_path", path)
+    recording = read(log)
+    loaded = find_model(model, 200.0)
+    start = find_initial_bias("auto", loaded, recording)
+    evaluate(log, models=[model], aid="stops")
+    raw, known = (prior.std for prior in priors)
+    _, std = apply_with_std(loaded, start, recording.imu)
+    assert (known <= np.maximum(start.std, LEAST_STD)).all()
+    np.testing.assert_allclose(known, np.maximum(np.minimum(start.std, np.median(std, axis=0)), LEAST_STD), rtol=1e-12)
+    assert (known < start.std).any()
+    assert (raw > known).all()
 
 
 def test_all_aids_of_a_log_and_each_setting_of_its_clock(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float64
 from msgspec import Meta
 
+from imutool.array_types import Bool, Float64
 from imutool.bias.model import Vector6
 from imutool.bias_start.bias_tracking import Aiding, BiasFilter, FilteredBlock, smooth_blocks
 from imutool.bias_start.initial_bias import relative_samples

@@ -5,7 +5,7 @@ logs ─ align_all ─> Pair[] ─ whitened ─> WhitenedImu[] ─ select_effect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
@@ -29,6 +29,7 @@ from imutool.diagnosis.estimation.observability import unobservable, with_free
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
+from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
 from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
@@ -38,7 +39,7 @@ from imutool.diagnosis.reference_coverage import (
     without_unusable,
 )
 from imutool.diagnosis.reference_errors import reference_caveat, reference_errors, turned_reference
-from imutool.diagnosis.result import Diagnosis, Finding, Located
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
@@ -80,11 +81,37 @@ def diagnose(
     report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     report(0, 4, "reading")
     _check_signals(signals, reals, sim)
-    if sim is not None and not all(_has_imu(log) for log in (reals[0], sim)):
+    topics = _imu_topics(reals[0])
+    if sim is not None and not (topics and _imu_topics(sim)):
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
-    logs_read = [with_channels(read_log(real, imu=imu, truth=truth), real) for real in reals]
+    first = imu or (topics[0] if len(topics) > 1 and len(reals) == 1 else None)
+    logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     warn_of_recordings(recordings)
+    others = [topic for topic in topics if topic != first] if len(reals) == 1 and first in topics else []
+    if others and sim is None and not recordings[0].truths:
+        diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
+    else:
+        told = [log.remark for log in logs_read if log.remark]
+        diagnosis = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings)
+    if others and first is not None:
+        diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
+    report(4, 4, "")
+    return diagnosis
+
+
+def _beside_reference(
+    recordings: Sequence[Recording],
+    reals: Sequence[Location],
+    sim: Location | None,
+    imu: str | None,
+    truth: str | None,
+    signals: Sequence[str],
+    told: Sequence[str],
+    report: Tell,
+    settings: DiagnoseSettings,
+) -> Diagnosis:
+    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read."""
     simulated = None if sim is None else read_log(sim, imu=imu)
     sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
@@ -111,12 +138,25 @@ def diagnose(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     caveat = reference_caveat(recordings) if simulated is None else ""
-    tried = tuple(dict.fromkeys(log.remark for log in logs_read if log.remark))
-    diagnosis = _with_reference(diagnosis, wrong, wrong_at, (*another, *left_out, *diagnosis.remarks, *tried), caveat)
+    remarks = (*another, *left_out, *diagnosis.remarks, *dict.fromkeys(told))
+    diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
-    report(4, 4, "")
     return diagnosis
+
+
+def _with_other_imus(
+    diagnosis: Diagnosis, recording: Recording, real: Location, first: str, others: Sequence[str], settings: DiagnoseSettings
+) -> Diagnosis:
+    """Adds the relation of each other IMU to the first, or the reason why there is none."""
+    imus, remarks = dict[str, Mapping[str, Estimate]](), [f"{1 + len(others)} IMUs; the findings are those of {first}"]
+    for topic in others:
+        try:
+            imus[topic] = imu_relation(recording, read_log(real, imu=topic), EVERY_UNIT, settings)
+            remarks.append(imu_sentence(topic, first, imus[topic]))
+        except ImutoolError as error:
+            remarks.append(f"{topic} is not compared with {first}: {error}")
+    return replace(diagnosis, imus=imus, remarks=(*diagnosis.remarks, *remarks))
 
 
 def read_log(log: Location, *, imu: str | None = None, truth: str | None = None) -> Recording:
@@ -145,9 +185,9 @@ def _check_signals(signals: Sequence[str], reals: Sequence[Location], sim: Locat
             read_field(place, name)
 
 
-def _has_imu(path: Location) -> bool:
+def _imu_topics(path: Location) -> list[str]:
     with Log(path) as log:
-        return bool(log.imu_topics)
+        return log.imu_topics
 
 
 def _with_reference(

@@ -186,6 +186,7 @@ class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     Attributes:
         bias: of the first log; `biases` has one for each log.
         unexplained: `SIGNAL_rms` of each signal, `noise_floor` by signal, and whether all residuals are `white`.
+        imus: rotation, lever arm and clock of the log's other IMUs against this one, by topic.
     """
 
     real: tuple[str, ...]
@@ -200,6 +201,7 @@ class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
     closer: Mapping[str, Closer]
     remarks: tuple[str, ...]
     closed: ClosedLoop | UnsetType = UNSET
+    imus: Mapping[str, Mapping[str, Estimate]] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +253,7 @@ class Diagnosis:
     signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
     caveat: str = ""
     closed: ClosedLoop | None = None
+    imus: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)  # other IMUs of the log, by topic
 
     @classmethod
     def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:
@@ -280,17 +283,16 @@ class Diagnosis:
             closer=self.closer,
             remarks=self.remarks,
             closed=UNSET if self.closed is None else self.closed,
+            imus=self.imus or UNSET,
         )
 
 
 def _bias(values: Float64[np.ndarray, "6"]) -> Bias:
-    known = (part if np.isfinite(part).all() else None for part in (values[:3], values[3:]))
-    return Bias(*(None if part is None else tuple(part.tolist()) for part in known))
+    return Bias(*(tuple(part.tolist()) if np.isfinite(part).all() else None for part in (values[:3], values[3:])))
 
 
 def _unexplained(residuals: Mapping[str, Unexplained]) -> dict[str, float | bool | dict[str, float]]:
-    missing = Unexplained(np.nan, np.nan, white=True)  # null in JSON
-    by_signal = dict.fromkeys(ASCII_UNITS, missing) | dict(residuals)
+    by_signal = dict.fromkeys(ASCII_UNITS, Unexplained(np.nan, np.nan, white=True)) | dict(residuals)  # null in JSON
     return {
         **{f"{signal}_rms": residual.rms for signal, residual in by_signal.items()},
         "noise_floor": {signal: residual.noise_floor for signal, residual in by_signal.items()},

@@ -15,8 +15,8 @@ import re
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 
+from imutool.array_types import Float64
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
 from imutool.geometry import quaternion
 from imutool.inertial.metrics import align
@@ -35,6 +35,8 @@ STOPS, BAROMETER, WHEELS, GROUND = KINDS = ("stops", "barometer", "odometry", "g
 AUTO = "auto"
 BLOCK_NS = 500_000_000  # over which the accelerations of odometry and IMU are compared
 MOST_MOUNT_STD_RAD = 0.2  # of a mount that the motion shows
+MOST_SLIP_M_S2 = 2.0  # difference in size of the two: above, wheels slip or their odometry was reset
+LEAST_NOISE_M_S2 = 0.05  # of such a difference: what does not accelerate shows nothing, however exact it is
 SAME_M, LEAST_PATH_M = 1e-3, 1.0  # odometry as near to the truth, over such a path, is the truth
 PRESSURE_UNITS = {"Pa": (1.5e4, 1.2e5), "hPa": (150.0, 1200.0), "kPa": (15.0, 120.0)}
 SEA_PA, EXPONENT, FACTOR_M = 101_325.0, 0.190263, 44_330.8  # of the standard atmosphere, ISO 2533
@@ -265,17 +267,22 @@ def _mounted(poses: Poses, imu: Imu, name: str) -> Odometry:
     first, last = np.searchsorted(imu.t_ns, edges[:-1]), np.searchsorted(imu.t_ns, edges[1:])
     full = (last - first) * imu.period_s * 1e9 > 0.9 * BLOCK_NS
     good = valid[1:] & valid[:-1] & known & full
-    if at.v_w is None or good.sum() < 3:
-        raise DataError(f"{name} and the IMU share fewer than three half seconds", expected="odometry while the IMU measures")
+    assert at.v_w is not None
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accel, axis=0)])
     f_b = (sums[last] - sums[first])[good] / (last - first)[good, None]
     f_w = np.diff(at.v_w, axis=0)[good] / (BLOCK_NS * 1e-9) - np.array(GRAVITY_W)
     f_v = quaternion.rotate(quaternion.inverse(middle.q_wb_wxyz[good]), f_w)
+    alike = np.abs(quaternion.length(f_v) - quaternion.length(f_b)) < MOST_SLIP_M_S2
+    f_v, f_b = f_v[alike], f_b[alike]
+    if len(f_v) < 3:
+        raise DataError(
+            f"{name} and the IMU agree in fewer than three half seconds", expected="odometry while the IMU measures"
+        )
     u, _, vt = np.linalg.svd(f_v.T @ f_b)
     R_vb = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-    residual = float(((f_v - f_b @ R_vb.T) ** 2).sum()) / (3 * len(f_v) - 3)
+    variance = max(float(((f_v - f_b @ R_vb.T) ** 2).sum()) / (3 * len(f_v) - 3), LEAST_NOISE_M_S2**2)
     information = np.linalg.eigvalsh(-(hat(f_v) @ hat(f_v)).sum(axis=0)).min()
-    std = float(np.sqrt(residual / max(information, np.finfo(float).tiny)))
+    std = float(np.sqrt(variance / max(information, np.finfo(float).tiny)))
     if std > MOST_MOUNT_STD_RAD:
         raise DataError(
             f"the motion does not show how the IMU is mounted in the frame of {name}",

@@ -75,37 +75,9 @@ READ = {
     "folders",
 }
 WORDS = {
-    *(
-        "aid",
-        "format",
-        "sequence",
-        "compression",
-        "imu",
-        "truth",
-        "rule",
-        "no_rule",
-        "init",
-        "verify",
-        "connect",
-        "method",
-        "set_",
-    ),
-    *(
-        "sensor",
-        "device",
-        "align",
-        "at",
-        "signal",
-        "kind",
-        "size",
-        "damaged",
-        "name",
-        "address",
-        "memory",
-        "robot_from",
-        "encoding",
-        "by",
-    ),
+    *("format", "sequence", "compression", "imu", "truth", "rule", "no_rule", "init", "verify", "connect", "method", "set_"),
+    *("sensor", "device", "align", "at", "signal", "kind", "size", "damaged", "name", "address", "memory", "robot_from"),
+    *("encoding", "by", "aid"),
 }
 
 

@@ -15,7 +15,7 @@ from imutool.errors import ConfigError, DataError, LogError
 from imutool.inertial.aids import Aids, find_aids, parse_aids
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
-from imutool.recording import Poses
+from imutool.recording import Imu, Poses
 
 HEIGHT = 5.0
 
@@ -116,6 +116,15 @@ def test_mount_and_velocity_come_from_poses_or_twist(drive: Drive, tmp_path: Pat
     assert turned < 4.0 * aids.odometry.std_rad + np.radians(2.0)  # lever arm and bias are not in the deviation
 
 
+def test_odometry_that_is_reset_keeps_its_mount(drive: Drive, tmp_path: Path) -> None:
+    """A jump of its poses by meters is half a second of hundreds of m/s²."""
+    p = drive.vehicle.p_wb + np.where(np.arange(len(drive.vehicle))[:, None] > 350, [40.0, -25.0, 0.0], 0.0)
+    path = driven.write(tmp_path / "a.mcap", drive.imu, drive.truth, {"/odom": driven.odometry(replace(drive.vehicle, p_wb=p))})
+    odometry = found(path, "odometry").odometry
+    assert odometry is not None
+    assert (Rotation.from_matrix(odometry.R_vb) * R_VB.inv()).magnitude() < np.radians(5.0)
+
+
 def test_the_truth_is_no_aid_by_any_name(drive: Drive, tmp_path: Path) -> None:
     rotated = Rotation.from_euler("z", 70.0, degrees=True)
     v = drive.truth
@@ -140,9 +149,14 @@ def test_the_truth_is_no_aid_by_any_name(drive: Drive, tmp_path: Path) -> None:
         found(path, "odometry=/ekf/odom", truth="/ekf/odom")
 
 
-def test_a_motion_that_shows_no_mount_is_refused(drive: Drive, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_motion_that_shows_no_mount_is_refused(
+    drive: Drive, tmp_path: Path, caplog: pytest.LogCaptureFixture, exact: bool
+) -> None:
     end_ns = int(drive.imu.t_ns[0] + STILL_S * 1e9)
-    still = drive.imu.between(int(drive.imu.t_ns[0]), end_ns)
+    still: Imu = drive.imu.between(int(drive.imu.t_ns[0]), end_ns)
+    if exact:  # of a simulator without noise
+        still = replace(still, accel=np.tile(R_VB.inv().apply([0.0, 0.0, 9.81]), (len(still), 1)))
     truth, vehicle = (poses.between(int(drive.imu.t_ns[0]), end_ns) for poses in (drive.truth, drive.vehicle))
     twist = np.zeros((len(vehicle), 2))
     path = driven.write(tmp_path / "a.mcap", still, truth, {"/odom": driven.odometry(vehicle, twist)})
