@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from imutool.api.logs import NamedProgress, Progress
+from imutool.api import NamedProgress, Progress
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
+from imutool.api import NamedProgress
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
 from imutool.errors import ConfigError, did_you_mean
@@ -19,8 +20,6 @@ from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
 FORMATS = ("euroc", "rosbag2", *simulators.FORMATS)
-Progress = Callable[[int, int], None]  # bytes done, bytes in all
-NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 
 
 def read(

@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 
 from imutool import debiasing, evaluation
-from imutool.api.logs import Progress
+from imutool.api import Progress
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for

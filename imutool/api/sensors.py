@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from imutool import diagnosis_output
-from imutool.api.logs import NamedProgress
+from imutool.api import NamedProgress
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.location import LogPath, local, location

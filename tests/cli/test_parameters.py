@@ -48,6 +48,18 @@ def test_debias_of_a_log_with_poses_does_without_what_takes_long_to_import(tmp_p
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_repair_and_clean_do_without_scipy(tmp_path: Path) -> None:
+    write(flight(2, duration_s=20.0), tmp_path / "flight.mcap")
+    for word in ("repair", "clean"):
+        words = ["imutool", word, str(tmp_path / "flight.mcap"), str(tmp_path / f"{word}.mcap")]
+        seen = f"import sys; sys.argv = {words}; from imutool.cli import main\ntry: main()\nexcept SystemExit: pass\n"
+        done = subprocess.run(
+            [sys.executable, "-c", f"{seen}print('scipy' in sys.modules)"], capture_output=True, text=True, check=True
+        )
+        assert (tmp_path / f"{word}.mcap").exists()
+        assert done.stdout.splitlines()[-1] == "False"
+
+
 def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:
     known = flags(COMMANDS["debias"])
     assert (known["init"], known["models"], known["out"], known["source"]) == ("--init", "--model", "OUT", "IN")
