@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from msgspec import convert
+from msgspec import convert, field
 
 from imutool.bias_start import Fitness
 from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
@@ -34,7 +34,7 @@ class Score(Section, frozen=True, kw_only=True):
     log: str
     model: str
     estimate: Literal["integration", "aided"]
-    aids: dict[str, str]
+    aids: dict[str, str] = field(default_factory=dict)  # older reports have none
     init: str | None
     init_how: str | None
     smooth: bool

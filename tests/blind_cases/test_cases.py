@@ -46,7 +46,14 @@ FLIGHT_S = 30.0
 WHERE = Path("findings.json")
 
 ROOT = Path(__file__).parents[2]
-MAY_IMPORT = {"imutool.errors", "imutool.recording", "imutool.noise.datasheet", "imutool.mcap_io", "imutool.report"}
+MAY_IMPORT = {
+    "imutool.array_types",
+    "imutool.errors",
+    "imutool.recording",
+    "imutool.noise.datasheet",
+    "imutool.mcap_io",
+    "imutool.report",
+}
 
 
 def as_json(report: msgspec.Struct) -> dict[str, Any]:

@@ -113,7 +113,7 @@ class NonMonotonic(Rule):
         self, stamp: Int64[np.ndarray, " n"], before: Int64[np.ndarray, " n"], behind: Bool[np.ndarray, " n"]
     ) -> None:
         """Notes late samples in a row after which the stamps go on from the last of them."""
-        if not behind.any() and self._run is None:
+        if not len(stamp) or not (behind.any() or self._run):
             return
         for first, end in true_ranges(behind) if behind[0] else [(0, 0), *true_ranges(behind)]:
             count, back_ns, last_ns = self._run if self._run and first == 0 else (0, 0, 0)
