@@ -167,6 +167,8 @@ def _save(log: RecoveredLog, out: LogWriter, damaged: str, tell: Callable[[int],
     log.check_data_crc()
     if log.losses and not log.index.by_records:
         raise _ContradictionError
+    if log.index.by_records:
+        log.index.check()
     saver = _Saver(log.index, out)
     for item in log.index.items:
         saver.copy(item)

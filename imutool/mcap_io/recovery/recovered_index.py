@@ -143,7 +143,7 @@ class RecoveredIndex(LogIndex):
             return np.zeros((0, 2), np.uint64)
 
     def check(self) -> None:
-        """Compares the CRC of every attachment, and of every chunk that was not unpacked yet."""
+        """Compares the CRC of every attachment, and of every chunk that was not unpacked yet; then chunks are in order."""
         if not self.by_records:
             super().check()
             return
@@ -153,6 +153,7 @@ class RecoveredIndex(LogIndex):
                     Attachment.of(self.source, item.offset, item.length - HEAD.size).check_crc(self.source)
                 except LogError as error:
                     self.lose(item, error)
+        self.sort()
 
     def lose(self, item: MessageBlock | RecordSpan, error: LogError) -> None:
         """Leaves a part of the log out from now on, and lists it in `losses`."""
@@ -233,8 +234,7 @@ class RecoveredIndex(LogIndex):
                         recording.define(record, proven=False)
 
     def _add_gap(self, gap: Gap) -> None:
-        ids = self.recordings.each[gap.recording].ids
-        topics = self._by_topic({ids.get(local, -1 - local): count for local, count in gap.counts.items()})
+        topics = self._by_topic({self.recordings.each[gap.recording].ids.get(i, -1 - i): n for i, n in gap.counts.items()})
         self.losses.add(Loss(gap.offset, gap.length, gap.reason, topics, gap.counted, gap.start_ns, gap.end_ns))
 
     def _by_topic(self, counts: dict[int, int]) -> dict[str, int]:

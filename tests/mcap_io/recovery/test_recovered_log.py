@@ -331,6 +331,19 @@ def test_a_damaged_attachment_is_left_out(foreign: Foreign, flight: Messages, tm
     assert len(by_mcap(target)) == len(flight)
 
 
+@pytest.mark.parametrize("layout", ["no-index"], indirect=True)
+def test_chunks_are_in_order_though_only_an_attachment_is_damaged(foreign: Foreign, tmp_path: Path, layout: str) -> None:
+    """It was found while the chunks were copied, after they would have been put in order."""
+    path = foreign(some(1, 40), layout, chunk_size=300, attachments=(b"a" * 3000,))
+    raw, (first, second) = path.read_bytes(), [(b.offset, b.offset + b.length) for b in blocks(path)[3:5]]
+    raw = raw[: first[0]] + raw[slice(*second)] + raw[first[1] : second[0]] + raw[slice(*first)] + raw[second[1] :]
+    path.write_bytes(raw.replace(b"a" * 100, b"a" * 50 + b"b" + b"a" * 49, 1))
+    report = repair(path, tmp_path / "out.mcap")
+    assert ["attachment" in loss.reason for loss in report.losses.entries] == [True]
+    starts = [block.start_ns for block in blocks(tmp_path / "out.mcap")]
+    assert starts == sorted(starts)
+
+
 # ── what is written ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 
