@@ -2,8 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 DEMO ?= demo-out
-# one more than cores: tests wait for browsers and for fleets
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1) + 1)
+WORKERS ?= auto
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 READY_DEMO := $(VENV)/.ready-demo

@@ -146,16 +146,22 @@ def _candidates(raw: bytes, known: ChunkIndex | None) -> Iterator[bytes]:
 def keeps_sound(head: records.ChunkHead, raw: bytes, found: messages.Messages) -> bool:
     """Whether a chunk that is copied as it is can be told to be sound.
 
-    Without a CRC its head must agree with its messages: nothing else tells the next reader that it is sound. Packed data
-    need their end mark, without which other readers refuse them.
+    Without a CRC its head must agree with its messages: nothing else tells the next reader that it is sound. A frame of
+    lz4 must end where its data do, since other readers refuse it otherwise.
     """
     if not head.crc and len(found.heads) and (head.start_ns, head.end_ns) != messages.span(found.times()):
         return False
     packed = raw[head.data_at :]
     if head.compression != "lz4":
         return True
-    checksum = 4 if packed[4] & 4 else 0  # of the contents, behind the end mark
-    return packed[len(packed) - 4 - checksum : len(packed) - checksum] == bytes(4)
+    frame = lz4.frame.LZ4FrameDecompressor()
+    try:
+        frame.decompress(packed, max_length=max(head.size, 1))
+        if not frame.eof:
+            frame.decompress(b"", max_length=1)
+    except (RuntimeError, EOFError):
+        return False
+    return bool(frame.eof) and not frame.unused_data
 
 
 def find_definitions(raw: bytes) -> Iterator[tuple[int, bytes]]:

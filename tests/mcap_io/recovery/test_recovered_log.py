@@ -435,6 +435,18 @@ def test_a_chunk_without_a_crc_that_states_other_times_is_sound_in_the_repaired_
         assert len(content(log)) == saved == 40
 
 
+@pytest.mark.parametrize("layout", ["lz4"], indirect=True)
+def test_an_lz4_frame_that_does_not_end_is_packed_anew(foreign: Foreign, tmp_path: Path, layout: str) -> None:
+    """Its record was a byte too short. The last byte of the data, a zero, was taken for the first one of the end mark."""
+    path = foreign([(*m[:5], m[5] + bytes(1)) for m in some(1, 40)], layout, chunk_size=300)
+    block, raw = blocks(path)[3], bytearray(path.read_bytes())
+    assert raw[block.offset + block.length - 6 : block.offset + block.length][1:] == bytes(5)
+    raw[block.offset + 1] -= 1
+    path.write_bytes(bytes(raw))
+    saved = sum(repair(path, tmp_path / "out.mcap").messages.values())
+    assert len(by_mcap(tmp_path / "out.mcap")) == saved
+
+
 def test_damaged_stretches_are_kept_where_no_reader_takes_them_for_messages(
     foreign: Foreign, flight: Messages, tmp_path: Path
 ) -> None:
