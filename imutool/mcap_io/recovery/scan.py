@@ -240,7 +240,7 @@ class Scan(ScanResult):
         end = position + HEAD.size + length
         if not (length <= frames.limit - position - HEAD.size and frames.is_boundary(end)):
             return None
-        if frames.find_proven(position + 1, end) >= 0:
+        if frames.find_proven((self._unproven if self._unproven >= 0 else position) + 1, end) >= 0:
             return None
         if opcode >= PRIVATE:
             self.items.append(RecordSpan(opcode, position, HEAD.size + length))

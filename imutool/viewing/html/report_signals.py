@@ -245,7 +245,8 @@ def _draw_spectrum(
             label = f"{run_name(trace)}: raw minus debiased, {AXES[k]}"
             axes.plot(at, np.sqrt(np.where(power[:, k] > 0.0, power[:, k], np.nan)), label=label, **style)
     for k, axes in enumerate(panels):
-        largest = max(float(np.sqrt(density[:, k].max())) for _, _, density in curves)
+        powers = [density[:, k] for _, _, density in curves]
+        largest = max(float(np.sqrt(power.max(where=np.isfinite(power), initial=0.0))) for power in powers)
         if largest > 0.0:
             axes.set_yscale("log")
             axes.set_ylim(bottom=max(axes.get_ylim()[0], ROUNDING * largest))

@@ -245,7 +245,8 @@ def path_rows(p_wb: Float64[np.ndarray, "n 3"], most: int = MAX_PATH_ROWS) -> Ro
         return np.arange(n)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p_wb, axis=0), axis=1))])
     half = most // 2
-    along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half))
+    finite = np.isfinite(travelled[-1])  # squares of absurd positions overflow: then all rows are even in time
+    along = np.searchsorted(travelled, np.linspace(0.0, travelled[-1], half)) if finite else np.zeros(0, np.int64)
     rows: Rows = np.unique(np.concatenate([np.linspace(0, n - 1, most - half).round().astype(np.int64), along]))
     return rows
 

@@ -195,6 +195,13 @@ def test_every_run_has_its_curve_in_every_panel_it_belongs_to(seen: RunData, pag
     assert titles.count("truth") == len([svg for svg in svgs(page) if "Paths:" in svg])
 
 
+def test_a_spectrum_whose_power_overflows_is_drawn(flown: Recording) -> None:
+    imu = replace(flown.imu, accel=flown.imu.accel * [1.0, 1.0, 1e160])
+    with np.errstate(all="ignore"):
+        page = report.page([build(replace(flown, imu=imu, truths={}), [Run.raw(imu)])])
+    assert len([svg for svg in svgs(page) if "spectrum" in svg]) == 2
+
+
 @pytest.mark.parametrize("which", [0, 1], ids=["gyro", "accel"])
 def test_signals_are_the_samples_of_all_runs_on_one_scale_one_below_the_other(seen: RunData, which: int) -> None:
     drawn = curves(panel(seen, report_signals.signals, which))

@@ -322,6 +322,13 @@ def test_a_path_that_never_moves_is_thinned_too() -> None:
     assert {0, 4999} <= set(rows.tolist())
 
 
+def test_a_path_whose_length_overflows_is_thinned_too() -> None:
+    with np.errstate(over="ignore"):
+        rows = path_rows(np.linspace(0.0, 1e200, 5000)[:, None] * np.ones(3), 100)
+    assert len(rows) <= 100
+    assert {0, 4999} <= set(rows.tolist())
+
+
 RATE_HZ, COUNT = 200.0, 40_000
 SCATTER = 0.1  # of a mean over 800 frequencies of 49 half-overlapping windows: a hundredth, with margin
 
