@@ -109,7 +109,7 @@ class Command(TyperCommand):
         """Read the words of the command line; an option that only other commands have is answered with this command's."""
         try:
             return super().parse_args(ctx, args)
-        except typer.BadParameter.__bases__[0] as error:  # click's error of usage, which typer does not export
+        except Exception as error:  # click's own kinds of error are not exported by typer
             if hasattr(error, "possibilities"):
                 error.possibilities = instead_of(getattr(error, "option_name", ""), self)
             raise
