@@ -18,7 +18,7 @@ from imutool.training.settings import settings_of
 
 TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
-BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: at least seven there
+BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
 
 
 def saved(folder: Path, kind: Kind, first: int, durations_s: tuple[float, ...]) -> list[Path]:
