@@ -207,7 +207,8 @@ class RecoveredIndex(LogIndex):
         dropped = {id(block) for block, _ in scan.doubtful}
         for block, gap in scan.doubtful:
             gap.length = max(gap.length, block.offset + block.length - gap.offset)
-            gap.counts.update({} if gap.counted else block.counts or {})
+            if not gap.counted:
+                gap.counts.update(block.counts or {})
         self.items = [item for item in self.items if id(item) not in dropped]
 
     def _found_in(self, block: MessageBlock) -> messages.Messages:
