@@ -278,8 +278,7 @@ class _Search:
         log_p = self.candidates.log_p(effect, gain)
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
-        parts, block_s = ((fitted, "held_out"), (other, "fitted")), self.settings.held_out_block_s
-        blocks = np.concatenate([held_out_gains(log, of, k, part, block_s) for of, part in parts for log in self.logs])
+        blocks = np.concatenate([held_out_gains(fitted, k, "held_out"), held_out_gains(other, k, "fitted")])
         exact_p = prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
         held_out_p = min(held_out_p_value(blocks[:, 0]), exact_p)
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
