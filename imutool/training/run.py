@@ -169,7 +169,7 @@ def _drift_first(
 
     def physics_of(**effects: Sequence[str]) -> PhysicsFirst:
         alone = msgspec.structs.replace(settings, model={"accel_effects": (), **effects})
-        return PhysicsFirst.of(recordings, alone, descent.device, descent.say)
+        return PhysicsFirst.of(recordings, alone, descent.device, lambda epoch: None)
 
     loads = settings.model.get("loads")
     if loads is None:
