@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
 from typing import Any, NamedTuple
@@ -164,18 +164,16 @@ def different(definitions: Iterable[Any]) -> Iterator[Any]:
 
 
 def renumber(
-    recordings: Sequence[Recording], carried: Collection[tuple[int, int]], losses: Losses
+    recordings: Sequence[Recording], blocks: Iterable[MessageBlock], losses: Losses
 ) -> tuple[dict[int, Schema], dict[int, Channel]]:
     """Schemas and channels of the whole file; the first recording keeps its ids.
-
-    `carried` are the channels with messages, each with its recording's number.
 
     Raises:
         LogError: no id is left.
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    _name_topics(recordings, carried)
+    _name_topics(recordings, blocks)
     for recording in recordings:
         first = recording is recordings[0]
         placed = {
@@ -192,8 +190,9 @@ def renumber(
     return schemas, channels
 
 
-def _name_topics(recordings: Sequence[Recording], carried: Collection[tuple[int, int]]) -> None:
+def _name_topics(recordings: Sequence[Recording], blocks: Iterable[MessageBlock]) -> None:
     """Gives a channel another topic if its own carries another type; one without messages gives way."""
+    carried = {(block.recording, channel) for block in blocks for channel in block.counts or ()}
     types: dict[str, tuple[str, str]] = {}
     every = [(number, local) for number, recording in enumerate(recordings) for local in sorted(recording.readable())]
     for number, local in sorted(every, key=lambda place: place not in carried):

@@ -188,8 +188,7 @@ class RecoveredIndex(LogIndex):
         self.recordings.assign([e for e in scan.events if not isinstance(e, ScannedBlock) or id(e.block) in kept])
         self.recordings.drop_copies([e for e in scan.events if isinstance(e, ScannedBlock)])
         self._search_definitions(scan)
-        carried = {(block.recording, channel) for block in self.blocks for channel in block.counts or ()}
-        self.schemas, self.channels = renumber(self.recordings.each, carried, self.losses)
+        self.schemas, self.channels = renumber(self.recordings.each, self.blocks, self.losses)
         self.losses.unchecked_topics = unproven_topics(self.recordings.each)
         for gap in really_lost(scan, self.blocks, summaries, self.losses):
             self._add_gap(gap)
@@ -208,7 +207,8 @@ class RecoveredIndex(LogIndex):
         dropped = {id(block) for block, _ in scan.doubtful}
         for block, gap in scan.doubtful:
             gap.length = max(gap.length, block.offset + block.length - gap.offset)
-            gap.counts.update({} if gap.counted else block.counts or {})
+            if not gap.counted:
+                gap.counts.update(block.counts or {})
         self.items = [item for item in self.items if id(item) not in dropped]
 
     def _found_in(self, block: MessageBlock) -> messages.Messages:

@@ -14,6 +14,7 @@ import zstandard
 from mcap.records import Channel, Schema
 from support.log_damage import by_mcap, stretches
 
+from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
@@ -190,7 +191,8 @@ def test_a_topic_stays_with_the_messages_that_are_on_it() -> None:
     imu, pose = Schema(3, b"", "ros2msg", schemas.IMU), Schema(4, b"", "ros2msg", schemas.POSE)
     empty = Recording(0, {3: imu}, {3: Channel(3, "/pose", "cdr", {}, 3)})
     full = Recording(9, {4: pose}, {4: Channel(4, "/pose", "cdr", {}, 4)})
-    kinds, channels = renumber([empty, full], {(1, 4)}, losses := Losses())
+    block = MessageBlock(0, 0, 0, 0, 0, None, counts={4: 1}, recording=1)
+    kinds, channels = renumber([empty, full], [block], losses := Losses())
     assert {(c.topic, kinds[c.schema_id].name) for c in channels.values()} == {("/pose", pose.name), ("/pose_2", imu.name)}
     assert [empty.renamed, full.renamed, empty.moved] == [{3: "/pose_2"}, {}, True]
     assert any("/pose has two types" in line for line in describe(losses.plain()))
