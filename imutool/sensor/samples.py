@@ -83,7 +83,10 @@ class Sampler:
 
 
 class Recent:
-    """The last few arrays that were made from others, by the objects they were made from; they are read-only."""
+    """The last few arrays that were made from others, by the objects they were made from.
+
+    They are read-only.
+    """
 
     def __init__(self) -> None:
         self._known: tuple[tuple[Any, object, Columns], ...] = ()
@@ -94,7 +97,10 @@ class Recent:
         return self._kept(of, at, make()) if value is None else value
 
     def changed(self, x: Columns, by: object, change: Callable[[Columns], Columns]) -> Columns:
-        """Columns behind a change of each by itself, which `by` stands for; those that were changed before come from there."""
+        """Columns behind a change of each by itself, which `by` stands for.
+
+        Columns that were changed before, in this array or in another, are taken from there.
+        """
         value = self._of(x, by)
         if value is not None:
             return value

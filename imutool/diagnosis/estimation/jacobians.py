@@ -26,7 +26,7 @@ Chosen = tuple[tuple[Effect, Theta], ...]
 
 
 class AddedColumns(ABC):
-    """Forward model that adds columns of its own, times the parameters, to one axis: they are its derivatives."""
+    """Forward model of columns on one axis, times the parameters: they are its derivatives."""
 
     sensor: int
     axis: int

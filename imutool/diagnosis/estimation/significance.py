@@ -67,7 +67,7 @@ def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
 
 
 def held_out_gains(fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
-    """Gain in squares by an effect, and squares of its prediction, on held-out blocks of all logs."""
+    """Gain in squares by an effect, and squares of its prediction, on held-out blocks."""
     others, out = (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), []
     block_s = fitted.logs[0].pair.settings.search.held_out_block_s
     for log, forward in zip(fitted.logs, fitted.passes, strict=True):

@@ -154,7 +154,10 @@ class SplineCurve(SplineBasis, ABC):
 
 
 class Curve(AddedColumns, SplineCurve):
-    """+ a spline of one variable on one axis of an IMU; curves of one variable share their splines."""
+    """+ a spline of one variable on one axis of an IMU.
+
+    Curves of one variable share their splines.
+    """
 
     def __init__(self, variable: str, sensor: int, axis: int, splines: SplineBasis) -> None:
         super().__init__(variable, unit(variable), splines.inner, columns=len(AXES), axis=axis)
