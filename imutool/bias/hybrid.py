@@ -97,7 +97,7 @@ class Model(BiasModel):
             values, vectors = np.linalg.eigh(self.tensors[f"covariance_{sensor}"])
             root = vectors * np.sqrt(np.maximum(values, 0.0))
             roots[sensor] = patterns(self.effects[sensor]) @ root
-        filter_ = SignalFilter(self.rate_hz)
+        filter_ = SignalFilter(self.rate_hz, max(self._compiled(sensor).wanted for sensor in SENSORS))
 
         def root_at(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
@@ -136,6 +136,11 @@ class _Stream:
     def rest(self) -> Vector6:
         """Latest rest bias."""
         return self._rest if self._ode is None else self._ode.rest
+
+    def continue_from(self, before: Stream) -> None:
+        """Go on with the load of the stretch before a gap."""
+        if isinstance(before, _Stream):
+            self._signals.continue_load(before._signals)
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]

@@ -84,6 +84,14 @@ class DriftStream(SampleStream, Protocol):
 
 
 @runtime_checkable
+class StretchedStream(Stream, Protocol):
+    """Bias stream with slow states that outlast a gap."""
+
+    def continue_from(self, before: Stream) -> None:
+        """Take over the states of the stream of the stretch before."""
+
+
+@runtime_checkable
 class CovarianceModel(Protocol):
     """Roots S of the covariance S S^T of the motion-dependent bias, by sensor.
 
@@ -213,7 +221,9 @@ class _Stretches:
 
     def _begin(self) -> None:
         self._rest = getattr(self._stream, "rest", self._rest)
-        self._stream = self._model.stretch(self._rest, self._start_s)
+        before, self._stream = self._stream, self._model.stretch(self._rest, self._start_s)
+        if isinstance(self._stream, StretchedStream):
+            self._stream.continue_from(before)
         self._one = getattr(self._stream, "one", None)
 
 

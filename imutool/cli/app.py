@@ -17,7 +17,7 @@ from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
-from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, with_flags
+from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.mcap_io.storage import outputs
@@ -104,6 +104,15 @@ class Command(TyperCommand):
     def get_params(self, ctx: Any) -> list[Any]:
         """Parameters with --help; they convert texts and paths by themselves."""
         return [PlainValue.into(parameter) for parameter in super().get_params(ctx)]
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the words of the command line; an option that only other commands have is answered with this command's."""
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:  # click's own kinds of error are not exported by typer
+            if hasattr(error, "possibilities"):
+                error.possibilities = instead_of(getattr(error, "option_name", ""), self)
+            raise
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command.

@@ -34,6 +34,16 @@ ALIASES = {
     "settings": ("config",),
     "signals": ("signal",),
 }
+# What a user types whom another command, or another tool, has taught; and what serves that purpose, if a command has it.
+TAUGHT_ELSEWHERE = (
+    (("--output", "--out", "-o"), ("--output", "OUT")),
+    (("--report", "--html", "--page", "--png"), ("--report", "--html", "--png", "--output")),
+    (("--force", "--yes", "-f", "-y"), ("--overwrite",)),
+    (("--start",), ("--init",)),
+    (("--topic",), ("--imu",)),
+    (("--jobs", "-j"), ("--workers",)),
+)
+LIKE = 0.75  # of a misspelt option to the one that is meant, by difflib
 current: ContextVar[Mapping[str, str]] = ContextVar("flags of the command that runs", default={})  # noqa: B039  never changed
 QUOTED = re.compile(r"`([a-z_]+)(?:=([^`]*))?`")
 PLACE = re.compile(r"([a-z_]+)(?:=(\S*))?")
@@ -51,6 +61,17 @@ def flags(command: Any) -> dict[str, str]:
         if flag is not None:
             flag_of.setdefault(name, flag)
     return flag_of
+
+
+def instead_of(option: str, command: Any) -> list[str]:
+    """What a click command has for the purpose of an option that it lacks."""
+    from difflib import get_close_matches  # every command would pay for it at its start
+
+    own = [_flag(parameter) for parameter in command.params]
+    meant = [word for typed, answers in TAUGHT_ELSEWHERE if option in typed for word in answers if word in own]
+    return ["OUT as a word without a flag" if word == "OUT" else word for word in meant] or get_close_matches(
+        option, own, cutoff=LIKE
+    )
 
 
 def _flag(parameter: Any) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.sensor.effect import CompiledEffect, Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import IdealMotion, SensorSamples
-from imutool.sensor.signals import COUNT, Signals
+from imutool.sensor.signals import COUNT, LOAD, Signals
 from imutool.units import Sensor, Three
 
 # Size of the parameters with which `forward` is asked for an error: beside that error the reading is lost in rounding, and to
@@ -105,15 +105,14 @@ class LinearForm:
 class CompiledEffects:
     """Several effects for given parameters: one matrix on all columns, and effects without one."""
 
-    matrix: Float64[np.ndarray, "27 3"]
+    matrix: Float64[np.ndarray, "60 3"]
     others: tuple[CompiledEffect, ...]
 
     @property
     def wanted(self) -> int:
-        """How many of the signals' columns they need."""
-        if self.others:
-            return COUNT
-        return int(np.flatnonzero(self.matrix.any(axis=1)).max(initial=-1)) + 1
+        """How many of the signals' columns they need: effects without a matrix all but the load."""
+        own = int(np.flatnonzero(self.matrix.any(axis=1)).max(initial=-1)) + 1
+        return max(own, LOAD.start) if self.others else own
 
     def __call__(self, signals: Signals) -> Float64[np.ndarray, "n 3"]:
         """The error at each sample of a block."""

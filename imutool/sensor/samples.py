@@ -195,6 +195,14 @@ class SensorSamples:
         rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
         return SignalFilter(float(rate_hz), FILTERED.stop)(self.stamp_s, self.gyro, self.accel)
 
+    @cached_property
+    def load(self) -> Float64[np.ndarray, "n 3 11"]:
+        """States of a slow drift (`Signals.load`), which only it needs."""
+        if self.online is not None:
+            return self.online.load
+        rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
+        return SignalFilter(float(rate_hz))(self.stamp_s, self.gyro, self.accel).load
+
     @classmethod
     def joined(cls, parts: Sequence[SensorSamples]) -> SensorSamples:
         """Several stretches end to end; the attitude only where all of them have one."""

@@ -5,6 +5,10 @@ samples: over the lag behind a ramp, a little less than tau, so that a ramp's sl
 A row depends on its sample and earlier ones alone, and not on the blocks in which samples arrive. The filters start settled at
 the first sample. They count samples: over a gap they stand still. The derivatives divide by the difference of the stamps, and
 by no less than a tenth of a period.
+
+The *load* of a sensor is what may warm or strain it: that it is on, how fast it turns, how it shakes, how far the force is from
+gravity. Slow filters of it are the states of a drift, dz/dt = (g(u) - z) / tau, zero (a cold sensor) at the first sample.
+Ramps between knots make up g: a sum of them imitates any monotone dependence, and is constant beyond the last knot.
 """
 
 from __future__ import annotations
@@ -27,7 +31,16 @@ BLOCK = 64  # samples of a matrix product in `low_pass`
 GYRO, ACCEL, SAMPLES = slice(0, 3), slice(3, 6), slice(0, 6)
 GYRO_SLOW, ACCEL_SLOW, SLOW, TURN, VIBRATION = slice(6, 9), slice(9, 12), slice(6, 12), slice(12, 15), slice(15, 18)
 FILTERED = slice(6, 18)
-GYRO_DOT, ACCEL_DOT, DOTS, ALPHA, COUNT = slice(18, 21), slice(21, 24), slice(18, 24), slice(24, 27), 27
+GYRO_DOT, ACCEL_DOT, DOTS, ALPHA = slice(18, 21), slice(21, 24), slice(18, 24), slice(24, 27)
+
+LOAD_TAU_S = np.array([5.0, 20.0, 80.0])  # a response in between is a sum of two of them, right within 3 % of its size
+G_M_S2 = 9.81
+TURNING_RAD_S = np.array([0.0, 0.3, 0.7, 1.5, 3.0])  # knots of the ramps
+SHAKING_M_S2 = np.array([0.0, 0.5, 2.0, 6.0])
+RAMPS = (len(TURNING_RAD_S) - 1, len(SHAKING_M_S2) - 1)
+LOADS = 1 + RAMPS[0] + 2 * RAMPS[1]
+LOAD = slice(27, 27 + len(LOAD_TAU_S) * LOADS)  # the loads behind the first filter, then behind the next
+COUNT = LOAD.stop
 
 Vectors = Float64[np.ndarray, "n 3"]
 
@@ -37,7 +50,7 @@ class Signals:
     """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
 
     t_s: Float64[np.ndarray, " n"]
-    columns: Float64[np.ndarray, "n 27"]
+    columns: Float64[np.ndarray, "n 60"]
 
     @property
     def gyro(self) -> Vectors:
@@ -74,6 +87,11 @@ class Signals:
         """Power of the force above 1.6 Hz over half a second."""
         return self.columns[:, VIBRATION]
 
+    @property
+    def load(self) -> Float64[np.ndarray, "n 3 11"]:
+        """States of a slow drift, by time constant and load."""
+        return self.columns[:, LOAD].reshape(-1, len(LOAD_TAU_S), LOADS)
+
     def rows(self, rows: slice | np.ndarray) -> Signals:
         """The signals of some rows."""
         return Signals(self.t_s[rows], self.columns[rows])
@@ -86,8 +104,9 @@ class SignalFilter:
     """
 
     def __init__(self, rate_hz: float, wanted: int = COUNT) -> None:
-        self._filters, self._derives = wanted > FILTERED.start, wanted > DOTS.start
+        self._filters, self._derives, self._loads = (wanted > part.start for part in (FILTERED, DOTS, LOAD))
         self._gain = -np.expm1(-1.0 / (rate_hz * TAU_S))
+        self._load_gain = -np.expm1(-1.0 / (rate_hz * LOAD_TAU_S))[:, None]
         self._period_s = 1.0 / rate_hz
         self._lag_s = self._period_s / math.expm1(self._period_s / TURN_S)
         self._lead = np.full(3, (1.0 / self._gain[6] - 1.0) / self._lag_s)  # from the filter's last step to what it lags by
@@ -98,6 +117,7 @@ class SignalFilter:
         self._gyro, self._slow, self._turn, self._power = row[GYRO], row[SLOW], row[TURN], row[VIBRATION]
         self._step, self._step_slow, self._step_turn, self._step_power = step, step[:6], step[6:9], step[9:]
         self._fast = step[3:6]  # the force without its mean, until it is a step
+        self._load = row[LOAD].reshape(len(LOAD_TAU_S), LOADS)
 
     def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Signals:
         """The signals at each sample of a block."""
@@ -109,7 +129,7 @@ class SignalFilter:
             self._many(t_s, columns)
         return Signals(t_s, columns)
 
-    def one(self, t_s: float, u: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "27"]:
+    def one(self, t_s: float, u: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "60"]:
         """Columns at one sample, in a row that the next call overwrites; 10 times faster."""
         if math.isnan(self._t_s):
             self._begin(t_s, u)
@@ -121,6 +141,8 @@ class SignalFilter:
             step, power = self._step, self._step_power
             np.subtract(u, self._slow, self._step_slow)
             np.subtract(self._gyro, self._turn, self._step_turn)
+            if self._loads:
+                self._load += self._load_gain * (_loads(self._gyro[None], u[None, 3:], self._fast[None]) - self._load)
             np.multiply(self._fast, self._fast, power)
             power -= self._power
             step *= self._gain
@@ -130,7 +152,7 @@ class SignalFilter:
         self._t_s = t_s
         return self._row
 
-    def _many(self, t_s: Float64[np.ndarray, " n"], columns: Float64[np.ndarray, "n 27"]) -> None:
+    def _many(self, t_s: Float64[np.ndarray, " n"], columns: Float64[np.ndarray, "n 60"]) -> None:
         u, gyro, gain = columns[:, SAMPLES], columns[:, GYRO], self._gain
         if math.isnan(self._t_s):
             self._begin(float(t_s[0]), u[0])
@@ -139,18 +161,40 @@ class SignalFilter:
             columns[:, TURN] = low_pass(gyro, gain[6], self._turn)
             # the mean before the sample: one filter waits for none
             around = np.concatenate([self._slow[None, 3:], slow[:-1, 3:]])
-            columns[:, VIBRATION] = low_pass((columns[:, ACCEL] - around) ** 2, gain[9], self._power)
+            fast = columns[:, ACCEL] - around
+            columns[:, VIBRATION] = low_pass(fast**2, gain[9], self._power)
+        if self._loads:
+            load = _loads(gyro, columns[:, ACCEL], fast)
+            states = [low_pass(load, gain, state) for gain, state in zip(self._load_gain.flat, self._load, strict=True)]
+            columns[:, LOAD] = np.concatenate(states, axis=1)
         if self._derives:
             step_s = np.maximum(np.diff(t_s, prepend=self._t_s), self._least_s)[:, None]
             columns[:, DOTS] = np.diff(u, axis=0, prepend=self._u[None]) / step_s
             columns[:, ALPHA] = (gyro - columns[:, TURN]) / self._lag_s
         self._row[:], self._t_s = columns[-1], float(t_s[-1])
 
+    def continue_load(self, before: SignalFilter) -> None:
+        """Go on with the load of another filter, over a gap in which a sensor neither warms nor cools."""
+        self._load[:] = before._load
+
     def _begin(self, t_s: float, u: Float64[np.ndarray, "6"]) -> None:
         """Start settled at the first sample."""
         self._t_s, self._u[:] = t_s - self._period_s, u
         if self._filters:
             self._slow[:], self._turn[:] = u, self._gyro
+
+
+def _loads(gyro: Vectors, accel: Vectors, fast: Vectors) -> Float64[np.ndarray, "n 11"]:
+    """Loads between zero and one: on, turning, shaking (force without its mean), and force other than gravity's."""
+    turning, size, shaking = (np.sqrt(np.einsum("ij,ij->i", x, x)) for x in (gyro, accel, fast))
+    on = np.ones((len(gyro), 1))
+    ramps = (_ramps(turning, TURNING_RAD_S), _ramps(shaking, SHAKING_M_S2), _ramps(np.abs(size - G_M_S2), SHAKING_M_S2))
+    return np.concatenate([on, *ramps], axis=1)
+
+
+def _ramps(x: Float64[np.ndarray, " n"], knots: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "n j"]:
+    """How far each sample is from each knot to the next, between zero and one."""
+    return np.asarray(np.clip((x[:, None] - knots[:-1]) / np.diff(knots), 0.0, 1.0))
 
 
 def low_pass(x: Float64[np.ndarray, "n k"], gain: float, before: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "n k"]:

@@ -43,6 +43,7 @@ from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
 LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
+DRIFTS = {"gyro_warm_up": 0.3, "gyro_rate_load": 0.3, "gyro_force_load": 0.3}  # likewise: many parameters that look alike
 TINY = 1e-12  # of a loss, whose unit is a window's noise
 LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
@@ -156,13 +157,13 @@ def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> di
     while True:
         left = [effect.name for effect in effects if effect.name not in gains]
         tried = {name: problem.predicted(parameter_columns(effects, [*gains, name])) for name in left}
-        helped = {name: new for name, new in tried.items() if bool((new < loss).sum() > 0.5 * len(loss))}
+        enough = {name: new for name, new in tried.items() if _gain(new, loss) >= DRIFTS.get(name, LEAST_GAIN)}
+        helped = {name: new for name, new in enough.items() if bool((new < loss).sum() > 0.5 * len(loss))}
         agreed = {name: new for name, new in helped.items() if _beyond_chance(problem, effects, [*gains, name])}
         best = max(agreed, key=lambda name: _gain(agreed[name], loss), default="")
-        gain = _gain(agreed[best], loss) if best else 0.0
-        if gain < LEAST_GAIN:
+        if not best:
             break
-        gains[best], loss = gain, agreed[best]
+        gains[best], loss = _gain(agreed[best], loss), agreed[best]
     imitated = {CONTAINED[name] for name in gains if name in CONTAINED}
     for name in (form.name for form in effects if form.name in LINEAR[form.sensor] and form.name not in {*gains, *imitated}):
         new = problem.predicted(parameter_columns(effects, [*gains, name]))

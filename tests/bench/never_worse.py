@@ -14,11 +14,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from support.switchings_on import DRIFTING, Switchings, log
+from support.switchings_on import Switchings, log
 
 from imutool.config import load
 from imutool.evaluation import evaluate
@@ -38,13 +37,11 @@ def main() -> None:
     parser.add_argument("--sensors", type=int, default=1)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--scale", type=float, default=0.005)
-    parser.add_argument("--drifting", action="store_true", help="A gyro whose bias follows the load with a lag of 10 s.")
     parser.add_argument("--large", action="store_true", help="Logs of two minutes with a minute of rest, at 200 Hz.")
     options = parser.parse_args()
     large = {"rest_s": 60.0, "duration_s": 120.0, "rate_hz": 200.0} if options.large else {}
     for sensor in range(options.first, options.first + options.sensors):
         kind = Switchings(sensor_seed=sensor, scale=options.scale, **large)
-        kind = msgspec.structs.replace(DRIFTING, sensor_seed=sensor) if options.drifting else kind
         with tempfile.TemporaryDirectory() as folder:
             score(Path(folder), kind, options.method or ["linear", "hybrid"], options.set)
 

@@ -216,6 +216,18 @@ def test_the_context_is_as_long_as_the_filters_remember(build: MakeModel, segmen
     assert build("hybrid").context == 0, "without effects there is nothing to remember"
 
 
+def test_the_load_outlasts_a_gap(build: MakeModel, segment: MakeSegment) -> None:
+    """A drift of minutes does not begin anew where the samples of some seconds are missing."""
+    names: dict[Sensor, tuple[str, ...]] = {"gyro": ("gyro_warm_up", "gyro_rate_load"), "accel": ()}
+    model, seen = model_of(build, names, remainder=False).frozen(), segment(33, 1, 2000)
+    t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
+    rest, late = np.zeros(6), t + 5.0 * (t >= t[1000])
+    whole, stream = model.stream(rest)(t, gyro, accel), model.stream(rest)
+    np.testing.assert_allclose(stream(late, gyro, accel), whole, rtol=0, atol=SAME)
+    fresh = model.stream(rest)(t[1000:], gyro[1000:], accel[1000:])
+    assert np.abs(fresh - whole[1000:]).max() > 1e-4, "the load must matter for this test to mean anything"
+
+
 def test_it_does_not_start_from_a_matrix(build: MakeModel) -> None:
     with pytest.raises(ConfigError, match=r"does not start from a matrix.*imutool.training.run.train"):
         build("hybrid").begin_at("gyro", torch.eye(3, dtype=torch.float64))

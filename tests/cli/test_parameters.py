@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,12 @@ import typer
 
 from imutool import cli
 from imutool.cli import overview
-from imutool.cli.parameters import error_with_flags, flags, with_flags
+from imutool.cli.parameters import error_with_flags, flags, instead_of, with_flags
 from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 
+Run = Callable[..., subprocess.CompletedProcess[str]]
 COMMANDS = typer.main.get_command(cli.load()).commands  # type: ignore[attr-defined]
 
 
@@ -27,6 +29,30 @@ def test_the_page_of_help_lists_every_command_with_its_own_words(capsys: pytest.
     overview.show()
     shown = capsys.readouterr().out
     assert all(name in shown for name in own)
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "answer"),
+    [
+        ("diagnose", "--html", ["--output"]),
+        ("evaluate", "--html", ["--report"]),
+        ("view", "--report", ["--html", "--png"]),
+        ("debias", "-o", ["OUT as a word without a flag"]),
+        ("convert", "--force", ["--overwrite"]),
+        ("debias", "--overwite", ["--overwrite"]),
+        ("info", "--html", []),
+    ],
+)
+def test_an_option_of_another_command_is_answered_with_this_ones(command: str, typed: str, answer: list[str]) -> None:
+    assert instead_of(typed, COMMANDS[command]) == answer
+
+
+def test_a_wrong_option_is_told_with_what_serves_its_purpose(tmp_path: Path, imutool: Run) -> None:
+    done = imutool("repair", "in.mcap", "-o", "out.mcap", cwd=tmp_path)
+    assert (
+        done.returncode,
+        "OUT as a word without a flag" in done.stderr.replace("│", " ").replace("\n", " ").replace("  ", " "),
+    ) == (2, True)
 
 
 def test_help_and_a_command_import_what_they_need() -> None:

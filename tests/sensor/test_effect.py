@@ -169,7 +169,12 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
     expected |= {"clock_offset", "clock_skew", "clock_jump", "saturation", "quantization", "earth_rotation", "vibration"}
     expected |= {"temperature", "vibration_rectification"}
     assert {one.name for one in catalogue.diagnosed()} == expected
-    assert {one.name for one in catalogue.effects()} == expected | {"rate_curve"}
+    assert {one.name for one in catalogue.effects()} == expected | {
+        "rate_curve",
+        "gyro_warm_up",
+        "gyro_rate_load",
+        "gyro_force_load",
+    }
 
 
 def test_names_pick_some_and_a_wrong_one_suggests_the_nearest() -> None:

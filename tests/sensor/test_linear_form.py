@@ -14,7 +14,7 @@ from imutool.sensor.effects.gyro_bias_drift import TRAINING_TAU_S
 from imutool.sensor.effects.rate_curve import KNOTS_RAD_S, NONZERO, hats
 from imutool.sensor.linear_form import LinearForm, compiled, patterns
 from imutool.sensor.made_up_flight import trajectory
-from imutool.sensor.signals import ACCEL, ALPHA, COUNT, GYRO, GYRO_SLOW, SignalFilter, Signals
+from imutool.sensor.signals import ACCEL, ALPHA, COUNT, GYRO, GYRO_SLOW, LOAD, LOAD_TAU_S, LOADS, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 
 RATE_HZ = 200.0
@@ -35,7 +35,7 @@ CATALOGUE = {
     "lever_arm": (3, "m"),
     "clock_offset": (1, "s"),
 }
-ONLY_OURS = {"rate_curve", "vibration_rectification"}
+ONLY_OURS = {"rate_curve", "vibration_rectification", "gyro_warm_up", "gyro_rate_load", "gyro_force_load"}
 
 
 def lively(n: int = 200) -> Signals:
@@ -138,9 +138,10 @@ def test_samples_alone_need_no_filters_and_no_effect_needs_nothing() -> None:
             catalogue.trained("gyro", ["gyro_scale", "gyro_g_sensitivity"]),
             catalogue.trained("accel", ["vibration_rectification"]),
             catalogue.trained("gyro", ["gyro_scale", "rate_curve"]),
+            catalogue.trained("gyro", ["gyro_force_load"]),
         )
     ]
-    assert wanted == [3, 6, 18, COUNT]
+    assert wanted == [3, 6, 18, LOAD.start, COUNT]
     assert compiled([], np.zeros(0)).wanted == 0
 
 
@@ -223,6 +224,33 @@ def test_g_sensitivity_and_rectification_are_full_matrices_row_by_row() -> None:
     for name, u in (("gyro_g_sensitivity", signals.accel), ("vibration_rectification", signals.vibration)):
         (effect,) = catalogue.trained("gyro", [name])
         close(effect.compiled(G.ravel())(signals), u @ G.T)
+
+
+def test_a_load_drift_is_the_answer_of_a_slow_ode_to_the_load() -> None:
+    """At rest, then at a steady rate: K g (1 - exp(-t/tau)) for each time constant, g the ramps that the rate has passed."""
+    t_s = np.arange(6000) / RATE_HZ
+    rate = np.zeros((6000, 3))
+    rate[1000:, 1] = 0.5  # halfway up the second ramp, from 0.3 to 0.7
+    signals = SignalFilter(RATE_HZ)(t_s, rate, np.tile([0.0, 0.0, 9.81], (6000, 1)))
+    (effect,) = catalogue.trained("gyro", ["gyro_rate_load"])
+    theta = np.random.default_rng(0).normal(size=len(effect.parameters))
+    K = theta.reshape(3, len(LOAD_TAU_S), -1)
+    since_s = np.clip(t_s - 5.0 + 1.0 / RATE_HZ, 0.0, None)[:, None]
+    z = -np.expm1(-since_s / LOAD_TAU_S)
+    expected = np.einsum("nk,ik->ni", z, K[:, :, 0] + 0.5 * K[:, :, 1])
+    np.testing.assert_allclose(effect.compiled(theta)(signals), expected, rtol=0, atol=1e-12)
+
+
+def test_a_warm_up_of_any_time_constant_is_a_sum_of_those_given() -> None:
+    t_s = np.arange(12000) / 100.0
+    still = np.zeros((12000, 3))
+    z = SignalFilter(100.0)(t_s, still, still + np.array([0.0, 0.0, 9.81])).load[:, :, 0]
+    assert z.shape[1] < LOADS
+    for tau_s in (8.0, 12.0, 30.0, 45.0, 60.0):
+        course = np.exp(-t_s / tau_s)
+        columns = np.concatenate([z, np.ones((len(z), 1))], axis=1)
+        off = columns @ np.linalg.lstsq(columns, course, rcond=None)[0] - course
+        assert np.abs(off[100:]).max() < 0.03
 
 
 def test_a_clock_offset_moves_the_samples_in_time() -> None:

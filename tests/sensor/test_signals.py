@@ -56,7 +56,7 @@ def test_one_sample_at_a_time_is_the_block() -> None:
     close(in_blocks(list(range(1, 400)), *seen), in_blocks([], *seen))
 
 
-@pytest.mark.parametrize(("wanted", "made"), [(0, 6), (6, 6), (7, 18), (18, 18), (19, COUNT), (COUNT, COUNT)])
+@pytest.mark.parametrize(("wanted", "made"), [(0, 6), (6, 6), (7, 18), (18, 18), (19, 27), (27, 27), (28, COUNT)])
 @pytest.mark.parametrize("cuts", [[], list(range(1, 60)), [0, 7, 8, 9, 40]])
 def test_what_nobody_wants_is_left_at_zero_and_the_rest_is_the_same(wanted: int, made: int, cuts: list[int]) -> None:
     t_s, gyro, accel = samples(6, 60)
@@ -160,3 +160,16 @@ def test_columns_have_names() -> None:
     for name, place in zip(names, places, strict=True):
         np.testing.assert_array_equal(getattr(signals, name), columns[:, place])
     assert signals.rows(np.array([0, 0])).columns.shape == (2, COUNT)
+
+
+def test_the_load_of_a_filter_goes_on_in_another() -> None:
+    """As after a gap: the quick filters begin anew, the load does not cool."""
+    t_s, gyro, accel = samples(8, 900)
+    first, second, cold = SignalFilter(RATE_HZ), SignalFilter(RATE_HZ), SignalFilter(RATE_HZ)
+    before = first(t_s[:600], gyro[:600], accel[:600]).load
+    second.continue_load(first)
+    after = second(t_s[600:], gyro[600:], accel[600:]).load
+    whole = in_blocks([], t_s, gyro, accel)
+    np.testing.assert_allclose(after[:, :, 0], Signals(t_s[600:], whole[600:]).load[:, :, 0], rtol=0, atol=1e-12)
+    assert np.abs(after[0] - before[-1]).max() < 2e-3
+    assert np.abs(cold(t_s[600:], gyro[600:], accel[600:]).load[0]).max() < 2e-3

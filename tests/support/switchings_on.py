@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from imutool.config import Settings
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import ACCEL, EPOCH_NS, GYRO, flight
 
-HALF_LOAD_RAD_S = 0.7
 DAY_NS, TEN_MINUTES_NS = 86_400_000_000_000, 600_000_000_000
 
 
@@ -35,8 +32,6 @@ class Switchings(Settings, frozen=True, kw_only=True):
     rate_hz: float = 100.0
     attitude_knot_s: float = 0.35
     turn_rad: float = 0.5  # change of heading from knot to knot
-    load_rad_s: float = 0.0  # gyro bias under full load, reached with a lag of `load_lag_s`
-    load_lag_s: float = 10.0
 
 
 def log(seed: int, switching: int, kind: Switchings | None = None) -> Recording:
@@ -61,35 +56,11 @@ def log(seed: int, switching: int, kind: Switchings | None = None) -> Recording:
     )
     once, own = np.random.default_rng([switching, 1]), np.random.default_rng([seed, 2])
     bias = np.concatenate([kind.turn_on_rad_s * once.normal(size=3), kind.turn_on_m_s2 * once.normal(size=3)])
-    drift = _under_load(exact.imu.gyro, kind)
     shift_ns = EPOCH_NS + DAY_NS * switching + TEN_MINUTES_NS * seed - int(exact.imu.t_ns[0])
-    imu = Imu(exact.imu.t_ns + shift_ns, exact.imu.gyro + bias[:3] + drift, exact.imu.accel + bias[3:])
+    imu = Imu(exact.imu.t_ns + shift_ns, exact.imu.gyro + bias[:3], exact.imu.accel + bias[3:])
     mount = Rotation.from_rotvec(kind.mount_rad * own.normal(size=3))
     truth = exact.truth
     turned = (Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * mount).as_quat(scalar_first=True)
     clock_ns = round(1e9 * kind.clock_s * own.normal())
     poses = Poses(truth.t_ns + shift_ns + clock_ns, truth.p_wb, np.ascontiguousarray(turned), truth.v_w)
     return Recording(f"switching_{switching}_log_{seed}", imu, {"/ground_truth/pose": poses})
-
-
-DRIFTING = Switchings(
-    turn_on_rad_s=0.002,
-    mount_rad=0.0,
-    clock_s=0.0,
-    rest_s=5.0,
-    duration_s=100.0,
-    attitude_knot_s=1.5,
-    turn_rad=1.5,
-    load_rad_s=0.01,
-)
-
-
-def _under_load(gyro: Float64[np.ndarray, "n 3"], kind: Switchings) -> Float64[np.ndarray, "n 3"]:
-    """Gyro bias of a sensor that its own motion warms: dx/dt = (w^2 / (w^2 + `HALF_LOAD`^2) - x) / lag, from cold."""
-    if not kind.load_rad_s:
-        return np.zeros_like(gyro)
-    square = (gyro**2).sum(axis=1)
-    keep = np.exp(-1.0 / (kind.rate_hz * kind.load_lag_s))
-    warmth = lfilter([1.0 - keep], [1.0, -keep], square / (square + HALF_LOAD_RAD_S**2))
-    axes = np.random.default_rng([kind.sensor_seed, 3]).normal(size=3)
-    return np.asarray(warmth[:, None] * kind.load_rad_s * axes / np.linalg.norm(axes))

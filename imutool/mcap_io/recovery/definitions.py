@@ -66,7 +66,7 @@ class Recording:
     sizes: dict[int, tuple[int, int]] = field(default_factory=dict)  # the shortest and the longest message of a channel
     samples: dict[int, MessageBlock] = field(default_factory=dict)  # a block with messages of a channel
     habits: Habits = NO_HABITS  # of its writer
-    renamed: dict[str, str] = field(default_factory=dict)  # topics that carry another type elsewhere
+    renamed: dict[int, str] = field(default_factory=dict)  # topics of channels whose own carries another type
 
     def known(self, opcode: int) -> dict[int, Any]:
         """Its schemas or its channels, by the opcode of their records."""
@@ -163,7 +163,9 @@ def different(definitions: Iterable[Any]) -> Iterator[Any]:
             yield record
 
 
-def renumber(recordings: Sequence[Recording], losses: Losses) -> tuple[dict[int, Schema], dict[int, Channel]]:
+def renumber(
+    recordings: Sequence[Recording], blocks: Iterable[MessageBlock], losses: Losses
+) -> tuple[dict[int, Schema], dict[int, Channel]]:
     """Schemas and channels of the whole file; the first recording keeps its ids.
 
     Raises:
@@ -171,6 +173,7 @@ def renumber(recordings: Sequence[Recording], losses: Losses) -> tuple[dict[int,
     """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
+    _name_topics(recordings, blocks)
     for recording in recordings:
         first = recording is recordings[0]
         placed = {
@@ -178,23 +181,29 @@ def renumber(recordings: Sequence[Recording], losses: Losses) -> tuple[dict[int,
         }
         for local in sorted(recording.readable()):
             channel = recording.channels[local]
-            moved = replace(channel, schema_id=placed.get(channel.schema_id, 0))
-            moved = replace(moved, topic=_name(recording, moved, schemas, channels))
+            topic = recording.renamed.get(local, channel.topic)
+            moved = replace(channel, topic=topic, schema_id=placed.get(channel.schema_id, 0))
             recording.ids[local] = _place(channels, moved, _same_channel, reuse=not first)
         recording.moved = not first or bool(recording.renamed)
-        for old, new in recording.renamed.items():
-            losses.add_harmless(f"{old} carries messages of two types; those of the second are on {new}")
+        for local, new in recording.renamed.items():
+            losses.add_harmless(f"{recording.channels[local].topic} has two types; messages of the second are on {new}")
     return schemas, channels
 
 
-def _name(recording: Recording, channel: Channel, schemas: dict[int, Schema], channels: dict[int, Channel]) -> str:
-    """The topic's name in the whole file: one of another type gets another name."""
-    taken = {other.topic: _type(other, schemas) for other in channels.values()}
-    names = chain([channel.topic], (f"{channel.topic}_{number}" for number in count(2)))
-    name = next(name for name in names if taken.get(name, _type(channel, schemas)) == _type(channel, schemas))
-    if name != channel.topic:
-        recording.renamed[channel.topic] = name
-    return str(name)
+def _name_topics(recordings: Sequence[Recording], blocks: Iterable[MessageBlock]) -> None:
+    """Gives a channel another topic if its own carries another type; one without messages gives way."""
+    carried = {(block.recording, channel) for block in blocks for channel in block.counts or ()}
+    types: dict[str, tuple[str, str]] = {}
+    every = [(number, local) for number, recording in enumerate(recordings) for local in sorted(recording.readable())]
+    for number, local in sorted(every, key=lambda place: place not in carried):
+        recording = recordings[number]
+        channel = recording.channels[local]
+        schema = recording.schemas.get(channel.schema_id)
+        own = (schema.name if schema else "", channel.message_encoding)
+        names = chain([channel.topic], (f"{channel.topic}_{suffix}" for suffix in count(2)))
+        name = next(name for name in names if types.setdefault(name, own) == own)
+        if name != channel.topic:
+            recording.renamed[local] = name
 
 
 def unproven_topics(recordings: Sequence[Recording]) -> list[str]:
@@ -204,13 +213,8 @@ def unproven_topics(recordings: Sequence[Recording]) -> list[str]:
         for channel in (recording.channels[local] for local in recording.ids):
             keys = {(int(Opcode.CHANNEL), channel.id), (int(Opcode.SCHEMA), channel.schema_id)}
             if not keys - {(int(Opcode.SCHEMA), 0)} <= recording.proven:
-                topics.add(recording.renamed.get(channel.topic, channel.topic))
+                topics.add(recording.renamed.get(channel.id, channel.topic))
     return sorted(topics)
-
-
-def _type(channel: Channel, schemas: dict[int, Schema]) -> tuple[str, str]:
-    schema = schemas.get(channel.schema_id)
-    return (schema.name if schema else "", channel.message_encoding)
 
 
 def _same_schema(a: Schema, b: Schema) -> bool:

@@ -188,7 +188,7 @@ class RecoveredIndex(LogIndex):
         self.recordings.assign([e for e in scan.events if not isinstance(e, ScannedBlock) or id(e.block) in kept])
         self.recordings.drop_copies([e for e in scan.events if isinstance(e, ScannedBlock)])
         self._search_definitions(scan)
-        self.schemas, self.channels = renumber(self.recordings.each, self.losses)
+        self.schemas, self.channels = renumber(self.recordings.each, self.blocks, self.losses)
         self.losses.unchecked_topics = unproven_topics(self.recordings.each)
         for gap in really_lost(scan, self.blocks, summaries, self.losses):
             self._add_gap(gap)

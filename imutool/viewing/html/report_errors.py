@@ -20,7 +20,7 @@ from imutool.viewing.html.drawing import (
 )
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
 from imutool.viewing.html.report_paths import color_of
-from imutool.viewing.html.report_wording import alignment_text, format_number
+from imutool.viewing.html.report_wording import alignment_text, format_number, format_quantity
 from imutool.viewing.model.events import KINDS, Event
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift
@@ -52,10 +52,7 @@ def error_curves(data: RunData) -> Picture | None:
         _panel(data, scored, times, turned, "Orientation error", "°"),
         _panel(data, scored, times, moved, "Position error", "m"),
     )
-    signed = [values for rows in (turned, moved) for name, values in rows.items() if name not in ("total", "horizontal")]
-    out = any(_leaves(error, values) for values in signed for error in values)
-    note = " A signed error far above the others is left out of its panel; the total shows it." * out
-    return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.{note}", panels)
+    return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.", panels)
 
 
 def drift_curves(data: RunData) -> Picture | None:
@@ -115,8 +112,10 @@ def _draw(
     for axes, (name, values) in zip(panels, rows.items(), strict=True):
         signed = name not in {"total", "horizontal"}
         log = not signed and _needs_log_scale(values)
+        beyond: list[str] = []
         for trace, t, error in zip(scored, times, values, strict=True):
             if signed and axes is not panels[0] and _leaves(error, values):
+                beyond.append(f"{trace.name} up to {format_quantity(float(np.nanmax(np.abs(error))), unit)}")
                 continue
             shown = np.where(error > 0.0, error, np.nan) if log else error  # the start is exact: log(0)
             label = f"{trace.name}: {title.lower()}, {name}" if axes is not panels[0] else trace.name
@@ -125,6 +124,10 @@ def _draw(
             )
             lines += line if axes is panels[0] else []
         _limits(axes, values, signed=signed, log=log)
+        if beyond:
+            axes.set_title(
+                f"off scale: {', '.join(beyond)}", loc="right", fontsize="small", fontweight="normal", color=INK, pad=2.0
+            )
         axes.set_ylabel(f"{name} ({unit})" if len(rows) > 1 else f"{title.lower()} ({unit})")
     panels[0].set_title(title)
     panels[-1].set(xlabel="time (s)", xlim=(0.0, data.duration_s))

@@ -11,10 +11,15 @@ from pathlib import Path
 
 import pytest
 import zstandard
+from mcap.records import Channel, Schema
 from support.log_damage import by_mcap, stretches
 
+from imutool.mcap_io.blocks import MessageBlock
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
+from imutool.mcap_io.recovery.definitions import Recording, renumber
+from imutool.mcap_io.recovery.losses import Losses, describe
 from imutool.mcap_io.repair import repair
 
 Message = tuple[str, str, int, int, int, bytes]
@@ -179,3 +184,15 @@ def test_a_chunk_in_two_logs_whose_definitions_differ_is_unproven(foreign: Forei
     assert by_mcap(tmp_path / "out.mcap") == [m for each in (*a, b[0], b[2]) for m in each[2]]
     assert report.losses.unproven == 1
     assert report.losses.topics == {"(/mine or /other)": 1}
+
+
+def test_a_topic_stays_with_the_messages_that_are_on_it() -> None:
+    """Seed n8-a, logs 1280: poses went to /pose_2, since a channel without messages said that /pose has another type."""
+    imu, pose = Schema(3, b"", "ros2msg", schemas.IMU), Schema(4, b"", "ros2msg", schemas.POSE)
+    empty = Recording(0, {3: imu}, {3: Channel(3, "/pose", "cdr", {}, 3)})
+    full = Recording(9, {4: pose}, {4: Channel(4, "/pose", "cdr", {}, 4)})
+    block = MessageBlock(0, 0, 0, 0, 0, None, counts={4: 1}, recording=1)
+    kinds, channels = renumber([empty, full], [block], losses := Losses())
+    assert {(c.topic, kinds[c.schema_id].name) for c in channels.values()} == {("/pose", pose.name), ("/pose_2", imu.name)}
+    assert [empty.renamed, full.renamed, empty.moved] == [{3: "/pose_2"}, {}, True]
+    assert any("/pose has two types" in line for line in describe(losses.plain()))

@@ -1,0 +1,79 @@
+"""Made-up sensors whose gyro bias really evolves: what each method makes of it.
+
+    python tests/bench/drift.py [--kind rate] [--method hybrid --set model.remainder=false] [--start truth]
+
+Six training logs of 60 to 120 s, four test logs of other motions (100 s, one of five minutes); every log is a switching-on of
+its own, cold (`tests/support/drifting.py`). AOE in degrees, mean over the test logs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from support.drifting import KINDS, Drifting, log
+
+from imutool.config import load
+from imutool.evaluation import evaluate
+from imutool.mcap_io.write import write
+from imutool.training.run import train
+from imutool.training.settings import settings_of
+
+STARTS = ("truth", "auto", "smooth")
+TRAINING_S, TEST_S = (60.0, 70.0, 80.0, 90.0, 100.0, 120.0), (100.0, 100.0, 100.0, 300.0)
+
+
+def main() -> None:
+    """One row for each kind of drift and start."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kind", action="append")
+    parser.add_argument("--method", action="append")
+    parser.add_argument("--set", action="append", default=[], help="Of hybrid and neural_ode.")
+    parser.add_argument("--start", action="append")
+    parser.add_argument("--sensor", type=int, default=0)
+    options = parser.parse_args()
+    methods = options.method or ["linear", "neural_ode", "hybrid"]
+    print(f"| drift, start | raw | static | {' | '.join(methods)} |\n|{'---|' * (len(methods) + 3)}")
+    for kind in options.kind or KINDS:
+        with tempfile.TemporaryDirectory() as folder:
+            sensor = Drifting(kind=kind, sensor_seed=options.sensor)
+            score(Path(folder), sensor, methods, options.set, options.start or STARTS)
+
+
+def score(folder: Path, sensor: Drifting, methods: list[str], words: list[str], starts: list[str] | tuple[str, ...]) -> None:
+    """Trains every method, and prints its mean AOE for each start."""
+    training = [save(folder, seed, sensor, duration_s) for seed, duration_s in enumerate(TRAINING_S)]
+    tests = [save(folder, seed, sensor, duration_s) for seed, duration_s in enumerate(TEST_S, start=50)]
+    models = ["static"]
+    for method in methods:
+        models.append(str(folder / f"{method}.safetensors"))
+        said = (
+            [word for word in words if method == "hybrid" or not word.startswith("model.remainder")]
+            if method != "linear"
+            else []
+        )
+        card = train(training, Path(models[-1]), method=method, settings=load(settings_of(method), None, said)).card
+        print(
+            sensor.kind, method, {key: card[key] for key in ("physics", "compared", "held_out") if key in card}, file=sys.stderr
+        )
+    for start in starts:
+        smooth = start == "smooth"
+        rows = [evaluate(test, models=models, init="auto" if smooth else start, smooth=smooth) for test in tests]
+        table = np.array([[result["aoe_deg"] for result in row] for row in rows])
+        print(f"| {sensor.kind}, {start} | {' | '.join(f'{value:.2f}' for value in table.mean(axis=0))} |", flush=True)
+
+
+def save(folder: Path, seed: int, sensor: Drifting, duration_s: float) -> Path:
+    """Log on disk."""
+    path = folder / f"{seed}.mcap"
+    write(log(seed, sensor, duration_s), path)
+    return path
+
+
+if __name__ == "__main__":
+    main()

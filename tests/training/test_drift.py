@@ -1,0 +1,53 @@
+"""A gyro bias that follows the load of its motion is learned from poses; where there is none, none is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from support.drifting import Drifting, Kind, log
+
+from imutool.bias.hybrid import Config
+from imutool.bias.model import BiasModel
+from imutool.config import load
+from imutool.evaluation import evaluate
+from imutool.mcap_io.write import write
+from imutool.training.calibration import DRIFTS
+from imutool.training.run import train
+from imutool.training.settings import settings_of
+
+TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
+ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
+BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
+
+
+def saved(folder: Path, kind: Kind, first: int, durations_s: tuple[float, ...]) -> list[Path]:
+    paths = [folder / f"{seed}.mcap" for seed in range(first, first + len(durations_s))]
+    for seed, (path, duration_s) in enumerate(zip(paths, durations_s, strict=True), start=first):
+        write(log(seed, Drifting(kind=kind, rate_hz=50.0, lag_s=15.0), duration_s), path)
+    return paths
+
+
+def trained(folder: Path, logs: list[Path], method: str, *words: str) -> BiasModel:
+    settings = load(settings_of(method), None, ["compare=false", *words])
+    return train(logs, folder / f"{method}.safetensors", method=method, settings=settings)
+
+
+def test_hybrid_learns_a_drift_that_follows_the_load(tmp_path: Path) -> None:
+    logs = saved(tmp_path, "rate", 0, TRAINING_S)
+    trained(tmp_path, logs, "linear")
+    model = trained(tmp_path, logs, "hybrid", *ALONE)
+    assert isinstance(model.config, Config)
+    assert "gyro_rate_load" in (model.config.gyro_effects or ())
+    models = ["static", *(str(tmp_path / f"{method}.safetensors") for method in ("linear", "hybrid"))]
+    tests = saved(tmp_path, "rate", 50, TEST_S)
+    for init in ("truth", "auto"):
+        rows = [evaluate(test, models=models, init=init) for test in tests]
+        _, static, linear, hybrid = np.mean([[result["aoe_deg"] for result in row] for row in rows], axis=0)
+        assert BETTER * hybrid < min(static, linear), init
+
+
+def test_no_drift_is_found_where_there_is_none(tmp_path: Path) -> None:
+    model = trained(tmp_path, saved(tmp_path, "none", 0, TRAINING_S), "hybrid", *ALONE)
+    assert isinstance(model.config, Config)
+    assert not {*DRIFTS, "gyro_bias_drift"} & {*(model.config.gyro_effects or ())}
