@@ -74,15 +74,15 @@ def made(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
 
 
 @pytest.fixture
-def here(made: Path, tmp_path: Path) -> Path:
+def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(report, "PICTURES", report.PICTURES[:1])  # of a page: they take seconds, and come ahead of its file
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
 @pytest.fixture
-def brief(here: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+def brief(here: Path, name: str) -> Path:
     """As `here`, with logs that are quickly done: in.mcap just long enough for the command, and a shorter one."""
-    monkeypatch.setattr(report, "PICTURES", report.PICTURES[:1])  # of a page: they take seconds, and come ahead of its file
     write(flight(1, duration_s=0.4 * BRIEF_S, rate_hz=100.0), here / "short.mcap")
     if name != "conceal":  # it asks for twenty seconds
         (here / "in.mcap").unlink()

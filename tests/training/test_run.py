@@ -215,7 +215,7 @@ def test_refusals_come_before_the_work_and_leave_nothing(
     with pytest.raises(DataError, match="blind: no true poses"):
         train([logs[0], blind], tmp_path / "m.safetensors", method="neural_ode", settings=TINY)
     other = tmp_path / "other.mcap"
-    write(perfect(3, duration_s=4.0, rate_hz=100.0), other)
+    write(perfect(3, duration_s=4.0, rate_hz=50.0), other)
     with pytest.raises(DataError, match="different rates"):
         train([logs[0], other], tmp_path / "m.safetensors", method="neural_ode", settings=TINY)
     with pytest.raises(ConfigError, match="cannot be"):
