@@ -144,7 +144,7 @@ class _Search:
         enough = self.settings.unnamed_share * (self.before - now.numbers)
         if unnamed_count(best[1]) and now.objective - best[1].objective < enough:
             return None  # the rim of something that has no name: a name for it would be wrong
-        return best[1]
+        return self.candidates.jump_on_trend(now, best[1], self.named, self.threshold)
 
     def tried_with(self, others: Chosen, effect: Effect, start: Theta, near: Fit, limit: float) -> Fit:
         """Fit with one more effect, without its implausibly large parameters."""

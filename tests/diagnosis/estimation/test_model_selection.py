@@ -246,6 +246,18 @@ def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitt
     assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
 
 
+@pytest.mark.parametrize(
+    ("seed", "eps", "t_jump", "step"), [(3, 2.18e-3, 7.64, -0.028), (4, 1.6e-3, 6.44, -0.02), (7, 2.45e-3, 10.19, -0.015)]
+)
+def test_a_clock_that_runs_fast_and_jumps_shows_both(seed: int, eps: float, t_jump: float, step: float) -> None:
+    """Neither two offsets nor a straight line shows when it jumps: only a step on a trend does."""
+    truth = {"clock_skew": [eps], "clock_jump": [t_jump, step]}
+    found = asked(planted.pair(planted.shaken(seed, DURATION_S), truth, 4), beyond=False)
+    assert sorted(names(found)) == ["clock_jump", "clock_skew"]
+    assert sure(found, "clock_skew", [eps])
+    assert sure(found, "clock_jump", [t_jump, step])
+
+
 def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
     """On level ground nine numbers do what three do, and a little more as long as nobody thinks of the resonance."""
     pair = planted.pair(planted.planar(), {"lever_arm": [-0.4, -0.9, 0.0], "mount_resonance": [3.0, 0.2, 0.3, 1.0, 0.0]})
