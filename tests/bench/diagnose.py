@@ -8,8 +8,8 @@ a case in DIR/cases.jsonl, one Markdown table at the end (`--table` prints that 
 --resume goes on where it stopped; --again diagnoses the cases that are there anew, for whoever works on the estimator, and its
 lines say so. --no-sim gives diagnose the recording alone, against its own poses; sizes are drawn for a simulation, so the table
 then parts the cases that poses with their noise show to an optimal test, as clearly as a simulation has to, from the others.
---mujoco takes cases of the second generator. Do not choose settings of the estimator by cases on trajectories that are kept for
-testing.
+--mujoco takes cases of the second generator. --only null deals cases of that kind alone. Do not choose settings of the
+estimator by cases on trajectories that are kept for testing.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ def deck() -> list[Task]:
     return tasks
 
 
-def dealt(cases: int, seed: int) -> list[Task]:
+def dealt(cases: int, seed: int, only: str = "") -> list[Task]:
     """So many of the deck (again and again), shuffled so that any first part has the kinds in proportion."""
     rng = np.random.default_rng(seed)
     out: list[Task] = []
     while len(out) < cases:
         placed = []
-        tasks = deck()
+        tasks = [task for task in deck() if only in ("", task.kind)]
         for kind in sorted({task.kind for task in tasks}):
             mine = [task for task in tasks if task.kind == kind]
             order = rng.permutation(len(mine))
@@ -147,7 +147,7 @@ def run(options: argparse.Namespace) -> list[dict[str, Any]]:
         sys.exit(f"{lines_at} exists; use --resume, --again, --table or another folder")
     if options.again:
         lines_at.unlink(missing_ok=True)
-    for number, task in enumerate(dealt(options.cases, options.seed)):
+    for number, task in enumerate(dealt(options.cases, options.seed, options.only)):
         if number in done or options.table:
             continue
         folder = options.out / f"{number:04d}"
@@ -176,7 +176,7 @@ def _made(number: int, task: Task, folder: Path, options: argparse.Namespace) ->
     if options.mujoco:
         from mujoco_cases import conceal_mujoco
 
-        conceal_mujoco(folder, seed=options.seed * 100_003 + number)
+        conceal_mujoco(folder, seed=options.seed * 100_003 + number, kind="null" if options.only == "null" else None)
         return None
     if make(task, options.trajectories, folder, options.seed * 100_003 + number, number) is None:
         return {"case": number, **task._asdict(), "failed": "no motion shows it", "seconds": 0.0, "hidden": True}
@@ -260,11 +260,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--trajectories", type=Path, nargs="+", default=[])
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--only", default="", choices=["", "single", "pair", "driven", "unknown", "null"])
     for name in ("--no-sim", "--resume", "--again", "--table", "--mujoco", "--only-conceal"):
         parser.add_argument(name, action="store_true")
     options = parser.parse_args()
     if options.only_conceal:
-        for number, task in enumerate(dealt(options.cases, options.seed)):
+        for number, task in enumerate(dealt(options.cases, options.seed, options.only)):
             _made(number, task, options.out / f"{number:04d}", options)
         return
     print(table(run(options)))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float, Float64, Int64
-from imutool.diagnosis.estimation.gauss_newton import Fit, direction, parameters_of, priors
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, parameters_of, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
@@ -19,6 +19,7 @@ RIDGE = 1e-9
 FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
+CLOCK = "clock_skew", "clock_jump"
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
@@ -225,6 +226,21 @@ class Candidates:
             best = sorted([*best, self.scores[effect.key]], key=lambda entry: entry.log_p)
         return best
 
+    def jump_on_trend(self, now: Fit, best: Fit, named: Sequence[Effect], threshold: float) -> Fit:
+        """The better of a fit with one more effect and a clock that runs fast and jumps.
+
+        Each of the two alone is misplaced where the other acts.
+        """
+        clock = {effect.name: effect for effect in named if effect.name in CLOCK}
+        first = best.chosen[-1][0].name
+        if len(clock) < len(CLOCK) or first not in CLOCK or any(effect.name in CLOCK for effect, _ in now.chosen):
+            return best
+        skew, jump = (clock[name] for name in CLOCK)
+        both = (skew, skew.null_value.astype(float)), (jump, self.starts[jump.key][-1])
+        trial = fit(self.logs, (*now.chosen, *both), near=now)
+        second = jump if first == skew.name else skew
+        return trial if self.log_p(second, best.objective - trial.objective) < threshold else best
+
     def _derived(self, now: Fit) -> dict[str, list[_Linear]]:
         """Candidates derived beside fits with the same filters; those of the last few such sets are kept."""
         filters = frozenset(effect.key for effect, _ in now.chosen if effect.stage in FILTERS and not effect.linear)
@@ -253,10 +269,10 @@ def unnamed_count(found: Fit) -> int:
     return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
 
 
-def bic(found: Fit, unnamed_penalty: float) -> float:
+def bic(found: Fit) -> float:
     """Bayesian information criterion (BIC): squares left and the cost of the parameters.
 
     An effect outside the catalogue costs more.
     """
-    count = len(parameters_of(found.chosen))
-    return found.objective + count * float(np.log(found.numbers)) + unnamed_penalty * unnamed_count(found)
+    count, penalty = len(parameters_of(found.chosen)), found.logs[0].pair.settings.search.unnamed_penalty
+    return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)

@@ -210,7 +210,7 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
     whiteners = [log.whiten for log in problem.logs]
     while len(problem.mean) and steps < iterations:
         before = now.objective
-        for moved in _onsets(problem, now):
+        for moved in _onsets(problem, now) if steps else ():  # where it begins is best known until all else has moved once
             now = min(now, problem.state(moved, now), key=_objective)
         jacobians = Jacobians(whiteners, now.passes, now.chosen, kept)
         x, whole = free_of(now.chosen), problem.step(jacobians, now)

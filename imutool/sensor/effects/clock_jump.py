@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
-PARTS, STARTS = 12, 4  # of the log, and the best times of how many of them
+Column = Float64[np.ndarray, " n"]
+Steps = Float64[np.ndarray, " n-1"]
+PARTS, STARTS, ON_TREND = 12, 4, 1  # of the log; the best times of how many of them, with two offsets and on a trend
 
 
 def _forward(taken_s: Times, theta: Theta) -> Times:
@@ -16,21 +19,34 @@ def _forward(taken_s: Times, theta: Theta) -> Times:
 
 
 def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-    """Times at which two offsets explain most of the gyro's residual, to first order, by part.
+    """Times at which a step of the offset explains most of the gyro's residual, to first order, by part.
 
-    An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring.
+    An offset tau adds tau d omega/dt, so that sums up to each sample and from it on tell what any jump would bring. The last of
+    them are steps on a trend: beside a clock that also runs fast, two offsets do not show when it jumps.
     """
     error, _ = residual(motion, samples)
     slope = np.gradient(motion.sample(samples.stamp_s, samples.stamp_s).gyro, samples.stamp_s, axis=0)
-    common = np.cumsum(np.sum(slope * (error - np.median(error, axis=0)), axis=1))
-    power = np.cumsum(np.sum(slope**2, axis=1)) + np.finfo(np.float64).tiny
-    before = common[:-1] / power[:-1]
-    after = (common[-1] - common[:-1]) / (power[-1] - power[:-1] + np.finfo(np.float64).tiny)
-    gain = before**2 * power[:-1] + after**2 * (power[-1] - power[:-1])
-    best = [int(part[np.argmax(gain[part])]) for part in np.array_split(np.arange(len(gain)), PARTS) if len(part)]
-    best = sorted(best, key=lambda row: -gain[row])[:STARTS]
-    t_s = samples.stamp_s
-    return [np.array([(t_s[row] + t_s[row + 1]) / 2.0, after[row] - before[row]]) for row in best]
+    common = np.sum(slope * (error - np.median(error, axis=0)), axis=1)
+    power = np.sum(slope**2, axis=1) + np.finfo(np.float64).tiny
+    t_s, starts = samples.stamp_s, list[Theta]()
+    for degree, count in ((0, STARTS), (1, ON_TREND)):
+        trend = np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1)
+        step, gain = _steps(trend, common, power)
+        best = [int(part[np.argmax(gain[part])]) for part in np.array_split(np.arange(len(gain)), PARTS) if len(part)]
+        best = sorted(best, key=lambda row: -gain[row])[:count]
+        size = 0.0 if degree else 1.0  # a trend that is in the fit by now has changed the step
+        starts += [np.array([(t_s[row] + t_s[row + 1]) / 2.0, size * step[row]]) for row in best]
+    return starts
+
+
+def _steps(trend: Float64[np.ndarray, "n p"], common: Column, power: Column) -> tuple[Steps, Steps]:
+    """Size of the step after each sample but the last, on a trend of the offset, and the squares that it explains."""
+    whole = np.linalg.pinv(trend.T @ (power[:, None] * trend))
+    after = np.cumsum((power[:, None] * trend)[::-1], axis=0)[::-1][1:]
+    left = np.cumsum(common[::-1])[::-1][1:] - after @ whole @ (trend.T @ common)
+    own = np.cumsum(power[::-1])[::-1][1:] - np.einsum("np,pq,nq->n", after, whole, after)
+    step = left / np.maximum(own, np.finfo(np.float64).tiny)
+    return step, step * left
 
 
 EFFECT = Effect(

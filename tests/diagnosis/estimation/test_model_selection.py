@@ -124,6 +124,22 @@ def test_noise_and_a_bias_are_nothing(seed: int) -> None:
     assert found.tried > len(planted.catalogue())
 
 
+def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    logs, candidates = (
+        [planted.weighed(planted.pair(planted.rich(4, DURATION_S), {"gyro_scale": [0.02, 0.0, 0.01]}, 4))],
+        planted.catalogue(),
+    )
+    now = fit(logs, planted.acting({"gyro_scale": [0.02, 0.0, 0.01], "accel_scale": [0.0] * 3, "clock_offset": [0.0]}))
+    known, settings = Candidates(logs, candidates), logs[0].pair.settings.search
+    search = model_selection._Search(logs, candidates, (), (), fit(logs, ()).objective, settings, lambda word: None, known)
+    short = search.tested(now)
+    monkeypatch.setattr(model_selection, "FOLLOWING", frozenset(now.keys))  # whatever it is, the others may matter to it
+    whole = search.tested(now)
+    assert names(short) == names(whole) == ["gyro_scale"]
+    np.testing.assert_array_equal(short.selected[0].theta, whole.selected[0].theta)
+    assert short.selected[0].gain == whole.selected[0].gain
+
+
 # ── one, two ──
 
 
@@ -244,6 +260,18 @@ def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitt
     jump = next(one for one in found.selected if one.effect.key == "clock_jump")
     assert abs(jump.theta[0] - t_jump) < 0.05  # s: five samples, in which it may hardly move
     assert jump.theta[1] == pytest.approx(-0.02, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("seed", "eps", "t_jump", "step"), [(3, 2.18e-3, 7.64, -0.028), (4, 1.6e-3, 6.44, -0.02), (7, 2.45e-3, 10.19, -0.015)]
+)
+def test_a_clock_that_runs_fast_and_jumps_shows_both(seed: int, eps: float, t_jump: float, step: float) -> None:
+    """Neither two offsets nor a straight line shows when it jumps: only a step on a trend does."""
+    truth = {"clock_skew": [eps], "clock_jump": [t_jump, step]}
+    found = asked(planted.pair(planted.shaken(seed, DURATION_S), truth, 4), beyond=False)
+    assert sorted(names(found)) == ["clock_jump", "clock_skew"]
+    assert sure(found, "clock_skew", [eps])
+    assert sure(found, "clock_jump", [t_jump, step])
 
 
 def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
