@@ -44,6 +44,7 @@ class Recordings:
         self._named: Recording | None = None  # the last one that is not anonymous
         self._early: list[ScannedBlock] = []  # blocks whose definitions, if any, come behind them
         self._certain = False  # an unbroken chain of records leads from the definitions of the current one to here
+        self._follows = True  # the next block may go on with the one before: no data section ends between them
         self._behind_gap: list[ScannedBlock] | None = None  # blocks since the last gap, where one came since the log began
         for summary in summaries:
             recording = Recording(summary.base)
@@ -73,8 +74,8 @@ class Recordings:
                 self._begin(event.offset)
             elif isinstance(event, LogEnd):
                 if self._current is not None:
-                    self._current.ended = True
-                self._certain = False
+                    self._current.ended |= event.closed
+                self._certain = self._follows = False
             elif isinstance(event, Gap):
                 event.recording = self.each.index(self._now)
                 self._now.gapped = True
@@ -130,6 +131,7 @@ class Recordings:
         self._current, self._named = recording, self._named if recording.anonymous else recording
         if not (found.block.counts or {}).keys() <= recording.readable():
             self._early.append(found)
+        self._follows = True
         self._certain = not foreign and (self._certain or found.evidence > 1 or bool(known))
         recording.habits |= found.habits if found.evidence else NO_HABITS
         if found.evidence > 1:
@@ -264,7 +266,7 @@ class Recordings:
         """The recording of a block that does not define all of its ids itself."""
         pool = list({id(r): r for r in pool}.values())
         unlisted = [r for r in pool if r.lists is None or found.key in r.lists]
-        if (self._certain or self._now.anonymous) and self._now in unlisted:
+        if (self._certain or (self._now.anonymous and self._follows)) and self._now in unlisted:
             return self._now
         for narrower in (
             unlisted,

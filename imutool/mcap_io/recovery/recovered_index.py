@@ -248,9 +248,9 @@ class RecoveredIndex(LogIndex):
         """Counts by the channel ids of the whole file; lists messages without a topic as lost."""
         local, recording = block.counts or {}, self.recordings.of(block)
         unproven = self.recordings.unproven.get(block.offset, {})
-        if unproven and (lost := {f"({names})": local[i] for i, names in unproven.items() if i in local}):
+        if lost := sum((Counter({f"({names})": local.get(i, 0)}) for i, names in unproven.items()), Counter[str]()):
             why = "messages here are of one of several recordings, and nothing proves of which"
-            self.losses.add(Loss(block.offset, 0, why, lost, True, block.start_ns, block.end_ns))
+            self.losses.add(Loss(block.offset, 0, why, dict(lost), True, block.start_ns, block.end_ns))
             self.losses.unproven += sum(lost.values())
         undefined = {-1 - i: n for i, n in local.items() if i not in recording.ids}
         if undefined:

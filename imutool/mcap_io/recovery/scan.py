@@ -43,8 +43,7 @@ class Scan(ScanResult):
         self.source, self.limit, self.listed, self.losses, self.max_chunk = source, limit, listed, losses, max_chunk
         self.has_summary = limit < source.size  # an intact one, which begins at the limit
         self.frames = RecordFrames(source, limit, max_chunk)
-        self._closed = False  # past a footer
-        self._ended = False  # past the data section of a log
+        self._ended = self._closed = False  # past the data section of a log, and past its footer
         self._open_gap: Gap | None = None  # messages behind it may lie inside a damaged chunk
         self._summary_starts: list[int] = []  # where one may begin
         self._defined_until = -1  # where the last definition outside chunks ended
@@ -219,6 +218,7 @@ class Scan(ScanResult):
             self.events.append(LogEnd(end))
         elif opcode == Opcode.DATA_END:
             self.data_ends.append(position)
+            self.events.append(LogEnd(end, closed=False))
             self._ended, self.last, self._open_gap = True, None, None
             self._summary_starts.append(end)
         elif opcode in (Opcode.ATTACHMENT, Opcode.METADATA):

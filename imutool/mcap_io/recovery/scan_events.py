@@ -43,9 +43,10 @@ class LogStart(NamedTuple):
 
 
 class LogEnd(NamedTuple):
-    """Footer and magic of a log."""
+    """End of a log: of its data section, or, if it is closed, its footer."""
 
     offset: int
+    closed: bool = True
 
 
 class Definition(NamedTuple):

@@ -186,6 +186,35 @@ def test_a_chunk_in_two_logs_whose_definitions_differ_is_unproven(foreign: Forei
     assert report.losses.topics == {"(/mine or /other)": 1}
 
 
+def test_every_message_of_which_two_topics_are_possible_is_counted(foreign: Foreign, tmp_path: Path) -> None:
+    """Seed n8-b, logs 722: of two channels with the same two possible topics, one was counted."""
+    first = foreign([text("/mine", 100), text("/other", 101)], chunk_size=CHUNK_SIZE, name="first")
+    messages = [
+        text("/other", 1000),
+        text("/mine", 1001),
+        *(text(("/other", "/mine")[i % 2], 1002 + i, 1200) for i in range(3)),
+    ]
+    second = foreign(messages, chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, other = stretches(first), stretches(second), first.read_bytes(), second.read_bytes()
+    assert [len(each) for _, _, each in b] == [1, 1, 3]
+    chunk, begin = other[b[2][0] : b[2][1]], other[b[0][0] : b[1][1]]
+    first.write_bytes(raw[: a[1][1]] + b"\0" * 5 + chunk + b"\0" * 5 + begin)
+    report = repair(first, tmp_path / "out.mcap")
+    assert (report.losses.unproven, report.losses.topics) == (3, {"(/mine or /other)": 3})
+
+
+def test_a_chunk_behind_the_data_of_a_log_may_be_of_another(foreign: Foreign, tmp_path: Path) -> None:
+    """Seed n8-b, logs 4158: a chunk among the last records of a log whose begin is lost was on that log's topic."""
+    first = foreign([text("/mine", 100 + i) for i in range(4)], "no-message-index", chunk_size=CHUNK_SIZE, name="first")
+    second = foreign([text("/other", 1000 + i) for i in range(4)], chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw, other = stretches(first), stretches(second), first.read_bytes(), second.read_bytes()
+    tail = other[b[2][0] : -60]  # with its summary, of which without a footer nothing is proven
+    tail = tail[: tail.rindex(b"\x0e")]  # ends with a record
+    first.write_bytes(raw[: a[1][1]] + b"\0" * 5 + tail + raw[a[3][0] : a[3][1]])
+    report = repair(first, tmp_path / "out.mcap")
+    assert (report.messages, report.losses.topics) == ({"/mine": 2, "/other": 2}, {"(/mine or /other)": 1})
+
+
 def test_a_topic_stays_with_the_messages_that_are_on_it() -> None:
     """Seed n8-a, logs 1280: poses went to /pose_2, since a channel without messages said that /pose has another type."""
     imu, pose = Schema(3, b"", "ros2msg", schemas.IMU), Schema(4, b"", "ros2msg", schemas.POSE)
