@@ -26,7 +26,7 @@ GROUPS = {
     "imutool.clean": "imutool.cleaning.rules",
 }
 NOT_PLUGINS = {
-    "imutool.bias": frozenset({"io", "model", "networks", "neural_stream", "physics"}),
+    "imutool.bias": frozenset({"effects_stream", "io", "model", "networks", "neural_stream", "physics"}),
     "imutool.networks": frozenset({"joint_ode", "network", "ode"}),
 }
 

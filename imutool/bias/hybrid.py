@@ -16,7 +16,8 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias import neural_ode
-from imutool.bias.model import COLUMNS, BiasModel, CovarianceModel, DriftStream, Shapes, Stream, Vector6
+from imutool.bias.effects_stream import EffectsStream
+from imutool.bias.model import BiasModel, CovarianceModel, Shapes, Stream, Vector6
 from imutool.config import Settings
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, patterns
@@ -84,7 +85,7 @@ class Model(BiasModel):
         """Bias stream, with filters that start at its first sample."""
         ode = None if self.ode is None else self.ode.stretch(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
-        return _Stream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64), start_s)
+        return EffectsStream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64), start_s)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics of the neural ODE."""
@@ -113,61 +114,3 @@ class Model(BiasModel):
 
     def _compiled(self, sensor: Sensor) -> CompiledEffects:
         return compiled(self.effects[sensor], self.tensors[f"theta_{sensor}"])
-
-
-class _Stream:
-    """Bias stream: effects, then the neural ODE on the corrected samples."""
-
-    def __init__(
-        self,
-        rate_hz: float,
-        gyro: CompiledEffects,
-        accel: CompiledEffects,
-        ode: DriftStream | None,
-        rest: Vector6,
-        start_s: float,
-    ) -> None:
-        self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
-        self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)
-        self._gyro, self._accel, self._only_product = gyro, accel, not (gyro.others or accel.others)
-        self._ode, self._rest, self._start_s = ode, rest, start_s
-
-    @property
-    def rest(self) -> Vector6:
-        """Latest rest bias."""
-        return self._rest if self._ode is None else self._ode.rest
-
-    def continue_from(self, before: Stream) -> None:
-        """Go on with the load of the stretch before a gap."""
-        if isinstance(before, _Stream):
-            self._signals.continue_load(before._signals)
-
-    def __call__(
-        self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n 6"]:
-        if len(t_s) == 1:
-            return self.one(float(t_s[0]), np.concatenate([gyro[0], accel[0]]))[None]
-        if not len(t_s):
-            return np.zeros((0, 6))
-        if math.isnan(self._start_s):
-            self._start_s = float(t_s[0])
-        signals = self._signals(t_s - self._start_s, gyro, accel)
-        error: Float64[np.ndarray, "n 6"] = np.dot(signals.columns, self._matrix)
-        for columns, effects in ((COLUMNS["gyro"], self._gyro), (COLUMNS["accel"], self._accel)):
-            for other in effects.others:
-                error[:, columns] += other(signals)
-        error += self._rest if self._ode is None else self._ode(t_s, gyro - error[:, :3], accel - error[:, 3:])
-        return error
-
-    def one(self, t_s: float, u: Vector6) -> Vector6:
-        """Bias at one sample."""
-        if math.isnan(self._start_s):
-            self._start_s = t_s
-        since_s = t_s - self._start_s
-        row = self._signals.one(since_s, u)
-        error: Vector6 = row.dot(self._matrix)
-        if not self._only_product:
-            floats = row.tolist()
-            error += (*self._gyro.others_at(since_s, floats), *self._accel.others_at(since_s, floats))
-        error += self._rest if self._ode is None else self._ode.one(t_s, u - error)
-        return error

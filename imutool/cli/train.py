@@ -143,6 +143,6 @@ def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:
     """
     if method != "hybrid":
         raise ConfigError(f"{method} knows no effects", where="--physics", fix="Leave it out, or train --method hybrid")
-    from imutool.training.calibration import settings_for
+    from imutool.training.run import settings_from_physics
 
-    return settings_for(physics)
+    return settings_from_physics(physics)

@@ -11,10 +11,8 @@ motion does not show stays at its prior, and is named.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -29,9 +27,8 @@ from imutool.bias.networks import hybrid
 from imutool.bias.networks import neural_ode as ode_network
 from imutool.bias.networks.network import BiasNetwork
 from imutool.config import build, plain
-from imutool.errors import ConfigError
 from imutool.recording import Imu, Recording, seconds
-from imutool.sensor import catalogue, physics_file
+from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.training.closed_form import widest
@@ -235,6 +232,14 @@ class PhysicsFirst:
                 gyro = pool.gyro - error - fits[sensor].rest[pool.log]
         return cls(model, fits, [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings])
 
+    def with_gyro_effects(self, recordings: Sequence[Recording], names: Sequence[str]) -> PhysicsFirst:
+        """The same with some effects of the gyro alone, and recordings corrected for these."""
+        fit, chosen = self.fits["gyro"], parameter_columns(catalogue.trained("gyro", self.fits["gyro"].effects), names)
+        own = replace(fit, effects=tuple(names), theta=fit.theta[chosen], covariance=fit.covariance[chosen][:, chosen])
+        self.model.take("gyro", names, own.theta, own.covariance)
+        corrected = [replace(recording, imu=_corrected(self.model, recording.imu)) for recording in recordings]
+        return replace(self, fits=self.fits | {"gyro": own}, recordings=corrected)
+
     def ode_settings(self, settings: TrainSettings) -> TrainSettings:
         """Settings of the ODE's own training."""
         ode: neural_ode.Config = self.model.config.ode
@@ -251,23 +256,6 @@ class PhysicsFirst:
         for name, value in learnt.named_buffers(recurse=False):
             getattr(model, name).copy_(value)
         return model
-
-
-def settings_for(physics: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Settings for `hybrid` with the effects of a physics.toml, and names that it cannot have.
-
-    Their parameters are fitted anew to the logs. Effects that it cannot have, or without a name, are left to the neural ODE.
-
-    Raises:
-        ConfigError: the file cannot be read, or names no effect that `hybrid` can have.
-    """
-    names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
-    by_sensor = {sensor: [form.name for form in catalogue.trained(sensor) if form.name in names] for sensor in SENSORS}
-    taken = {name for some in by_sensor.values() for name in some}
-    if not taken:
-        raise ConfigError("no effect that a bias model can correct", where=physics, expected="for instance gyro_scale")
-    words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
-    return words, tuple(name for name in names if name not in taken)
 
 
 def config_of(settings: TrainSettings) -> Config:

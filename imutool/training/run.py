@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,31 +15,27 @@ import torch
 from imutool import __version__, registry
 from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
+from imutool.bias.networks import neural_ode as neural_ode_network
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
-from imutool.errors import ConfigError, DataError
-from imutool.geometry import so3
-from imutool.inertial.windows import rotation_residual
+from imutool.errors import ConfigError
 from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
+from imutool.sensor import catalogue, physics_file
 from imutool.training import checkpoint
-from imutool.training.calibration import LINEAR, Calibration, PhysicsFirst, config_of
+from imutool.training.calibration import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import compare, simpler_effects
-from imutool.training.segments import Pool
+from imutool.training.segments import Pool, check_trainable
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
 logger = logging.getLogger(__name__)
 
-LEAST_S = 10.0  # of truth without gaps, in all logs together
-LEAST_TURN_RAD_S = 0.02  # of the rate about its own mean: less is a sensor on a table
-WINDOW_S = 1.0
 LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
-WORST_MISS = 0.5  # of a log's largest turns; a scale error of a tenth misses by a tenth
 
 
 def checkpoint_path(out: Path) -> Path:
@@ -95,14 +92,12 @@ def train(
         model, about = _physics_first(recordings, chosen, descent)
     elif method == linear.Model.method:
         model, about = _linear(recordings, chosen, descent)
+    elif method == neural_ode.Model.method:
+        model, about = _drift_first(recordings, chosen, descent)
     else:
         training = descent(recordings, method, chosen)
         model, about = training.model, {"held_out": _held_out(training), **_turn_on(training)}
-    model.card = {
-        **_card(method, chosen, parts),
-        **about,
-        **{key: _shared(recordings, key) for key in ("sensor", "dataset")},
-    }
+    model.card = _card(method, chosen, parts) | about | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
     io.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
     return io.load(out)
@@ -167,6 +162,46 @@ def _physics_first(
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
 
 
+def _drift_first(
+    recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
+) -> tuple[BiasNetwork, dict[str, Any]]:
+    """Drift behind the load as far as it helps left-out logs, then the neural ODE; the card's entries."""
+
+    def physics_of(**effects: Sequence[str]) -> PhysicsFirst:
+        alone = msgspec.structs.replace(settings, model={"accel_effects": (), **effects})
+        return PhysicsFirst.of(recordings, alone, descent.device, lambda epoch: None)
+
+    loads = settings.model.get("loads")
+    if loads is None:
+        joint = settings.model.get("scheme") == "joint"
+        loads = [] if joint else [name for name in physics_of().fits["gyro"].effects if name in DRIFTS]
+    if not loads:
+        training = descent(recordings, neural_ode.Model.method, settings)
+    else:
+        physics = physics_of(gyro_effects=(*LINEAR["gyro"], *loads)).with_gyro_effects(recordings, loads)
+        training = descent(physics.recordings, neural_ode.Model.method, settings)
+        assert isinstance(training.model, neural_ode_network.Network)
+        training.model.take_loads(loads, physics.fits["gyro"].theta)
+    return training.model, {"held_out": _held_out(training), **_turn_on(training)}
+
+
+def settings_from_physics(physics: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Settings for `hybrid` with the effects of a physics.toml, and names that it cannot have.
+
+    Their parameters are fitted anew to the logs. Effects that it cannot have, or without a name, are left to the neural ODE.
+
+    Raises:
+        ConfigError: the file cannot be read, or names no effect that `hybrid` can have.
+    """
+    names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
+    by_sensor = {sensor: [form.name for form in catalogue.trained(sensor) if form.name in names] for sensor in SENSORS}
+    taken = {name for some in by_sensor.values() for name in some}
+    if not taken:
+        raise ConfigError("no effect that a bias model can correct", where=physics, expected="for instance gyro_scale")
+    words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
+    return words, tuple(name for name in names if name not in taken)
+
+
 def helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
     """Whether a descent lowers one held-out error enough and does not raise the other."""
     gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
@@ -224,59 +259,3 @@ def _card(method: str, settings: TrainSettings, parts: Sequence[tuple[Path, Reco
 def _kind(recording: Recording) -> str:
     """What the poses that a model was trained on are worth."""
     return recording.kind_of(next(iter(recording.truths), ""))
-
-
-def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
-    """Refuses recordings that no model should be learned from.
-
-    Raises:
-        DataError: different sensors, too short, standing still, or a truth that does not follow the samples.
-    """
-    _one_sensor(recordings)
-    n = pool.samples(WINDOW_S)
-    first = pool.starts(n, "all", hop=n)
-    if len(first) * WINDOW_S < LEAST_S:
-        raise DataError(
-            f"{len(first) * WINDOW_S:.0f} s of truth without gaps in all training logs",
-            where=", ".join(pool.names),
-            expected=f"at least {LEAST_S:g} s, and minutes for a useful model",
-            fix="Add logs, or look at their truth with imutool info",
-        )
-    turning = float((pool.gyro - pool.gyro.mean(0)).norm(dim=1).median())
-    if turning < LEAST_TURN_RAD_S:
-        raise DataError(
-            f"the sensor stands still: half of the time it turns by less than {turning:.3f} rad/s",
-            where=", ".join(pool.names),
-            expected=f"motion, more than {LEAST_TURN_RAD_S:g} rad/s",
-            fix="Add logs in which it turns; for a sensor at rest, imutool debias needs no model",
-        )
-    _truths_follow(pool, first, n)
-
-
-def _one_sensor(recordings: Sequence[Recording]) -> None:
-    said = {r.name: str(r.metadata.get("imutool", {}).get("sensor", "")) for r in recordings}
-    named = {sensor for sensor in said.values() if sensor}
-    if len(named) > 1:
-        listed = ", ".join(f"{name}: {sensor or 'not said'}" for name, sensor in said.items())
-        raise DataError(f"training logs of different sensors ({listed})", expected="logs of one sensor")
-
-
-def _truths_follow(pool: Pool, first: torch.Tensor, n: int) -> None:
-    """Compares what the samples and the true poses say of the same seconds, constants apart."""
-    windows = pool.windows(first, n, pool.t.new_zeros(len(first), 6))
-    R_true = windows.R_start.mT @ windows.R_end
-    e, _ = rotation_residual(windows.segment.gyro, windows.dt, R_true)
-    turned = so3.log(R_true).norm(dim=1)
-    for log, name in enumerate(pool.names):
-        of_log = windows.log == log
-        if not bool(of_log.any()):
-            continue
-        missed = float((e[of_log] - e[of_log].median(0).values).norm(dim=1).median())
-        largest = float(turned[of_log].quantile(0.9))
-        if missed > WORST_MISS * max(largest, LEAST_TURN_RAD_S * WINDOW_S):
-            raise DataError(
-                f"the true poses do not follow the gyro: they miss turns by {missed:.2f} rad a second, of {largest:.2f}",
-                where=name,
-                expected="poses of the IMU's own frame, on its clock",
-                fix="Look at the frame and the time offset of the truth, or leave the log out",
-            )

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from support.drifting import Drifting, Kind, log
 
+from imutool.bias import neural_ode
 from imutool.bias.hybrid import Config
 from imutool.bias.model import BiasModel
 from imutool.config import load
@@ -51,3 +52,14 @@ def test_no_drift_is_found_where_there_is_none(tmp_path: Path) -> None:
     model = trained(tmp_path, saved(tmp_path, "none", 0, TRAINING_S), "hybrid", *ALONE)
     assert isinstance(model.config, Config)
     assert not {*DRIFTS, "gyro_bias_drift"} & {*(model.config.gyro_effects or ())}
+
+
+def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path) -> None:
+    """One step of descent: what counts is that the drift is found, kept in the file, and taken off the samples."""
+    model = trained(tmp_path, saved(tmp_path, "rate", 0, TRAINING_S), "neural_ode", "steps=1")
+    assert isinstance(model.config, neural_ode.Config)
+    assert "gyro_rate_load" in (model.config.loads or ())
+    models = ["static", str(tmp_path / "neural_ode.safetensors")]
+    (test,) = saved(tmp_path, "rate", 50, TEST_S)
+    _, static, ode = (result["aoe_deg"] for result in evaluate(test, models=models, init="truth"))
+    assert BETTER * ode < static

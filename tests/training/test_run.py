@@ -21,12 +21,14 @@ from imutool.errors import ConfigError, DataError, LogError, ModelError, Numeric
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
-from imutool.training.calibration import config_of, settings_for
+from imutool.training.calibration import config_of
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objective import WindowEndObjective
-from imutool.training.run import checkpoint_path, helps, train
+from imutool.training.run import checkpoint_path, helps, settings_from_physics, train
 from imutool.training.settings import settings_of
 from imutool.units import Sensor
+
+pytestmark = pytest.mark.usefixtures("one_start")
 
 TINY = TrainSettings(
     gyro_window_s=(0.25, 0.5),
@@ -44,7 +46,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("logs")
     made = []
     for seed in (1, 2):
-        recording = flight(seed, duration_s=8.0, still_s=0.5)
+        recording = flight(seed, duration_s=8.0, still_s=0.5, rate_hz=100.0)
         about = {"imutool": {"dataset": "euroc", "sensor": "adis16448"}}
         made.append(folder / f"{seed}.mcap")
         write(Recording(recording.name, recording.imu, recording.truths, metadata=about), made[-1])
@@ -213,7 +215,7 @@ def test_refusals_come_before_the_work_and_leave_nothing(
     with pytest.raises(DataError, match="blind: no true poses"):
         train([logs[0], blind], tmp_path / "m.safetensors", method="neural_ode", settings=TINY)
     other = tmp_path / "other.mcap"
-    write(perfect(3, duration_s=4.0, rate_hz=100.0), other)
+    write(perfect(3, duration_s=4.0, rate_hz=50.0), other)
     with pytest.raises(DataError, match="different rates"):
         train([logs[0], other], tmp_path / "m.safetensors", method="neural_ode", settings=TINY)
     with pytest.raises(ConfigError, match="cannot be"):
@@ -375,7 +377,7 @@ def test_a_physics_file_says_which_effects_hybrid_takes_off_and_what_is_left(tmp
     file = tmp_path / "physics.toml"
     some = (("gyro_scale", "x", "-"), ("saturation", "gyro", "rad/s"), ("lever_arm", "x", "m"), ("clock_offset", "tau", "s"))
     file.write_text("".join(entry(*one) for one in some))
-    words, left = settings_for(file)
+    words, left = settings_from_physics(file)
     config = load_settings(settings_of("hybrid"), None, words)
     assert config_of(config).gyro_effects == ("clock_offset", "gyro_scale")
     assert "lever_arm" in (config_of(config).accel_effects or ())
@@ -386,7 +388,7 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path,
     file = tmp_path / "physics.toml"
     file.write_text(entry("saturation", "gyro", "rad/s"))
     with pytest.raises(ConfigError, match="no effect that a bias model can correct"):
-        settings_for(file)
+        settings_from_physics(file)
     words = ["train", "a.mcap", "-o", tmp_path / "m.safetensors", "--method", "linear", "--physics", file]
     said = imutool(*words, cwd=tmp_path)
     assert said.returncode == 3

@@ -7,8 +7,10 @@ changes the solution only by its own error.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar, TypeVar
 
+import msgspec
 import torch
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
@@ -86,6 +88,8 @@ class Network(BiasNetwork):
         Model.shapes(chosen)  # refuses settings that do not fit each other
         super().__init__(chosen, rate_hz)
         self.stride = chosen.stride(rate_hz)
+        if chosen.loads:
+            self.take_loads(chosen.loads, torch.zeros(Model.shapes(chosen)["theta_loads"]))
         scales = {sensor: chosen.units(sensor) for sensor in SENSORS}
         curves: dict[str, nn.Module] = {
             sensor: Curve(chosen.curve_width, scale, curve) for sensor, (scale, curve, _) in scales.items()
@@ -97,6 +101,11 @@ class Network(BiasNetwork):
             drifts["gyro"] = JointField(drifts["gyro"])
             self.longest_window_s = joint_ode.WINDOW_S
         self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drift})
+
+    def take_loads(self, names: Sequence[str], theta: Float[Tensor, " p"]) -> None:
+        """Take over a drift behind the load, fitted before; the samples of the training are corrected for it."""
+        self.config = msgspec.structs.replace(self.config, loads=tuple(names))
+        self.register_buffer("theta_loads", theta.clone())
 
     def _joint_start(self, segment: Segment) -> tuple[JointField, Float[Tensor, "b 3"]]:
         """Joint field, and bias at the first sample."""
