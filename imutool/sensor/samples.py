@@ -18,7 +18,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording import Recording, seconds
-from imutool.sensor.signals import FILTERED, SignalFilter, Signals
+from imutool.sensor.signals import FILTERED, SignalFilter, Signals, vibration_power
 from imutool.units import AXES, Sensor
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -27,7 +27,7 @@ Times = Float64[np.ndarray, " n"]
 PAD = 12  # samples beyond the ends, over which the spline forgets its start: 0.27^12 = 1e-7
 UNEVEN = 1e-2  # of a period: how far the even clock may be from even
 SAME_S = 1e-7  # a stamp's rounding; the fastest motion goes nowhere in it
-INSTANTS, RECENT = 3, 8  # entries that a sampler keeps: sets of instants, and columns
+INSTANTS, RECENT = 3, 16  # entries that a sampler keeps: sets of instants, and columns
 NOTHING: Mapping[str, Float64[np.ndarray, " n"]] = MappingProxyType({})
 Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], Any]  # the last a csr_array or None
 
@@ -41,7 +41,8 @@ class Sampler:
 
     def __init__(self) -> None:
         self._instants: tuple[Instants, ...] = ()
-        self._coefficients, self._values, self._others = _Recent(), _Recent(), _Recent()
+        self._coefficients, self._values, self._others = Recent(), Recent(), Recent()
+        self.behind, self.vibration = Recent(), Recent()  # columns behind an effect, and the power of the force
 
     def signals(self, motion: IdealMotion, taken_s: Float64[np.ndarray, " m"]) -> tuple[Vectors, ...]:
         """Gyro, accel and alpha at some instants."""
@@ -56,15 +57,15 @@ class Sampler:
             first = [np.zeros((len(motion.t_s), 0))] if motion.R_wb is None else [motion.R_wb.reshape(-1, 9)]
             return np.concatenate([*first, *(values[:, None] for values in motion.channels.values())], axis=1)
 
-        both = self._others(motion.R_wb, motion.channels, columns)
+        both = self._others.made(motion.R_wb, motion.channels, columns)
         return self._at_instants(both, instants)
 
     def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
         weights = instants[2]
         if weights is None:
-            return self._values(x, instants, lambda: _fixed(x.view()))
-        coefficients = self._coefficients(x, None, lambda: _coefficients(x))
-        return self._values(x, instants, lambda: _fixed(np.asarray(weights @ coefficients)))
+            return self._values.made(x, instants, x.view)
+        coefficients = self._coefficients.changed(x, None, _coefficients)
+        return self._values.changed(coefficients, instants, weights.__matmul__)
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
         """Clock, instants, and matrix from coefficients to values; none at the clock's instants.
@@ -81,23 +82,53 @@ class Sampler:
         return found
 
 
-class _Recent:
-    """The last few results, by the identity of the objects that they were made from."""
+class Recent:
+    """The last few arrays that were made from others, by the objects they were made from.
+
+    They are read-only.
+    """
 
     def __init__(self) -> None:
-        self._known: tuple[tuple[object, object, Columns], ...] = ()
+        self._known: tuple[tuple[Any, object, Columns], ...] = ()
 
-    def __call__(
-        self, of: object, at: object, evaluate: Callable[[], Float64[np.ndarray, "n k"]]
-    ) -> Float64[np.ndarray, "n k"]:
+    def made(self, of: object, at: object, make: Callable[[], Float64[np.ndarray, "n k"]]) -> Float64[np.ndarray, "n k"]:
+        """Array made from two objects; the same array for the same objects."""
+        value = self._of(of, at)
+        return self._kept(of, at, make()) if value is None else value
+
+    def changed(self, x: Columns, by: object, change: Callable[[Columns], Columns]) -> Columns:
+        """Columns behind a change of each by itself, which `by` stands for.
+
+        Columns that were changed before, in this array or in another, are taken from there.
+        """
+        value = self._of(x, by)
+        if value is not None:
+            return value
+        alike = [entry for entry in self._known if entry[1] is by and entry[0].shape == x.shape]
+        if not alike:
+            return self._kept(x, by, np.asarray(change(x)))
+        few = x[:: len(x) // 16 + 1]
+        like, _, before = min(alike, key=lambda entry: int((entry[0][:: len(x) // 16 + 1] != few).any(axis=0).sum()))
+        differs = [k for k, (a, b) in enumerate(zip(like.T, x.T, strict=True)) if not np.array_equal(a, b)]
+        if not differs:
+            return self._kept(x, by, before)
+        if len(differs) == x.shape[1]:
+            return self._kept(x, by, np.asarray(change(x)))
+        out = before.copy()
+        out[:, differs] = change(x[:, differs])
+        return self._kept(x, by, out)
+
+    def _of(self, of: object, at: object) -> Columns | None:
         entries = self._known
         for k, entry in enumerate(entries):
             if entry[0] is of and entry[1] is at:
                 if k:  # an entry in use moves to the front
                     self._known = (entry, *entries[:k], *entries[k + 1 :])
                 return entry[2]
-        value = evaluate()
-        self._known = ((of, at, value), *entries[: RECENT - 1])
+        return None
+
+    def _kept(self, of: object, at: object, value: Columns) -> Columns:
+        self._known = ((of, at, _fixed(value)), *self._known[: RECENT - 1])
         return value
 
 
@@ -172,7 +203,7 @@ class IdealMotion:
         others = self.sampler.others(self, taken_s)
         R_wb = None if self.R_wb is None else others[:, :9].reshape(-1, 3, 3)
         names = {name: others[:, k - len(self.channels)] for k, name in enumerate(self.channels)}
-        return SensorSamples(stamp_s, gyro, accel, alpha, R_wb, names)
+        return SensorSamples(stamp_s, gyro, accel, alpha, R_wb, names, powers=self.sampler.vibration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,14 +217,25 @@ class SensorSamples:
     R_wb: Float64[np.ndarray, "n 3 3"] | None = None
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING)
     online: Signals | None = field(default=None, repr=False)
+    powers: Recent = field(default_factory=Recent, repr=False)
 
     @cached_property
     def signals(self) -> Signals:
         """Filtered signals: of a running filter (`online`), else of these samples at mean rate."""
         if self.online is not None:
             return self.online
-        rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
-        return SignalFilter(float(rate_hz), FILTERED.stop)(self.stamp_s, self.gyro, self.accel)
+        return SignalFilter(self._mean_rate_hz, FILTERED.stop)(self.stamp_s, self.gyro, self.accel)
+
+    @property
+    def vibration(self) -> Vectors:
+        """The signals' vibration power, which only the force changes."""
+        if self.online is not None:
+            return self.online.vibration
+        return self.powers.made(self.accel, self.stamp_s, lambda: vibration_power(self._mean_rate_hz, self.accel))
+
+    @property
+    def _mean_rate_hz(self) -> float:
+        return float((len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0]))
 
     @cached_property
     def load(self) -> Float64[np.ndarray, "n 3 11"]:
@@ -219,7 +261,7 @@ class SensorSamples:
     def with_readings(self, gyro: Vectors | None = None, accel: Vectors | None = None) -> SensorSamples:
         """The samples with other readings of one sensor, or of both."""
         kept = self.gyro if gyro is None else gyro, self.accel if accel is None else accel
-        return SensorSamples(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels)
+        return SensorSamples(self.stamp_s, *kept, self.alpha, self.R_wb, self.channels, powers=self.powers)
 
     def with_added(self, sensor: Sensor, added: Vectors) -> SensorSamples:
         """The samples with something added to one sensor."""

@@ -216,3 +216,16 @@ def low_pass(x: Float64[np.ndarray, "n k"], gain: float, before: Float64[np.ndar
     y += before_block[..., None] * keep ** (step + 1.0)
     out: Float64[np.ndarray, "n k"] = y.swapaxes(1, 2).reshape(-1, k)[:n]
     return out
+
+
+def vibration_power(rate_hz: float, accel: Vectors) -> Vectors:
+    """The signals' `vibration` of a whole log at once.
+
+    Six times faster than all signals, where scipy is imported anyway.
+    """
+    from scipy.signal import lfilter
+
+    slow, power = -np.expm1(-1.0 / (rate_hz * np.array([SLOW_S, POWER_S])))
+    mean = lfilter([slow], [1.0, slow - 1.0], accel, axis=0, zi=(1.0 - slow) * accel[:1])[0]
+    fast = accel - np.concatenate([accel[:1], mean[:-1]])
+    return np.asarray(lfilter([power], [1.0, power - 1.0], fast**2, axis=0))

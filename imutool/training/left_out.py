@@ -74,12 +74,13 @@ def compare(
     scores: list[Score] = []
     candidates = [c for c in CANDIDATES if all(_known(fit, c, sensor) for sensor, fit in fits.items())]
     for index, recording in enumerate(_logs(recordings, pool, fits["gyro"])):
-        models = {c: left_out_model(fits, pool, trained, c, index) for c in candidates}
-        log = _without_nuisances(recording, fits["gyro"], "constant", index)
+        effects = {c: {sensor: _names(fit, c, sensor, index) for sensor, fit in fits.items()} for c in candidates}
+        models = {c: left_out_model(fits, pool, trained, effects[c], index) for c in candidates}
+        log = _without_nuisances(recording, fits["gyro"], (), index)
         scores.append(_score(log, "raw", "", log.imu))
         scores += [_score(log, "static", start, imu) for start in STARTS for imu in _corrected(log, None, start)]
         for name, model in models.items():
-            log = _without_nuisances(recording, fits["gyro"], name, index)
+            log = _without_nuisances(recording, fits["gyro"], effects[name]["gyro"], index)
             scores += [_score(log, name, start, imu) for start in STARTS for imu in _corrected(log, model, start)]
     return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS})
 
@@ -147,16 +148,19 @@ def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, st
 
 
 def left_out_model(
-    fits: Mapping[Sensor, Calibration], pool: Pool, trained: BiasNetwork, candidate: str, index: int
+    fits: Mapping[Sensor, Calibration],
+    pool: Pool,
+    trained: BiasNetwork,
+    effects: Mapping[Sensor, Sequence[str]],
+    index: int,
 ) -> BiasModel:
-    """Model of a candidate, with its prior of the rest bias, from all logs but one."""
+    """Model of a candidate's effects, with its prior of the rest bias, from all logs but one."""
     network = hybrid.Network(Config(remainder=False), pool.rate_hz).double()
     rest = []
     for sensor, fit in fits.items():
-        names = _names(fit, candidate, sensor, index)
-        columns = parameter_columns(fit.forms, names)
+        columns = parameter_columns(fit.forms, effects[sensor])
         theta, covariance = fit.problem.solve(columns, without=index)
-        network.take(sensor, names, theta[columns], covariance)
+        network.take(sensor, effects[sensor], theta[columns], covariance)
         rest.append(np.delete(fit.problem.own_at(theta)[:, :3].cpu().numpy(), index, axis=0))
     for name, value in trained.named_buffers(recurse=False):
         getattr(network, name).copy_(value)
@@ -182,9 +186,9 @@ def _names(fit: Calibration, candidate: str, sensor: Sensor, index: int) -> tupl
     return tuple(form.name for form in fit.forms if form.name in gains)
 
 
-def _without_nuisances(log: Recording, fit: Calibration, candidate: str, index: int) -> Recording:
-    """Recording whose poses are turned and shifted onto the sensor, as far as a log left out shows that to a candidate."""
-    columns = parameter_columns(fit.forms, _names(fit, candidate, "gyro", index))
+def _without_nuisances(log: Recording, fit: Calibration, names: Sequence[str], index: int) -> Recording:
+    """Recording whose poses are turned and shifted onto the sensor, as far as a log left out shows that to some effects."""
+    columns = parameter_columns(fit.forms, names)
     own = fit.problem.own_at(fit.problem.solve(columns, without=index).theta)[index].cpu().numpy()
     turn, late_s = Rotation.from_rotvec(-own[3:6]), float(own[6])
     truth = log.truth

@@ -20,9 +20,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
+from support.forked import Forked
 from support.processes import soon
 
 from imutool.cli.demo import write_asl
@@ -33,6 +33,7 @@ from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
+from imutool.viewing.html import report
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -73,7 +74,8 @@ def made(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
 
 
 @pytest.fixture
-def here(made: Path, tmp_path: Path) -> Path:
+def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(report, "PICTURES", report.PICTURES[:1])  # of a page: they take seconds, and come ahead of its file
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
@@ -97,19 +99,22 @@ def partials(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if path.name.endswith(".partial")]
 
 
-def started(command: str, words: Sequence[str], cwd: Path, **options: Any) -> subprocess.Popen[str]:
+def installed(command: str, words: Sequence[str], cwd: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [command, *words, "-q"], cwd=cwd, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-        text=True, start_new_session=True, **options,
+        text=True, start_new_session=True,
     )  # fmt: skip
 
 
-def stopped(command: str, words: Sequence[str], folder: Path, number: signal.Signals) -> tuple[int, str, float]:
+def started(words: Sequence[str], cwd: Path) -> Forked:
+    return Forked([*words, "-q"], cwd)
+
+
+def stopped(process: Forked | subprocess.Popen[str], folder: Path, number: signal.Signals) -> tuple[int | None, str, float]:
     """Exit code, stderr and time to the end of a command that a signal hits while its partial file is there.
 
     The process stands still while this is looked at. Code 0: the moment passed between two looks, and it ended.
     """
-    process = started(command, words, folder)
     deadline = time.monotonic() + WAIT_S
     while process.poll() is None and not partials(folder) and time.monotonic() < deadline:
         time.sleep(POLL_S)
@@ -134,7 +139,8 @@ def test_a_signal_in_the_middle(here: Path, command: str, imutool: Run, name: st
     words, target = WRITERS[name]
     before = digests(here)
     for _ in range(TRIES):
-        code, stderr, seconds = stopped(command, words, here, number)
+        process = installed(command, words, here) if name in ("convert", *RERUN) else started(words, here)
+        code, stderr, seconds = stopped(process, here, number)
         if code:
             break
         shutil.rmtree(here / target) if (here / target).is_dir() else (here / target).unlink()
@@ -167,7 +173,7 @@ def session(pid: int) -> list[int]:
 def test_no_child_is_left_soon_after_sigterm(tmp_path: Path, command: str) -> None:
     for seed in range(3):
         write_asl(flight(seed, duration_s=30.0), tmp_path / "src" / f"s{seed}")
-    process = started(command, ["convert", "src", "out", "--workers", "2"], tmp_path)
+    process = installed(command, ["convert", "src", "out", "--workers", "2"], tmp_path)
     deadline = time.monotonic() + WAIT_S
     while len(session(process.pid)) < 3 and time.monotonic() < deadline:
         time.sleep(POLL_S)
@@ -187,16 +193,15 @@ AT_WORK: dict[str, Sequence[str]] = {
     "view --web": ["view", "in.mcap", "--web"],
 }  # fleets: tests/fleet/test_fleet.py
 CODES = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED, signal.SIGKILL: KILLED}
-READING_FOR_EVER = """
-import pathlib, sys, time
-from imutool.cli import main
-from imutool.mcap_io.storage.source import Source
-def read(source, offset, length):
-    pathlib.Path("reading").touch()
-    time.sleep(600)
-Source._read = read
-main()
-"""
+
+
+def read_for_ever() -> None:
+    def read(source: Source, offset: int, length: int) -> bytes:
+        Path("reading").touch()
+        time.sleep(600)
+        return b""
+
+    Source._read = read  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize("name", AT_WORK)
@@ -206,8 +211,7 @@ def test_a_signal_while_the_input_is_read(here: Path, name: str) -> None:
     for number in CODES:
         (folder := here / number.name).mkdir()
         shutil.copy(here / "in.mcap", folder)
-        words = [sys.executable, "-c", READING_FOR_EVER, *AT_WORK[name], "-q"]
-        runs[number] = subprocess.Popen(words, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True)
+        runs[number] = Forked([*AT_WORK[name], "-q"], folder, read_for_ever)
     before = digests(here)
     for number, run in runs.items():
         soon((here / number.name / "reading").exists)
@@ -304,10 +308,10 @@ def change_input(source: Path, change: str) -> None:
 
 @pytest.mark.parametrize("change", ["grows", "vanishes", "is cut"])
 @pytest.mark.parametrize("name", ["convert a log", "debias", "repair", "export"])
-def test_an_input_that_changes_while_it_is_read(here: Path, command: str, name: str, change: str) -> None:
+def test_an_input_that_changes_while_it_is_read(here: Path, name: str, change: str) -> None:
     """The output is whole and of the bytes that were there, or there is none and a message says why."""
     words, target = WRITERS[name]
-    process = started(command, words, here)
+    process = started(words, here)
     deadline = time.monotonic() + WAIT_S
     while process.poll() is None and not partials(here) and time.monotonic() < deadline:
         time.sleep(POLL_S)
@@ -362,10 +366,10 @@ def test_an_input_that_changes_at_a_read(
 
 
 @pytest.mark.parametrize("name", ["convert", "debias", "view", "train", "diagnose", "live"])
-def test_of_two_runs_at_once_to_one_target_one_wins(brief: Path, command: str, name: str) -> None:
+def test_of_two_runs_at_once_to_one_target_one_wins(brief: Path, name: str) -> None:
     words, target = WRITERS[name]
     words = words if name == "train" else [word.replace("in.mcap", "short.mcap") for word in words]
-    runs = [started(command, words, brief) for _ in range(2)]
+    runs = [started(words, brief) for _ in range(2)]
     said = [run.communicate(timeout=WAIT_S)[1] for run in runs]
     assert sorted(run.returncode for run in runs) == [0, CONFIG], said
     (loser,) = (text for run, text in zip(runs, said, strict=True) if run.returncode)

@@ -519,6 +519,20 @@ def test_what_is_remembered_never_outlives_a_change() -> None:
             np.testing.assert_array_equal(numbers(seen)[name], value, err_msg=name)
 
 
+@pytest.mark.parametrize("changed", [[], [1], [0, 2], [0, 1, 2]])
+def test_columns_taken_from_an_earlier_motion_are_those_of_a_new_one(changed: list[int]) -> None:
+    felt, t = lively(), clock() + 0.001
+    acting = [(only("mount_resonance"), np.array([20.0, 0.2, 0.5, 0.0, 0.5])), (only("low_pass"), np.array([15.0]))]
+    accel = felt.accel.copy()
+    accel[:, changed] += np.sin(felt.t_s)[:, None]
+    moved = replace(felt, accel=accel)
+    alone = IdealMotion(felt.t_s, felt.gyro, accel, felt.alpha, felt.R_wb, felt.channels)
+    seen, again, expected = (simulate_samples(one, t, acting) for one in (felt, moved, alone))
+    np.testing.assert_array_equal(again.gyro, expected.gyro)
+    np.testing.assert_array_equal(again.accel, expected.accel)
+    assert (seen.accel != again.accel).any(axis=0).tolist() == [k in changed for k in range(3)]
+
+
 def test_a_clock_that_is_not_even_is_refused() -> None:
     felt = still()
     t_s = felt.t_s.copy()

@@ -23,6 +23,7 @@ from imutool.sensor.signals import (
     VIBRATION,
     SignalFilter,
     Signals,
+    vibration_power,
 )
 
 RATE_HZ = 200.0
@@ -49,6 +50,11 @@ def close(a: np.ndarray, b: np.ndarray) -> None:
 def test_block_borders_change_nothing(cuts: list[int], seed: int) -> None:
     seen = samples(seed, 300)
     close(in_blocks(cuts, *seen), in_blocks([], *seen))
+
+
+def test_the_vibration_of_a_whole_log_is_that_of_the_filter() -> None:
+    t_s, gyro, accel = samples(2, 500)
+    close(vibration_power(RATE_HZ, accel), SignalFilter(RATE_HZ)(t_s, gyro, accel).vibration)
 
 
 def test_one_sample_at_a_time_is_the_block() -> None:

@@ -1,17 +1,17 @@
-"""One small log damaged in every way there is: `python damage.py cut|seeds LOG [OTHER]` prints what should not have happened.
+"""One small log damaged in every way there is, and what of that should not have happened.
 
-A process of its own, because annotations that are checked at every call make a hundred thousand small files take minutes.
+It runs in another process, because annotations that are checked at every call make a hundred thousand small files take minutes.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import random
 import signal
-import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from mcap.reader import make_reader
@@ -33,7 +33,7 @@ IN_PLACE = KINDS[:5]  # what is not damaged by these lies where it lay
 DOUBTFUL = 3  # messages outside chunks that may be given up for nothing: nothing shows where the one before a damage ends
 
 
-@contextmanager
+@contextlib.contextmanager
 def in_time(seconds: float = BUDGET_S, error: type[BaseException] = TimeoutError) -> Iterator[None]:
     """Ends a case that hangs."""
 
@@ -214,7 +214,10 @@ def check_repair(path: Path, damage: str) -> Iterator[str]:
         yield "the report counts something else"
 
 
-if __name__ == "__main__":
-    paths = [Path(word) for word in sys.argv[2:]]
-    for line in after_a_cut(*paths) if sys.argv[1] == "cut" else after_corruption(*paths):
-        print(line)
+def findings(what: str, *paths: Path) -> str:
+    """What should not have happened to a log that is cut (`cut`) or spoiled by seeds (`seeds`), or was said meanwhile."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        for line in after_a_cut(*paths) if what == "cut" else after_corruption(*paths):
+            print(line)
+    return said.getvalue()

@@ -28,6 +28,14 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module")
+def one_start() -> Iterator[None]:
+    """Left-out logs are scored from one start of three: finding starts is most of a small training, and proved elsewhere."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("imutool.training.left_out.STARTS", ("truth",))
+        yield
+
+
 def _perfect(seed: int, **changes: Any) -> Recording:
     """Exact samples of an exact motion, and the exact truth at the samples' own stamps."""
     settings = msgspec.convert(

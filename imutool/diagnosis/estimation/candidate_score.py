@@ -269,10 +269,10 @@ def unnamed_count(found: Fit) -> int:
     return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
 
 
-def bic(found: Fit, unnamed_penalty: float) -> float:
+def bic(found: Fit) -> float:
     """Bayesian information criterion (BIC): squares left and the cost of the parameters.
 
     An effect outside the catalogue costs more.
     """
-    count = len(parameters_of(found.chosen))
-    return found.objective + count * float(np.log(found.numbers)) + unnamed_penalty * unnamed_count(found)
+    count, penalty = len(parameters_of(found.chosen)), found.logs[0].pair.settings.search.unnamed_penalty
+    return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)

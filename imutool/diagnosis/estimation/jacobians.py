@@ -7,6 +7,7 @@ parameter and log, so a fit keeps them by effect and evaluates only the missing 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from bisect import bisect
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -17,10 +18,28 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog
 from imutool.diagnosis.estimation.whitening import Whitener
 from imutool.sensor.effect import Effect, Parameter, SignalState, Stage, Theta, in_stage_order, stage_order
+from imutool.sensor.samples import SensorSamples
 
 STEP, LOG_STEP = 1e-3, 1e-3  # of the plausible size, or of the logarithm
 
 Chosen = tuple[tuple[Effect, Theta], ...]
+
+
+class AddedColumns(ABC):
+    """Forward model of columns on one axis, times the parameters: they are its derivatives."""
+
+    sensor: int
+    axis: int
+
+    @abstractmethod
+    def columns_at(self, samples: SensorSamples) -> Float64[np.ndarray, "n q"]:
+        """Columns at some samples, one for each parameter."""
+
+    def __call__(self, samples: SensorSamples, theta: Theta) -> SensorSamples:
+        """The samples with the columns on them."""
+        out = (samples.gyro if self.sensor == 0 else samples.accel).copy()
+        out[:, self.axis] += self.columns_at(samples) @ theta
+        return samples.with_readings(gyro=out) if self.sensor == 0 else samples.with_readings(accel=out)
 
 
 class ForwardPass:
@@ -63,6 +82,10 @@ class ForwardPass:
         if effect.stage > Stage.CLOCK:
             self._states[place] = self._states[place].sampled()
         x, before = free(effect, theta), self._states[place]
+        if isinstance(effect.forward, AddedColumns) and not behind:
+            rows = np.ascontiguousarray(effect.forward.columns_at(before.samples()).T)
+            yield from ((3 * effect.forward.sensor + effect.forward.axis, j, row) for j, row in enumerate(rows) if row.any())
+            return
         for j, parameter in enumerate(effect.parameters):
             h = step_of(parameter)
             only_j = np.arange(len(x)) == j  # the others stay to the last bit: their rounding would look like a derivative

@@ -20,6 +20,7 @@ from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEff
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
+    FOLLOWING,
     below_model_error,
     beyond_the_band,
     has_no_size,
@@ -70,7 +71,7 @@ def select_effects(
     if unnamed and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
-        if bic(other[1], settings.unnamed_penalty) < bic(now, settings.unnamed_penalty) - settings.clearly_better:
+        if bic(other[1]) < bic(now) - settings.clearly_better:
             search, now = other
     return search.tested(search.simplified(now))
 
@@ -163,8 +164,7 @@ class _Search:
         if fine is None:
             return now
         trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
-        penalty = self.settings.unnamed_penalty
-        return trial if bic(trial, penalty) < bic(now, penalty) - self.settings.clearly_better else now
+        return trial if bic(trial) < bic(now) - self.settings.clearly_better else now
 
     def exchanged(self, now: Fit) -> Fit:
         """Fit with an effect replaced by another of the catalogue that explains more."""
@@ -233,15 +233,13 @@ class _Search:
         first = len(self.always)
         while len(now.chosen) > first:
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
-            other = fit(self.logs, now.chosen, part="held_out", near=now)
             whole = fit(self.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
                 now = fit(self.logs, reduced)
                 continue
+            other = fit(self.logs, now.chosen, part="held_out", near=now)
             whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
-            scattered = self._scattered(whole)
-            tests = [self._verdict(k, now, other, whole, scattered) for k in range(first, len(now.chosen))]
-            verdicts = self._beyond_model_error(tests)
+            verdicts = self._verdicts(now, other, whole)
             worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
             if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
                 selected = [replace(verdict, similar=tuple(self._rivals(first + k, now))) for k, verdict in enumerate(verdicts)]
@@ -249,12 +247,6 @@ class _Search:
                 return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried, first)
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
         return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried, first)
-
-    def _scattered(self, found: Fit) -> Scatter | None:
-        """Robust covariance; none where the noise is known and the residuals are as white."""
-        if all(log.pair.exact for log in self.logs) and found.objective < self.settings.white_chi_square * found.numbers:
-            return None
-        return scatter(self.logs, found, found.part, self.settings.robust_block_s)
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
         """Fits with another effect of the catalogue in the place of one, that leave about as little (Akaike's criterion)."""
@@ -278,8 +270,7 @@ class _Search:
         log_p = self.candidates.log_p(effect, gain)
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
-        parts, block_s = ((fitted, "held_out"), (other, "fitted")), self.settings.held_out_block_s
-        blocks = np.concatenate([held_out_gains(log, of, k, part, block_s) for of, part in parts for log in self.logs])
+        blocks = np.concatenate([held_out_gains(fitted, k, "held_out"), held_out_gains(other, k, "fitted")])
         exact_p = prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
         held_out_p = min(held_out_p_value(blocks[:, 0]), exact_p)
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
@@ -292,9 +283,16 @@ class _Search:
         unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
         return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain)
 
-    def _beyond_model_error(self, verdicts: Sequence[SelectedEffect]) -> list[SelectedEffect]:
-        """Verdicts, with no trust in what may be the model error of a far larger effect."""
-        pairs, gains = [log.pair for log in self.logs], {verdict.effect.key: verdict.gain for verdict in verdicts}
-        denoised, poses = any(pair.denoised for pair in pairs), not all(pair.exact for pair in pairs)
-        hidden = below_model_error(gains, self.settings, denoised=denoised, poses=poses)
+    def _verdicts(self, fitted: Fit, other: Fit, whole: Fit) -> list[SelectedEffect]:
+        """Verdicts with no trust in model errors of far larger effects; up to the first effect that goes in any case."""
+        exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
+        white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
+        scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
+        for k in range(len(self.always), len(whole.chosen)):
+            verdicts.append(self._verdict(k, fitted, other, whole, scattered))
+            if verdicts[-1].false_discovery_rate == 1.0 and not FOLLOWING & {one.effect.key for one in verdicts[:-1]}:
+                return verdicts  # a later one could show a model error only of those that follow the motion
+        gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
+        denoised = any(log.pair.denoised for log in self.logs)
+        hidden = below_model_error(gains, self.settings, denoised=denoised, poses=not exact)
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in hidden else verdict for verdict in verdicts]

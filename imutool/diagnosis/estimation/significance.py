@@ -22,7 +22,7 @@ from scipy.stats import t as student
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors, with_value
-from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 
@@ -66,21 +66,23 @@ def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
     return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
 
 
-def held_out_gains(log: WhitenedLog, fitted: Fit, k: int, part: str, block_s: float) -> Float64[np.ndarray, "b 2"]:
+def held_out_gains(fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
     """Gain in squares by an effect, and squares of its prediction, on held-out blocks."""
-    chosen = fitted.chosen
-    with_, without = (_white(log, effects, part) for effects in (chosen, (*chosen[:k], *chosen[k + 1 :])))
-    rows = log.rows(part)
-    block = np.floor(log.pair.stamp_s[:: log.whiten.every][rows] / block_s).astype(int)
-    each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
-    names, inverse = np.unique(block, return_inverse=True)
-    return np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1)
+    others, out = (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), []
+    block_s = fitted.logs[0].pair.settings.search.held_out_block_s
+    for log, forward in zip(fitted.logs, fitted.passes, strict=True):
+        with_, without = (_white(log, one.expected, part) for one in (forward, ForwardPass(log.pair, others, forward)))
+        block = np.floor(log.pair.stamp_s[:: log.whiten.every][log.rows(part)] / block_s).astype(int)
+        each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
+        names, inverse = np.unique(block, return_inverse=True)
+        out.append(np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1))
+    return np.concatenate(out)
 
 
-def _white(log: WhitenedLog, chosen: Chosen, part: str) -> Float64[np.ndarray, "n k"]:
+def _white(log: WhitenedLog, expected: Float64[np.ndarray, "m k"], part: str) -> Float64[np.ndarray, "n k"]:
     """White residuals of a part, with the best constant for that part."""
     rows = log.rows(part)
-    residual = log.residual(expected(log.pair, chosen))[rows]
+    residual = log.residual(expected)[rows]
     constant = log.constants[rows]
     return np.asarray(residual - constant * ((constant * residual).sum(0) / np.maximum((constant * constant).sum(0), 1e-300)))
 

@@ -18,9 +18,10 @@ from scipy.interpolate import BSpline
 
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import AddedColumns
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.samples import SensorSamples, Vectors
+from imutool.sensor.samples import SensorSamples
 from imutool.sensor.unnamed_effects import VARIABLES, Variable, product_of
 from imutool.sensor.unnamed_effects import driven as channel_effect
 from imutool.units import AXES, SENSORS, UNITS
@@ -72,7 +73,8 @@ def curves(like: SensorSamples) -> Iterator[Effect]:
     for variable in VARIABLES:
         inner = _knots(like, variable, KNOTS)
         if inner is not None:
-            yield from (_curve(variable, k, axis, inner) for k in range(len(SENSORS)) for axis in range(3))
+            splines = SplineBasis(inner)
+            yield from (_curve(variable, k, axis, splines) for k in range(len(SENSORS)) for axis in range(3))
 
 
 def finer(effect: Effect, like: SensorSamples) -> Effect | None:
@@ -81,7 +83,7 @@ def finer(effect: Effect, like: SensorSamples) -> Effect | None:
     if not isinstance(coarse, Curve):
         return None
     inner = _knots(like, coarse.variable, FINE_KNOTS)
-    return None if inner is None else _curve(coarse.variable, coarse.sensor, coarse.axis, inner)
+    return None if inner is None else _curve(coarse.variable, coarse.sensor, coarse.axis, SplineBasis(inner))
 
 
 def _knots(like: SensorSamples, variable: str, count: int) -> Float64[np.ndarray, " p"] | None:
@@ -96,16 +98,16 @@ def _knots(like: SensorSamples, variable: str, count: int) -> Float64[np.ndarray
     return inner if np.diff(inner).min() > SPREAD * max(1.0, np.abs(inner).max()) else None
 
 
-def _curve(variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> Effect:
+def _curve(variable: str, sensor: int, axis: int, splines: SplineBasis) -> Effect:
     signal = SENSORS[sensor]
     return Effect(
         "unknown",
         Stage.SENSOR,
         (signal,),
         f"{signal}.{AXES[axis]} += curve({variable})",
-        tuple(Parameter(f"c{j}", UNITS[signal], PLAUSIBLE[signal]) for j in range(len(inner) + 2)),
+        tuple(Parameter(f"c{j}", UNITS[signal], PLAUSIBLE[signal]) for j in range(len(splines.inner) + 2)),
         f"{variable} varies",
-        Curve(variable, sensor, axis, inner),
+        Curve(variable, sensor, axis, splines),
         kind="unknown",
         variable=variable,
         axis=axis,
@@ -151,16 +153,19 @@ class SplineCurve(SplineBasis, ABC):
         """The samples with the curve on them."""
 
 
-class Curve(SplineCurve):
-    """+ a spline of one variable on one axis of an IMU."""
+class Curve(AddedColumns, SplineCurve):
+    """+ a spline of one variable on one axis of an IMU.
 
-    def __init__(self, variable: str, sensor: int, axis: int, inner: Float64[np.ndarray, " p"]) -> None:
-        super().__init__(variable, unit(variable), inner, columns=len(AXES), axis=axis)
-        self.sensor = sensor
+    Curves of one variable share their splines.
+    """
 
-    def __call__(self, samples: SensorSamples, theta: Theta) -> SensorSamples:
-        """The reading with the curve on it."""
-        return _on_axis(samples, self.sensor, self.axis, self.basis(VARIABLES[self.variable](samples)) @ theta)
+    def __init__(self, variable: str, sensor: int, axis: int, splines: SplineBasis) -> None:
+        super().__init__(variable, unit(variable), splines.inner, columns=len(AXES), axis=axis)
+        self.sensor, self._splines = sensor, splines
+
+    def columns_at(self, samples: SensorSamples) -> Float64[np.ndarray, "n q"]:
+        """The splines."""
+        return self._splines.basis(VARIABLES[self.variable](samples))
 
 
 def library() -> Iterator[str]:
@@ -194,18 +199,12 @@ def terms(like: SensorSamples) -> Iterator[Effect]:
                 )
 
 
-class _Term:
+class _Term(AddedColumns):
     def __init__(self, term: Variable, sensor: int, axis: int) -> None:
         self.term, self.sensor, self.axis = term, sensor, axis
 
-    def __call__(self, read: SensorSamples, theta: Theta) -> SensorSamples:
-        return _on_axis(read, self.sensor, self.axis, theta[0] * self.term(read))
-
-
-def _on_axis(read: SensorSamples, sensor: int, axis: int, added: Float64[np.ndarray, " n"]) -> SensorSamples:
-    out: Vectors = (read.gyro if sensor == 0 else read.accel).copy()
-    out[:, axis] += added
-    return read.with_readings(gyro=out) if sensor == 0 else read.with_readings(accel=out)
+    def columns_at(self, samples: SensorSamples) -> Float64[np.ndarray, "n 1"]:
+        return self.term(samples)[:, None]
 
 
 def like(pairs: Sequence[Pair]) -> SensorSamples:

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 
 from imutool.array_types import Complex128, Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
-from imutool.sensor.samples import IdealMotion
+from imutool.sensor.samples import IdealMotion, Vectors
 
 START_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 AHEAD, BEHIND = 5, 8  # samples that a tap looks ahead and back: this is no filter for samples as they arrive
@@ -36,8 +36,8 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     if math.isinf(cutoff_hz[0]):
         return motion
     a = 2.0 * math.pi * float(cutoff_hz[0]) / motion.rate_hz  # rad a sample
-    both = filtered(np.concatenate([motion.gyro, motion.accel, motion.alpha], axis=1), _first_order(a))
-    return replace(motion, gyro=both[:, :3], accel=both[:, 3:6], alpha=both[:, 6:])
+    gyro, accel, alpha = (slowed(motion, x, _first_order(a)) for x in (motion.gyro, motion.accel, motion.alpha))
+    return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
 class Filter(NamedTuple):
@@ -61,6 +61,11 @@ class Filter(NamedTuple):
 @lru_cache(maxsize=64)
 def _first_order(a: float) -> Filter:
     return Filter.of(a / (1j * OMEGA + a), np.array([1.0, -math.exp(-a)]))
+
+
+def slowed(motion: IdealMotion, x: Vectors, by: Filter) -> Vectors:
+    """Columns of a motion behind a filter."""
+    return motion.sampler.behind.changed(x, by, lambda columns: filtered(columns, by))
 
 
 def filtered(x: Float64[np.ndarray, "n k"], by: Filter) -> Float64[np.ndarray, "n k"]:

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, starts_at
-from imutool.sensor.effects.low_pass import OMEGA, Filter, filtered
+from imutool.sensor.effects.low_pass import OMEGA, Filter, slowed
 from imutool.sensor.samples import IdealMotion
 
 START_HZ = (4.0, 8.0, 15.0, 30.0, 50.0)
@@ -25,7 +25,7 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     if not share.any():
         return motion
     by = _spring(2.0 * math.pi * float(theta[0]) / motion.rate_hz, float(theta[1]))
-    return replace(motion, accel=motion.accel + share * (filtered(motion.accel, by) - motion.accel))
+    return replace(motion, accel=motion.accel + share * (slowed(motion, motion.accel, by) - motion.accel))
 
 
 @lru_cache(maxsize=64)

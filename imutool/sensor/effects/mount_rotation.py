@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache, partial
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
+from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
 from imutool.sensor.samples import IdealMotion
 
 
 def _forward(motion: IdealMotion, phi: Theta) -> IdealMotion:
     """R_bi = Exp(phi) takes the sensor's vectors to the body; R_wb stays the body's attitude."""
-    R_bi = Rotation.from_rotvec(phi).as_matrix()
-    return replace(motion, gyro=motion.gyro @ R_bi, accel=motion.accel @ R_bi, alpha=motion.alpha @ R_bi)
+    R_bi = _rotation(*phi.tolist())
+    turned = motion.sampler.behind.made
+    gyro, accel, alpha = (turned(x, R_bi, partial(np.matmul, x, R_bi)) for x in (motion.gyro, motion.accel, motion.alpha))
+    return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
+
+
+@lru_cache(maxsize=64)
+def _rotation(*phi: float) -> Float64[np.ndarray, "3 3"]:
+    return np.asarray(Rotation.from_rotvec(phi).as_matrix())
 
 
 EFFECT = Effect(

@@ -12,7 +12,7 @@ from imutool.sensor.samples import SensorSamples
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
     """K of the gyro, then of the accelerometer."""
-    power = samples.signals.vibration
+    power = samples.vibration
     return samples.with_readings(samples.gyro + power @ k[:9].reshape(3, 3).T, samples.accel + power @ k[9:].reshape(3, 3).T)
 
 

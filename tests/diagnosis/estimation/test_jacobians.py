@@ -8,6 +8,7 @@ from scipy.signal import firwin
 from support import planted
 from support.planted import simulate_samples
 
+from imutool.diagnosis.estimation import unnamed_effects
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
 from imutool.diagnosis.estimation.gauss_newton import fit
@@ -73,6 +74,20 @@ def test_the_jacobian_of_a_linear_effect_needs_no_pass_through_it(pair: Pair, ph
     np.testing.assert_array_equal(beside.axes, there.axes)
     np.testing.assert_array_equal(beside.parameters, there.parameters)
     np.testing.assert_allclose(beside.rows, there.rows, rtol=1e-12)
+
+
+@pytest.mark.parametrize("others", [{}, {"vibration_rectification": [1e-4] * 18}], ids=["last", "with one behind"])
+def test_columns_that_are_added_are_the_differences_of_the_whole(pair: Pair, others: dict[str, list[float]]) -> None:
+    acting = planted.acting({"gyro_scale": [0.01, 0.0, 0.0], **others})
+    read = unnamed_effects.like([pair])
+    for physics in (*list(unnamed_effects.curves(read))[::17], *list(unnamed_effects.terms(read))[::97]):
+        slope = effect_jacobian(Whitener(np.ones((6, 1)), np.ones(6)), ForwardPass(pair, acting), physics)
+        base = ForwardPass(pair, acting).expected
+        for j, (row, axis) in enumerate(zip(slope.rows, slope.axes, strict=True)):
+            theta = np.where(np.arange(slope.width) == slope.parameters[j], physics.plausible, 0.0)
+            there = ForwardPass(pair, (*acting, (physics, 1e-3 * theta))).expected - base
+            size = 1e-3 * physics.plausible[slope.parameters[j]]
+            np.testing.assert_allclose(row, there[:, axis] / size, atol=ROUNDED * np.abs(row).max())
 
 
 @pytest.mark.parametrize("name", ["mount_resonance", "gyro_bias_drift", "accel_bias_drift", "vibration"])

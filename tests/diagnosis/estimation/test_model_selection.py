@@ -124,6 +124,22 @@ def test_noise_and_a_bias_are_nothing(seed: int) -> None:
     assert found.tried > len(planted.catalogue())
 
 
+def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    logs, candidates = (
+        [planted.weighed(planted.pair(planted.rich(4, DURATION_S), {"gyro_scale": [0.02, 0.0, 0.01]}, 4))],
+        planted.catalogue(),
+    )
+    now = fit(logs, planted.acting({"gyro_scale": [0.02, 0.0, 0.01], "accel_scale": [0.0] * 3, "clock_offset": [0.0]}))
+    known, settings = Candidates(logs, candidates), logs[0].pair.settings.search
+    search = model_selection._Search(logs, candidates, (), (), fit(logs, ()).objective, settings, lambda word: None, known)
+    short = search.tested(now)
+    monkeypatch.setattr(model_selection, "FOLLOWING", frozenset(now.keys))  # whatever it is, the others may matter to it
+    whole = search.tested(now)
+    assert names(short) == names(whole) == ["gyro_scale"]
+    np.testing.assert_array_equal(short.selected[0].theta, whole.selected[0].theta)
+    assert short.selected[0].gain == whole.selected[0].gain
+
+
 # ── one, two ──
 
 

@@ -337,15 +337,15 @@ def test_means_follow_a_line_and_their_bands_count_blocks_not_samples() -> None:
 # ── files ──
 
 
-def test_it_is_written_and_an_existing_page_is_kept(tmp_path: Path, nothing: str) -> None:
-    target = tmp_path / "report.html"
-    write(diagnoses.NOTHING, target)
-    assert target.read_text(encoding="utf-8") == nothing
+def test_it_is_written_and_an_existing_page_is_kept(tmp_path: Path) -> None:
+    target, bare = tmp_path / "report.html", replace(diagnoses.NOTHING, traces=())
+    write(bare, target)
+    assert target.read_text(encoding="utf-8") == html(bare)
     with pytest.raises(ConfigError, match="exists"):
         write(diagnoses.LATE, target)
-    assert target.read_text(encoding="utf-8") == nothing
+    assert target.read_text(encoding="utf-8") == html(bare)
     write(replace(diagnoses.LATE, traces=()), target, overwrite=True)
-    assert target.read_text(encoding="utf-8") != nothing
+    assert target.read_text(encoding="utf-8") != html(bare)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
 
 
