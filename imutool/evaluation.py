@@ -15,12 +15,11 @@ from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias_start.aided_path import aided_path
+from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
-from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
+from imutool.bias_start.initial_bias import InitialBias, relative_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.bias_start.prior_width import BiasPrior
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
@@ -33,7 +32,6 @@ from imutool.recording import Imu, Poses, Recording
 RAW = "raw"
 DRIFT_S = 5.0
 PURE, AIDED = "integration", "aided"
-RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
 Refused = Callable[[str, ImutoolError], None]
 
 
@@ -98,7 +96,7 @@ def _evaluated(
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
         if aids is not None:
-            estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), _left(start, std), aids)
+            estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), residual_prior(start, std), aids)
         for kind, estimate in estimates.items():
             results.append(
                 {
@@ -137,16 +135,12 @@ def _over(imu: Imu, true: Poses) -> Imu:
     return rows
 
 
-def _left(start: InitialBias | None, std: Float64[np.ndarray, "n 6"]) -> BiasPrior:
-    """Prior of the residual bias: as the start states, or less where the tracked bias became more certain."""
-    least = np.median(std, axis=0) if start is None else np.minimum(start.std, np.median(std, axis=0))
-    return BiasPrior(np.zeros(6), np.maximum(least, LEAST_STD), AT_REST_STD)
-
-
-def _corrected(imu: Imu, model: BiasModel | None, start: InitialBias | None) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"]]:
-    """Samples corrected by a model, with the deviation of its bias; without one as they are, with a wide one."""
+def _corrected(
+    imu: Imu, model: BiasModel | None, start: InitialBias | None
+) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"] | None]:
+    """Samples corrected by a model, with the deviation of its bias; without one as they are."""
     if model is None or start is None:
-        return DebiasedImu(imu, np.zeros((len(imu), 6))), np.tile(RAW_STD, (len(imu), 1))
+        return DebiasedImu(imu, np.zeros((len(imu), 6))), None
     return apply_with_std(model, start, imu)
 
 

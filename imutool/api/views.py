@@ -34,6 +34,7 @@ def load_run(
     truth: str | None = None,
     align: str = "none",
     findings: str | Path | None = None,
+    aid: str | None = None,
 ) -> RunData:
     """Traces, errors, figures and events of one log, as `view` shows them.
 
@@ -46,9 +47,11 @@ def load_run(
         truth: Topic of the true poses; by default the first.
         align: Alignment of each path with the truth: `none`, `origin`, `yaw` or `se3`.
         findings: Folder of a diagnosis, whose findings become events.
+        aid: Also the smoothed path of each model with aids, as in `evaluate`.
 
     Returns:
-        `traces`, one for `raw` and one per model, each with `run`, `path`, `errors` and `windows`; `events`; and `table()`.
+        `traces` (of `raw`, each model and each aided path), each with `run`, `path`, `errors` and `windows`; `events`; and
+        `table()`.
 
     Raises:
         ConfigError: A file cannot be read, or options contradict each other.
@@ -72,6 +75,7 @@ def load_run(
         truth=truth,
         align=alignment(align),
         findings=None if findings is None else local(findings, "findings"),
+        aid=aid,
     )
 
 
@@ -107,7 +111,7 @@ def view(
         png: Folder for pictures.
         html: Page in one file.
         overwrite: Replace existing files.
-        **options: Options of `load_run`: `models`, `init`, `smooth`, `imu`, `truth`, `align`, `findings`.
+        **options: Options of `load_run`: `models`, `init`, `smooth`, `imu`, `truth`, `align`, `findings`, `aid`.
 
     Returns:
         One entry per output: `kind`, `address`, and a sentence, `said`.

@@ -22,7 +22,7 @@ from msgspec import Meta
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import Vector6
 from imutool.bias_start.bias_tracking import Aiding, BiasFilter, FilteredBlock, smooth_blocks
-from imutool.bias_start.initial_bias import relative_samples
+from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, relative_samples
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.config import Settings
 from imutool.geometry import quaternion
@@ -36,6 +36,7 @@ from imutool.recording import Imu, Poses, seconds
 START_STD = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3] * 3)  # rad, m/s, m: of the start pose
 HEIGHT, LEVER, MOUNT, SCALE = slice(0, 1), slice(1, 4), slice(4, 7), slice(7, 8)  # of the offsets
 OFFSETS = 8
+RAW_STD = (0.1, 0.1, 0.1, 0.5, 0.5, 0.5)  # rad/s and m/s²: biases of a consumer sensor nobody calibrated
 UNBOUNDED_M_S = 1e3  # a bound on speed that says nothing
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -58,6 +59,16 @@ class AidSettings(Settings, frozen=True, kw_only=True):
     height_walk_m: Positive = 0.05  # per second^1/2
     height_window_s: Positive = 0.5
     rate_window_s: Positive = 0.1
+
+
+def residual_prior(start: InitialBias | None = None, std: Float64[np.ndarray, "n 6"] | None = None) -> BiasPrior:
+    """Prior of the bias that is left after a model.
+
+    It is as wide as the start states, or less where `std`, the deviation of the subtracted bias, became smaller.
+    """
+    median = np.array(RAW_STD) if std is None else np.median(std, axis=0)
+    least = median if start is None else np.minimum(start.std, median)
+    return BiasPrior(np.zeros(6), np.maximum(least, LEAST_STD), AT_REST_STD)
 
 
 def aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids, settings: AidSettings | None = None) -> Poses:

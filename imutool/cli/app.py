@@ -200,6 +200,13 @@ Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Start bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]
+Aid = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND,...",
+        help="Also show the smoothed path with stops, barometer, odometry, ground; auto: all that the log has.",
+    ),
+]
 Imu = Annotated[str | None, typer.Option(help="IMU topic, where a log has several; gyro=TOPIC,accel=TOPIC joins two.")]
 Imus = Annotated[
     list[str] | None,

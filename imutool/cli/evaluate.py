@@ -12,7 +12,22 @@ import typer
 from msgspec import convert, field
 
 from imutool.bias_start import Fitness
-from imutool.cli.app import Imu, Init, Json, Logs, Models, Overwrite, Quiet, ReportPage, Smooth, Truth, Verbose, Written, app
+from imutool.cli.app import (
+    Aid,
+    Imu,
+    Init,
+    Json,
+    Logs,
+    Models,
+    Overwrite,
+    Quiet,
+    ReportPage,
+    Smooth,
+    Truth,
+    Verbose,
+    Written,
+    app,
+)
 from imutool.cli.terminal import figures, progress, say, table, write_json
 from imutool.errors import ImutoolError
 from imutool.report import UNSET, Report, Section, UnsetType
@@ -20,7 +35,6 @@ from imutool.report import UNSET, Report, Section, UnsetType
 logger = logging.getLogger(__name__)
 
 ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
-AID_HELP = "Also score the smoothed path with stops, barometer, odometry, ground; auto: all that the log has."
 TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
@@ -73,7 +87,7 @@ def evaluate(
     model: Models = None,
     init: Init = "auto",
     smooth: Smooth = False,
-    aid: Annotated[str | None, typer.Option(metavar="KIND,...", help=AID_HELP)] = None,
+    aid: Aid = None,
     zupt: Annotated[bool, typer.Option("--zupt", help="The same as --aid stops.")] = False,
     truth: Truth = None,
     imu: Imu = None,
@@ -99,7 +113,7 @@ def evaluate(
     if report is not None:
         require_matplotlib()
     results: list[dict[str, Any]] = []
-    loaded = []
+    loaded, asked = [], aid or ("stops" if zupt else None)
     errors: list[ImutoolError] = []
     with progress("Evaluating", verbose, quiet) as tell:
         for done, log in enumerate(logs):
@@ -108,12 +122,12 @@ def evaluate(
             refused: dict[str, ImutoolError] = {}
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
             more: dict[str, Any] = {"trajectories": trajectories, "overwrite": overwrite, "refused": refused.__setitem__}
-            results += run(log, models=model or (), aid=aid or ("stops" if zupt else None), **read, **more)
+            results += run(log, models=model or (), aid=asked, **read, **more)
             errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
-                run_data = load(log, models=scored, **read)
-                loaded.append(replace(run_data, notes=(*run_data.notes, *_fits(results[first:]), *_aided(results[first:]))))
+                run_data = load(log, models=scored, aid=asked, **read)
+                loaded.append(replace(run_data, notes=(*run_data.notes, *_fits(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
             pages.write_page(loaded, report, overwrite=overwrite)
@@ -146,22 +160,12 @@ def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
     return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
 
 
-def _aided(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences about the scores of aided paths, for a report that draws pure integration."""
-    return _used(results) + [
-        f"Aided, {row['model']} has an orientation error of {row['aoe_deg']:.2f}°, a position error of {row['ape_m']:.2f} m "
-        f"and a velocity error of {row['velocity_rmse_m_s']:.2f} m/s."
-        for row in results
-        if row["estimate"] == "aided"
-    ]
-
-
 def _used(results: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences about the aids of each log."""
+    from imutool.inertial.aids import listed
+
     used = {row["log"]: row["aids"] for row in results if row["aids"]}
-    return [
-        f"{log}, aids: {', '.join(f'{kind} {signal}'.strip() for kind, signal in aids.items())}" for log, aids in used.items()
-    ]
+    return [f"{log}, aids: {listed(aids)}" for log, aids in used.items()]
 
 
 @app.command(epilog="Example: [bold]imutool vio MH_04.mcap --model adis.safetensors --blackout 3[/]")

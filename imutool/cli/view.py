@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli.app import HTML, Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
+from imutool.cli.app import HTML, Aid, Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import progress, say, write_json
 from imutool.mcap_io.storage import outputs
 from imutool.report import Report
@@ -42,6 +42,7 @@ def view(
     smooth: Smooth = False,
     truth: Truth = None,
     imu: Imu = None,
+    aid: Aid = None,
     align: Annotated[str, typer.Option(metavar="none|origin|yaw|se3", help=ALIGN_HELP)] = "none",
     findings: Annotated[Path | None, typer.Option(metavar="DIR", help="Mark the findings of this diagnosis folder.")] = None,
     source: Annotated[bool, typer.Option("--source/--no-source", help=SOURCE_HELP)] = True,
@@ -72,7 +73,8 @@ def view(
     from imutool.viewing.outputs import Outputs, RequestedOutputs
 
     aligned = alignment(align)
-    read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, align=aligned, findings=findings)
+    read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, aid=aid)
+    read = partial(read, align=aligned, findings=findings)
     asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, overwrite)
     with Outputs(asked) as outputs:
         with progress("Reading", verbose, quiet) as tell:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +67,11 @@ class Aids:
     signals: dict[str, str]
     height: Scalars | None = None
     odometry: Odometry | None = None
+
+
+def listed(signals: Mapping[str, str]) -> str:
+    """Kinds of aids with what measures them, for a sentence."""
+    return ", ".join(f"{kind} {signal}".strip() for kind, signal in signals.items())
 
 
 def parse_aids(words: str) -> dict[str, str]:

@@ -63,6 +63,7 @@ def zoom(data: RunData) -> Picture | None:
 
 def biases(data: RunData) -> Picture | None:
     """Bias of each model with three standard deviations where stated, and the true bias."""
+    data = data.integrated()
     models = data.models()
     if not models:
         return None
@@ -77,6 +78,7 @@ def biases(data: RunData) -> Picture | None:
 
 def spectrum(data: RunData) -> Picture | None:
     """Amplitude density of the samples up to half their rate; None for a short log."""
+    data = data.integrated()
     if not any(trace.spectra for trace in data.traces):
         return None
     curves = {
@@ -114,6 +116,7 @@ def allan_deviation(data: RunData) -> Picture | None:
     """
     if find_spec("allantools") is None:
         return None
+    data = data.integrated()
     imu = data.traces[0].run.imu
     ranges = [(a, b) for a, b in stationary.rest_stretches(imu) if (b - a) * imu.period_s >= MIN_REST_S]
     if not ranges:
@@ -149,6 +152,7 @@ def missing_pictures() -> list[str]:
 
 
 def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[float, float]) -> Picture:
+    data = data.integrated()
     panels = [
         Panel(partial(_draw_samples, data=data, sensor=sensor, span_s=span_s), SAMPLES_INCH, f"{NOUNS[sensor]} by axis")
         for sensor in SENSORS

@@ -23,7 +23,7 @@ NOT_ERRORS = ("samples", "duration_s")  # no errors
 
 def best_run(data: RunData) -> Trace | None:
     """Run with the smallest orientation error, a model if there is one; None without truth."""
-    scored = [trace for trace in data.traces if trace.figures.get("aoe_deg") is not None]
+    scored = [trace for trace in data.integrated().traces if trace.figures.get("aoe_deg") is not None]
     models = [trace for trace in scored if not trace.is_raw]
     return min(models or scored, key=lambda trace: float(trace.figures["aoe_deg"]), default=None)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -14,8 +14,11 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64, Int64
+from imutool.bias_start.aided_path import aided_path
+from imutool.bias_start.prior_width import BiasPrior
 from imutool.errors import DataError
-from imutool.inertial.strapdown import StartPose
+from imutool.inertial.aids import Aids
+from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Poses, Scalars, Times, nanoseconds, seconds
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.trajectory_error import Alignment, Drift, Errors, Window
@@ -31,6 +34,7 @@ TRUE_BIAS = {"gyro": "/ground_truth/bias/gyro", "accel": "/ground_truth/bias/acc
 class Run:
     """IMU samples, raw or corrected by a model, with the subtracted bias (zeros for raw).
 
+    `path_from` gives the path of samples from a start pose: pure integration, or a smoothed path with aids.
     `bias_std` is one standard deviation of the bias, gyro (rad/s) then accel (m/s²), where the model states it. `start` is the
     method of the initial bias (`init`), where it is known.
     """
@@ -41,6 +45,7 @@ class Run:
     accel_bias: Float64[np.ndarray, "n 3"]
     bias_std: Float64[np.ndarray, "n 6"] | None = None
     start: str = ""
+    path_from: Callable[[Imu, StartPose], Poses] = dead_reckon
 
     def __post_init__(self) -> None:
         for name in ("gyro_bias", "accel_bias", "bias_std"):
@@ -53,6 +58,14 @@ class Run:
         """Run of the IMU as recorded."""
         zeros = np.zeros_like(imu.gyro)
         return cls(RAW, imu, zeros, zeros)
+
+    def aided(self, aids: Aids, prior: BiasPrior) -> Run:
+        """The same samples, with a smoothed path by the aids of the log; `prior` is that of the bias that is left."""
+
+        def smoothed(imu: Imu, start: StartPose) -> Poses:
+            return aided_path(imu, start, prior, aids)
+
+        return replace(self, name=f"{self.name} aided", path_from=smoothed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +92,11 @@ class Trace:
     def is_raw(self) -> bool:
         """Whether the run is the IMU as recorded."""
         return self.run.name == RAW
+
+    @property
+    def is_aided(self) -> bool:
+        """Whether the path is smoothed with aids; its samples are those of another run."""
+        return self.run.path_from is not dead_reckon
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +159,10 @@ class RunData:
     def models(self) -> tuple[Trace, ...]:
         """Traces of models."""
         return tuple(trace for trace in self.traces if not trace.is_raw)
+
+    def integrated(self) -> RunData:
+        """The same without aided paths, which have no samples or biases of their own; they come last."""
+        return replace(self, traces=tuple(trace for trace in self.traces if not trace.is_aided))
 
 
 def level_start(imu: Imu) -> StartPose:

@@ -15,10 +15,13 @@ import numpy as np
 
 from imutool import __version__
 from imutool.array_types import Bool
+from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
+from imutool.inertial.aids import Aids, find_aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
-from imutool.inertial.strapdown import StartPose, dead_reckon, stretch_with_truth, with_velocity
+from imutool.inertial.strapdown import StartPose, stretch_with_truth, with_velocity
 from imutool.location import Location
+from imutool.mcap_io.log import Log
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
@@ -46,27 +49,40 @@ def load(
     truth: str | None = None,
     align: Alignment = "none",
     findings: Path | None = None,
+    aid: str | None = None,
 ) -> RunData:
     """Load all data of one log for viewing, with the events of a diagnosis in `findings`.
+
+    With `aid` there is an aided path of each model too, of the raw samples where there is no model.
 
     Raises:
         ConfigError: the log or the folder cannot be read; two models of one name; `smooth` with another `init` than auto.
         LogError, DataError: no IMU, a log from which nothing can be recovered, an invalid findings.json, or as `build`.
         ModelError: a model that cannot be used with this log.
     """
+    asked = None if aid is None else parse_aids(aid)
     contents = read_log(log, imu=imu, truth=truth)
     recording = contents.recording
     if recording.truths:
         recording = recording.with_truth(truth or next(iter(recording.truths)))
-    with_models, origins = _with_models(recording, models, init, str(log), smooth) if models else ([], {})
+    aids = None
+    if asked is not None:
+        with Log(log) as opened:
+            aids = find_aids(opened, recording, asked)
+    with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids) if models else ([], [], {})
     events, notes = survey_events(contents.survey)
     if findings is not None:
         start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
         more_events, more_notes = finding_events(findings, log.name, start_ns, end_ns)
         events, notes = [*events, *more_events], [*notes, *more_notes]
+    raw = Run.raw(recording.imu)
+    if aids is not None:
+        aided += [run.aided(aids, residual_prior(std=run.bias_std)) for run in contents.debiased]
+        aided = aided or [raw.aided(aids, residual_prior())]
+        notes.append(f"Aids: {listed(aids.signals)}.")
     data = build(
         recording,
-        [Run.raw(recording.imu), *with_models, *contents.debiased],
+        [raw, *with_models, *contents.debiased, *aided],
         align=align,
         events=events,
         notes=[*contents.notes, *notes],
@@ -81,21 +97,22 @@ def load(
 
 
 def _with_models(
-    recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool
-) -> tuple[list[Run], dict[str, str]]:
-    """Run of each model, and by its name its file digest, method and start bias."""
+    recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool, aids: Aids | None
+) -> tuple[list[Run], list[Run], dict[str, str]]:
+    """Run of each model, the same with aids, and by its name its file digest, method and start bias."""
     from imutool.bias_start.bias_from_truth import TRUTH_S
     from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started
 
     method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
-    runs, origins = [], {}
+    runs, aided, origins = list[Run](), list[Run](), {}
     for name, model, start in started(recording, models, init, log, smooth=smooth):
         debiased, std = apply_with_std(model, start, recording.imu)
         runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))
+        aided += [] if aids is None else [runs[-1].aided(aids, residual_prior(start, std))]
         digest = model.card.get("sha256")
         origins[name] = f"{f'sha256 {digest}, ' if digest else ''}{model.method}, start: {start.how}"
-    return runs, origins
+    return runs, aided, origins
 
 
 def build(
@@ -129,7 +146,7 @@ def build(
         traces, of_paths = _scored(runs, truth, recording.name, align)
     else:
         truth, align = None, "none"
-        traces = tuple(Trace(run, dead_reckon(run.imu, level_start(run.imu)), None, spectra=spectra(run.imu)) for run in runs)
+        traces = tuple(Trace(run, run.path_from(run.imu, level_start(run.imu)), None, spectra=spectra(run.imu)) for run in runs)
         of_paths = [
             f"This log has no truth, so there are no errors and nothing to align with. Paths start at the origin, at rest, "
             f"heading 0, levelled by the first {LEVELLING_S:g} s of specific force."
@@ -195,7 +212,7 @@ class TruthSpan(NamedTuple):
 def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     """One run with its errors and figures, and a note on its alignment, if any."""
     rows, true, valid = known
-    path = dead_reckon(run.imu.rows(rows), StartPose.of(true))
+    path = run.path_from(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
     of_truth = (drift_since_reset(path, true, valid), windows(path, true, valid), MappingProxyType(evaluate(path, true, valid)))
     trace = Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu))

@@ -69,9 +69,9 @@ def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:
 
 def _log_one(data: RunData, to: rr.RecordingStream, scope: Scope, with_source: bool) -> None:
     paths.log_paths(data, to, scope, diagonal_m(layout.scene_box(data)))
-    signals.log_signals(data, to, scope)
+    signals.log_signals(data.integrated(), to, scope)
     errors.log_errors(data, to, scope)
-    signals.log_spectra(data, to, scope)
+    signals.log_spectra(data.integrated(), to, scope)
     errors.log_events(data, to, scope)
     notes = other_topics.log(data, to, scope) if with_source else []
     report.log_report(data, to, scope, [*signals.decimation_note(data), *notes])

@@ -32,7 +32,9 @@ View = Any  # a view or a container of views
 
 def tabs(data: RunData, scope: Scope, with_source: bool) -> list[View]:
     """Tabs with content, in their order."""
-    views = [_signals(data, scope), _bias(data, scope), _spectrum(data, scope), _errors(data, scope), _events(data, scope)]
+    samples = data.integrated()
+    views = [_signals(samples, scope), _bias(samples, scope), _spectrum(samples, scope), _errors(data, scope)]
+    views.append(_events(data, scope))
     return [view for view in (*views, _report(scope), _cameras(data, scope) if with_source else None) if view is not None]
 
 

@@ -17,7 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import markup
 
+from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
+from imutool.inertial.aids import Aids
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.html import drawing, report, report_errors, report_paths, report_signals, report_wording
@@ -266,6 +268,16 @@ def of(trace: Trace) -> Errors:
 
 def scaled(errors: Errors, factor: float) -> Errors:
     return Errors(errors.t_ns, factor * errors.orientation_deg, factor * errors.roll_pitch_yaw_deg, factor * errors.position_m)
+
+
+def test_an_aided_path_is_drawn_among_paths_and_errors_but_has_no_samples(seen: RunData) -> None:
+    runs = [trace.run for trace in seen.traces[:2]]
+    aided = runs[1].aided(Aids({"stops": ""}), residual_prior())
+    data = replace(seen, traces=(*seen.traces[:2], replace(seen.traces[2], run=aided)))
+    for make, drawn in ((report_paths.paths, True), (report_errors.error_curves, True), (report_signals.signals, False)):
+        assert ("half aided" in panel(data, make)) == drawn
+    assert "half aided" not in panel(data, report_signals.biases)
+    assert report_wording.best_run(data) is data.traces[1]
 
 
 def test_paths_have_equal_scales_and_one_that_leaves_is_said(seen: RunData) -> None:

@@ -15,7 +15,7 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wri
 from imutool.bias_start.correction import apply, apply_with_std
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
-from imutool.evaluation import started
+from imutool.evaluation import evaluate, started
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns, decode_twist
 from imutool.mcap_io.codec.encode import encode_imu
@@ -154,6 +154,29 @@ def test_smooth_reaches_the_models_and_is_refused_with_another_start(log: Path) 
     assert load(log, models=["static"], smooth=True).provenance["smooth"] == "yes"
     with pytest.raises(ConfigError, match="smooth"):
         load(log, models=["static"], smooth=True, init="prior")
+
+
+def test_an_aided_path_is_that_of_evaluate_and_has_no_samples_of_its_own(log: Path) -> None:
+    data = load(log, models=["static"], aid="stops")
+    assert [trace.name for trace in data.traces] == ["raw", "static", "static aided"]
+    row = evaluate(log, models=["static"], aid="stops")[-1]
+    assert (row["estimate"], row["ape_m"]) == ("aided", pytest.approx(data.traces[2].figures["ape_m"], rel=1e-9))
+    assert data.traces[2].figures["ape_m"] != data.traces[1].figures["ape_m"]
+    assert [trace.name for trace in data.integrated().traces] == ["raw", "static"]
+    assert "Aids: stops." in data.notes
+    assert [trace.name for trace in load(log, aid="stops").traces] == ["raw", "raw aided"]
+
+
+def test_an_aided_path_needs_no_truth(made: Recording, tmp_path: Path) -> None:
+    write(replace(made, truths={}), tmp_path / "log.mcap")
+    pure, aided = load(tmp_path / "log.mcap", models=["static"], aid="stops").models()
+    assert aided.errors is None
+    np.testing.assert_allclose(aided.path.p_wb[0], pure.path.p_wb[0], atol=1e-6)
+    assert np.abs(aided.path.p_wb - pure.path.p_wb).max() > 1.0
+
+
+def test_the_bias_in_a_log_gives_its_aided_path(debiased: Path) -> None:
+    assert [trace.name for trace in load(debiased, aid="stops").traces][2:] == [f"{load(debiased).traces[1].name} aided"]
 
 
 BROKEN = {
