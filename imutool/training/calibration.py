@@ -103,12 +103,17 @@ def calibrate(
     if own_prior is None and len(pool.names) < FOLDS:
         own_prior = widest(sensor, pool.t)
     every, gains = linearise(seen, effects, part, own_prior), {}
-    forms, problem = effects, every
     if names is None:
-        gains = effects_beyond_chance(problem, effects)
-        if len(gains) < len(effects):
-            effects = tuple(effect for effect in effects if effect.name in gains)
-            problem = linearise(seen, effects, part, every.own_prior)
+        gains = effects_beyond_chance(every, effects)
+        if not DRIFTS.keys() & gains.keys() and any(effect.name in DRIFTS for effect in effects):
+            # the point of linearisation has all candidates: without a drift it is as if there were none to choose
+            effects = tuple(effect for effect in effects if effect.name not in DRIFTS)
+            every = linearise(seen, effects, part, own_prior)
+            gains = effects_beyond_chance(every, effects)
+    forms, problem = effects, every
+    if names is None and len(gains) < len(effects):
+        effects = tuple(effect for effect in effects if effect.name in gains)
+        problem = linearise(seen, effects, part, every.own_prior)
     theta, covariance = problem.solve(range(len(problem.theta)))
     rest = problem.own_at(theta)[:, :3]
     return Calibration(

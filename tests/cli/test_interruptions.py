@@ -139,7 +139,7 @@ def test_a_signal_in_the_middle(here: Path, command: str, imutool: Run, name: st
     words, target = WRITERS[name]
     before = digests(here)
     for _ in range(TRIES):
-        process = installed(command, words, here) if name == "convert" else started(words, here)
+        process = installed(command, words, here) if name in ("convert", *RERUN) else started(words, here)
         code, stderr, seconds = stopped(process, here, number)
         if code:
             break
