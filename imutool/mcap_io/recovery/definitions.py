@@ -115,14 +115,27 @@ class Recording:
         used = {channel.schema_id for channel in self.channels.values()} | {i for opcode, i in self.proven if opcode == SCHEMA}
         return isinstance(known, Schema) and known.id not in used
 
-    def define(self, record: Any, *, proven: bool) -> None:
-        """Adds a definition; a proven one replaces one that is not."""
-        opcode = SCHEMA if isinstance(record, Schema) else int(Opcode.CHANNEL)
+    def define(self, record: Any, *, proven: bool) -> bool:
+        """Adds a definition; a proven one replaces one that is not. Whether it is the first of its id."""
+        opcode = _opcode(record)
+        first = record.id not in self.known(opcode)
         if proven or (opcode, record.id) not in self.proven:
             self.known(opcode).setdefault(record.id, record)
             if proven:
                 self.known(opcode)[record.id] = record
                 self.proven.add((opcode, record.id))
+        return first
+
+    def take_back(self, definitions: Iterable[Any]) -> None:
+        """Forgets definitions: the block that brought them is of another log."""
+        for record in definitions:
+            opcode = _opcode(record)
+            self.known(opcode).pop(record.id, None)
+            self.proven.discard((opcode, record.id))
+
+
+def _opcode(definition: Any) -> int:
+    return SCHEMA if isinstance(definition, Schema) else int(Opcode.CHANNEL)
 
 
 def parsed(definitions: Iterable[tuple[int, bytes]], offset: int, losses: Losses) -> list[Any]:

@@ -164,6 +164,7 @@ class Recordings:
             return
         what = "are written in another way than those before them" if foreign else "do not fit the definitions before them"
         self.losses.add_harmless(f"messages from byte {found.block.offset} on {what}")
+        recording.take_back(found.brought)
         self._current = self._new_behind_gap(found)
         self._current.anonymous = True
         self._give_up_misfits(self._current, [found])
@@ -220,8 +221,7 @@ class Recordings:
             chosen = (listed or [r for r in agreeing if r.lists is None] or agreeing)[0]  # a summary lists all of its log
         else:
             chosen = self._among(found, rest, [r for r in listed if rest <= r.readable()] or agreeing)
-        for record in own:
-            chosen.define(record, proven=bool(found.crc))
+        found.brought = [record for record in own if chosen.define(record, proven=bool(found.crc))]
         return chosen
 
     def _fits(self, block: MessageBlock, channel: int, recording: Recording) -> bool:
@@ -264,7 +264,7 @@ class Recordings:
 
     def _among(self, found: ScannedBlock, used: set[int], pool: Sequence[Recording]) -> Recording:
         """The recording of a block that does not define all of its ids itself."""
-        pool = list({id(r): r for r in pool}.values())
+        given = pool = list({id(r): r for r in pool}.values())
         unlisted = [r for r in pool if r.lists is None or found.key in r.lists]
         if (self._certain or (self._now.anonymous and self._follows)) and self._now in unlisted:
             return self._now
@@ -277,7 +277,7 @@ class Recordings:
         ):
             pool = [r for r in pool if r in narrower] or pool
         alone = used <= self._now.readable() and not any(used <= r.readable() for r in pool)
-        if self._certain and (alone or self._now in pool):
+        if self._certain and self._now in (given if alone else pool):
             return self._now
         return self._by_content(found, used, pool)
 

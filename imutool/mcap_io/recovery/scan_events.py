@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -34,6 +34,7 @@ class ScannedBlock:
     evidence: int = 0  # for the recording it is assigned to, the more the better
     bare: bool = False  # another record follows at once where message indexes would stand
     habits: Habits = NO_HABITS  # of all blocks between two gaps
+    brought: list[Any] = field(default_factory=list)  # definitions that its recording did not have before
 
 
 class LogStart(NamedTuple):

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from mcap.records import Channel, Schema
@@ -16,6 +17,7 @@ from support.log_damage import by_mcap, stretches
 
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
 from imutool.mcap_io.recovery.definitions import Recording, renumber
@@ -213,6 +215,33 @@ def test_a_chunk_behind_the_data_of_a_log_may_be_of_another(foreign: Foreign, tm
     first.write_bytes(raw[: a[1][1]] + b"\0" * 5 + tail + raw[a[3][0] : a[3][1]])
     report = repair(first, tmp_path / "out.mcap")
     assert (report.messages, report.losses.topics) == ({"/mine": 2, "/other": 2}, {"(/mine or /other)": 1})
+
+
+@pytest.mark.parametrize(("layout", "open_"), [("zstd", 0), ("no-summary", 3)])  # of /two or /other, if nothing lists the chunk
+def test_a_foreign_chunk_takes_its_definitions_with_it(foreign: Foreign, tmp_path: Path, layout: str, open_: int) -> None:
+    """Seed n8-d, logs 1434: one sound chunk of another log defined a channel, and all of this log behind it was lost.
+
+    In a log with a summary, the chunk replaced the channel that the summary proves.
+    """
+
+    def said(topic: str, t_ns: int) -> Message:
+        return topic, "std_msgs/msg/String", t_ns, t_ns, 0, b"\0\1\0\0" + struct.pack("<I", 1201) + b"a" * 1200 + b"\0"
+
+    def turned(topic: str, t_ns: int) -> Message:
+        payload = encode_imu(np.array([t_ns]), np.zeros((1, 3)), np.zeros((1, 3)), "imu").tobytes()
+        return topic, schemas.IMU, t_ns, t_ns, 0, payload
+
+    mine = [said("/mine", i) for i in range(3)] + [said("/two", 10 + i) for i in range(6)]
+    other = [turned("/imu", 1000 + i) for i in range(10)] + [said("/other", 1010 + i) for i in range(3)]
+    first = foreign(mine, layout, chunk_size=CHUNK_SIZE, name="first")
+    second = foreign(other, layout, chunk_size=CHUNK_SIZE, name="second")
+    a, b, raw = stretches(first), stretches(second), first.read_bytes()
+    assert {m[0] for m in a[0][2]} == {"/mine"}
+    assert {m[0] for m in b[1][2]} == {"/imu", "/other"}
+    first.write_bytes(raw[: a[0][1]] + second.read_bytes()[b[1][0] : b[1][1]] + raw[a[0][1] :])
+    assert repair(first, tmp_path / "out.mcap").losses.unproven == open_
+    back = [m for m in by_mcap(tmp_path / "out.mcap") if m not in b[1][2]]
+    assert back == [m for _, _, each in a for m in each][: 9 - open_]
 
 
 def test_a_topic_stays_with_the_messages_that_are_on_it() -> None:
