@@ -59,6 +59,11 @@ class Run:
         zeros = np.zeros_like(imu.gyro)
         return cls(RAW, imu, zeros, zeros)
 
+    @property
+    def is_aided(self) -> bool:
+        """Whether the path is smoothed with aids; the samples are those of another run."""
+        return self.path_from is not dead_reckon
+
     def aided(self, aids: Aids, prior: BiasPrior) -> Run:
         """The same samples, with a smoothed path by the aids of the log; `prior` is that of the bias that is left."""
 
@@ -92,11 +97,6 @@ class Trace:
     def is_raw(self) -> bool:
         """Whether the run is the IMU as recorded."""
         return self.run.name == RAW
-
-    @property
-    def is_aided(self) -> bool:
-        """Whether the path is smoothed with aids; its samples are those of another run."""
-        return self.run.path_from is not dead_reckon
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class RunData:
 
     def integrated(self) -> RunData:
         """The same without aided paths, which have no samples or biases of their own; they come last."""
-        return replace(self, traces=tuple(trace for trace in self.traces if not trace.is_aided))
+        return replace(self, traces=tuple(trace for trace in self.traces if not trace.run.is_aided))
 
 
 def level_start(imu: Imu) -> StartPose:

@@ -214,8 +214,10 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     rows, true, valid = known
     path = run.path_from(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
-    of_truth = (drift_since_reset(path, true, valid), windows(path, true, valid), MappingProxyType(evaluate(path, true, valid)))
-    trace = Trace(run, moved, errors(moved, true, valid), *of_truth, spectra=spectra(run.imu))
+    figures = MappingProxyType(evaluate(path, true, valid))
+    trace = Trace(run, moved, errors(moved, true, valid), figures=figures, spectra=spectra(run.imu))
+    if not run.is_aided:  # only an integration goes on from a true pose as from its own
+        trace = replace(trace, drift=drift_since_reset(path, true, valid), windows=windows(path, true, valid))
     if align == "none":
         return trace, ""
     shift_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))

@@ -163,6 +163,7 @@ def test_an_aided_path_is_that_of_evaluate_and_has_no_samples_of_its_own(log: Pa
     assert (row["estimate"], row["ape_m"]) == ("aided", pytest.approx(data.traces[2].figures["ape_m"], rel=1e-9))
     assert data.traces[2].figures["ape_m"] != data.traces[1].figures["ape_m"]
     assert [trace.name for trace in data.integrated().traces] == ["raw", "static"]
+    assert (data.traces[2].drift, data.traces[2].windows) == (None, ())  # a path with aids has no state to reset
     assert "Aids: stops." in data.notes
     assert [trace.name for trace in load(log, aid="stops").traces] == ["raw", "raw aided"]
 
