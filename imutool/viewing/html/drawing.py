@@ -29,6 +29,7 @@ LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
 MAX_LETTERS = 48  # of a name in a legend
 EMPTY_DECADES = 0.1, 10.0
 MAX_DECADES = 5  # labels of a logarithmic axis
+LARGEST = 1e300  # of a drawn value: beyond, the limits of an axis overflow
 BUCKETS = 400  # of a line at half width; each draws its lowest and its highest sample
 
 # placeholder colour for each of the page's colours in an SVG; none is one of matplotlib's own
@@ -162,7 +163,8 @@ def legend_name(name: str) -> str:
 
 
 def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
-    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps."""
+    """Decimate a line to the lowest and highest sample of each bucket, at most `LARGEST`; gaps stay gaps."""
+    y = np.clip(y, -LARGEST, LARGEST)
     if len(t) <= 2 * buckets:
         return t, y
     edges = np.linspace(0, len(t), buckets + 1).astype(int)

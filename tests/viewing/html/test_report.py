@@ -197,6 +197,14 @@ def test_every_run_has_its_curve_in_every_panel_it_belongs_to(seen: RunData, pag
     assert titles.count("truth") == len([svg for svg in svgs(page) if "Paths:" in svg])
 
 
+def test_a_sample_near_the_largest_number_is_drawn(seen: RunData, flown: Recording) -> None:
+    """Seeds n8-f and n8-g, numbers 166 and 296: the limits of the axis overflowed."""
+    gyro = flown.imu.gyro.copy()
+    gyro[50, 1] = 1.7e308
+    run = Run.raw(Imu(flown.imu.t_ns, gyro, flown.imu.accel))
+    assert "raw, y" in panel(replace(seen, traces=(replace(seen.traces[0], run=run),)), report_signals.signals)
+
+
 def test_a_spectrum_whose_power_overflows_is_drawn(flown: Recording) -> None:
     imu = replace(flown.imu, accel=flown.imu.accel * [1.0, 1.0, 1e160])
     with np.errstate(all="ignore"):
