@@ -163,7 +163,7 @@ def legend_name(name: str) -> str:
 
 
 def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
-    """Decimate a line to the lowest and highest sample of each bucket, at most `LARGEST`; gaps stay gaps."""
+    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps."""
     y = np.clip(y, -LARGEST, LARGEST)
     if len(t) <= 2 * buckets:
         return t, y
