@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 REPEAT_S = 0.01
 COMPLETION = "_IMUTOOL_COMPLETE"  # a shell asks for words; any command may be meant
+HALF_MADE = "RecordingStream.__del__"  # of Rerun: it fails where a Ctrl-C ended the stream's __init__
 WRONG_USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # what a shell reports of a program that SIGTERM ended
 
 
@@ -68,5 +69,5 @@ def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:
         from threading import Timer
 
         Timer(REPEAT_S, signal.raise_signal, [signal.SIGINT]).start()
-    else:
+    elif getattr(unraisable.object, "__qualname__", "") != HALF_MADE:
         sys.__unraisablehook__(unraisable)
