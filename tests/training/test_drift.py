@@ -17,8 +17,9 @@ from imutool.training.calibration import DRIFTS
 from imutool.training.run import train
 from imutool.training.settings import settings_of
 
-TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
+TRAINING_S, TEST_S = (60.0, 60.0, 60.0), (120.0,)
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
+FEW = ("steps=1", "samples=500", "gyro_window_s=[1.0]", "accel_window_s=[0.5]")
 BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
 
 
@@ -56,7 +57,7 @@ def test_no_drift_is_found_where_there_is_none(tmp_path: Path) -> None:
 
 def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path) -> None:
     """One step of descent: what counts is that the drift is found, kept in the file, and taken off the samples."""
-    model = trained(tmp_path, saved(tmp_path, "rate", 0, TRAINING_S), "neural_ode", "steps=1")
+    model = trained(tmp_path, saved(tmp_path, "rate", 0, TRAINING_S), "neural_ode", *FEW)
     assert isinstance(model.config, neural_ode.Config)
     assert "gyro_rate_load" in (model.config.loads or ())
     models = ["static", str(tmp_path / "neural_ode.safetensors")]

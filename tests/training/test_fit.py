@@ -297,7 +297,7 @@ def test_the_joint_scheme_lowers_the_held_out_error_of_a_curved_sensor(perfect: 
         return Recording(exact.name, Imu(exact.imu.t_ns, gyro, exact.imu.accel), exact.truths)
 
     joint = {"scheme": "joint", "curve_width": 8, "gyro_drift_rad_s2": 0.3}
-    short = settings(gyro_window_s=(0.25,), steps=30, validate_every=30, track_knot_s=8.0, weight_decay=0.0, model=joint)
+    short = settings(gyro_window_s=(0.25,), steps=12, validate_every=12, track_knot_s=8.0, weight_decay=0.0, model=joint)
     training = Training([bent(1), bent(2)], "neural_ode", short)
     gyro = [epoch.held_out for epoch in finish(training) if epoch.sensor == "gyro"]
     assert gyro[-1] < 0.9 * gyro[0]
