@@ -13,7 +13,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.initial_bias import InitialBias, relative_samples, tracked_from_prior
+from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
 from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured
 from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import MOST_GAP_S
@@ -32,7 +32,7 @@ class DebiasedImu(NamedTuple):
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
     """Corrected samples and bias of a model."""
     good = measured(imu.gyro, imu.accel)
-    bias = _to_all(good, start.stream(model)(*relative_samples(imu)))
+    bias = _with_drift(model, imu, _to_all(good, start.stream(model)(*model_samples(model, imu))))
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
@@ -42,14 +42,22 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
     Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as for a log.
     """
     estimator = BiasEstimator(model, start)
-    good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), relative_samples(imu)
+    good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), model_samples(model, imu)
+    t_ns = imu.t_ns[good]
     bias, std = np.empty((len(t_s), 6)), np.empty((len(t_s), 6))
     for first in range(0, len(t_s), BLOCK_SAMPLES):
         rows = slice(first, first + BLOCK_SAMPLES)
         bias[rows], covariance = estimator(t_s[rows], gyro[rows], accel[rows])
+        if model.log_drift is not None:
+            covariance += model.log_drift.covariance(t_ns[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
-    bias, std = _to_all(good, bias), _to_all(good, std)
+    bias, std = _with_drift(model, imu, _to_all(good, bias)), _to_all(good, std)
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+
+
+def _with_drift(model: BiasModel, imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    """Bias of the samples as recorded, from that of the samples without the drift."""
+    return bias if model.log_drift is None else bias + model.log_drift(imu.t_ns)
 
 
 def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) -> Float64[np.ndarray, "n 6"]:

@@ -41,16 +41,21 @@ RAMPS = (len(TURNING_RAD_S) - 1, len(SHAKING_M_S2) - 1)
 LOADS = 1 + RAMPS[0] + 2 * RAMPS[1]
 LOAD = slice(27, 27 + len(LOAD_TAU_S) * LOADS)  # the loads behind the first filter, then behind the next
 COUNT = LOAD.stop
+TEMPERATURE_TERMS = 3 * (1 + len(LOAD_TAU_S))  # polynomials of a temperature, at once and behind the filters
 
 Vectors = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
+    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)².
+
+    `temperature` has the terms of the log's temperature in a training (`imutool.bias.temperature`).
+    """
 
     t_s: Float64[np.ndarray, " n"]
     columns: Float64[np.ndarray, "n 60"]
+    temperature: Float64[np.ndarray, "n 12"] | None = None
 
     @property
     def gyro(self) -> Vectors:
@@ -94,7 +99,7 @@ class Signals:
 
     def rows(self, rows: slice | np.ndarray) -> Signals:
         """The signals of some rows."""
-        return Signals(self.t_s[rows], self.columns[rows])
+        return Signals(self.t_s[rows], self.columns[rows], None if self.temperature is None else self.temperature[rows])
 
 
 class SignalFilter:

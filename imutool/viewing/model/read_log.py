@@ -19,6 +19,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Imu, Recording
 from imutool.recording.columns import clock_jumps, jump_warnings
@@ -101,9 +102,10 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
         biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)
-        rest = longest_recording(
-            read_recordings(log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused)
+        found = read_recordings(
+            log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
         )
+        rest = longest_recording(with_temperatures(found, log))
         metadata = log.metadata_records()
         if isinstance(log, RecoveredLog):
             notes += [f"The log is damaged; {line}." for line in describe(log.losses.plain())]
