@@ -20,7 +20,7 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature import split_drift
+from imutool.bias.temperature_drift import split_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias

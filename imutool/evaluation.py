@@ -16,7 +16,7 @@ from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature import bound_to
+from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge

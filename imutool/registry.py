@@ -26,7 +26,9 @@ GROUPS = {
     "imutool.clean": "imutool.cleaning.rules",
 }
 NOT_PLUGINS = {
-    "imutool.bias": frozenset({"effects_stream", "io", "model", "networks", "neural_stream", "physics", "temperature"}),
+    "imutool.bias": frozenset(
+        {"effects_stream", "io", "model", "networks", "neural_stream", "physics", "temperature", "temperature_drift"}
+    ),
     "imutool.networks": frozenset({"joint_ode", "network", "ode", "temperature"}),
 }
 

@@ -16,7 +16,7 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature import bound_to
+from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std

@@ -12,17 +12,16 @@ of the channel holds until the next one, so that no sample depends on a later nu
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
+from imutool.bias.model import BiasModel
 from imutool.errors import ModelError
 from imutool.mcap_io.temperature import is_temperature, thinned
-from imutool.recording import Imu, Recording, Scalars
+from imutool.recording import Scalars
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_form import LinearForm
@@ -33,12 +32,8 @@ from imutool.units import AXES, SENSORS, Sensor
 ORDERS = 3
 ZERO_CELSIUS_K = 273.15
 LEAST_KELVIN = 200.0  # no sensor works at as many °C, none at fewer kelvin
-MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
-MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 PLAUSIBLE: Mapping[Sensor, tuple[str, float]] = {"gyro": ("rad/s", 0.01), "accel": ("m/s²", 0.1)}
 Terms = Float64[np.ndarray, "n 12"]
-Rows3 = Float64[np.ndarray, "n 3"]
-Drift = Float64[np.ndarray, "n 6"] | None
 
 
 def _form(sensor: Sensor) -> LinearForm:
@@ -142,39 +137,6 @@ def holding(channel_ns: Int64[np.ndarray, " m"], t_ns: Int64[np.ndarray, " n"]) 
     return np.maximum(np.searchsorted(channel_ns, t_ns, side="right") - 1, 0)
 
 
-class TemperatureDrift:
-    """Drift of a model's bias in one log, by its stamps."""
-
-    def __init__(self, model: BiasModel, channel: Scalars, name: str) -> None:
-        self.name, self._t_ns = name, channel.t_ns
-        self._terms = scale_of(model).terms(channel)
-        self._by_sensor = model.temperature_parameters()
-        self._bias = np.zeros((len(self._terms), 6))
-        for sensor, (theta, _) in self._by_sensor.items():
-            self._bias[:, COLUMNS[sensor]] = self._terms @ theta.reshape(3, TEMPERATURE_TERMS).T
-
-    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
-        """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
-        return np.asarray(self._bias[holding(self._t_ns, t_ns)])
-
-    def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
-        """Covariance of the drift relative to its mean so far.
-
-        The mean acts like a rest bias, and counts in its covariance (`imutool.bias_start.bias_covariance`).
-        """
-        out, rows = np.zeros((len(t_ns), 6, 6)), holding(self._t_ns, t_ns)
-        if not len(rows):
-            return out
-        row, place = np.unique(rows, return_inverse=True)
-        means = np.cumsum(self._terms[: row[-1] + 1], axis=0)[row] / (row + 1.0)[:, None]
-        off = self._terms[row] - means
-        for sensor, (_, covariance) in self._by_sensor.items():
-            blocks = covariance.reshape(3, TEMPERATURE_TERMS, 3, TEMPERATURE_TERMS)
-            S = np.einsum("nq,iqjr,nr->nij", off, blocks, off, optimize=True)
-            out[:, COLUMNS[sensor], COLUMNS[sensor]] = S[place]
-        return out
-
-
 def scale_of(model: BiasModel) -> Scale:
     """Channel, range and mean terms that a model was trained with.
 
@@ -194,7 +156,7 @@ def channel_of(scalars: Mapping[str, Scalars], imu_topic: str, wanted: str = "")
     then the only one.
     """
     numbers = {name: given for name, given in scalars.items() if is_temperature(name) and given.values.shape[1] == 1}
-    found = {name: celsius for name, given in numbers.items() if len(celsius := _celsius(given)) > 1}
+    found = {name: celsius for name, given in numbers.items() if len(celsius := _celsius(given))}
     if wanted in found:
         return wanted, found[wanted]
     ranks: dict[int, list[str]] = {}
@@ -206,82 +168,15 @@ def channel_of(scalars: Mapping[str, Scalars], imu_topic: str, wanted: str = "")
 
 
 def _celsius(channel: Scalars) -> Scalars:
-    """A channel's numbers in °C, two a second at most; those of another shape are none."""
-    kept = thinned(
-        channel.t_ns, channel.values[:, 0] if channel.values.shape[1] == 1 else channel.values[:, 0] * np.nan, "degC"
-    )
-    kelvin = channel.unit.lower() in ("k", "kelvin") or (len(kept) and float(np.median(kept.values)) > LEAST_KELVIN)
-    return Scalars(kept.t_ns, kept.values - ZERO_CELSIUS_K, "degC") if kelvin else kept
+    """A channel's numbers in °C, two a second at most."""
+    kept = thinned(channel.t_ns, channel.values[:, 0], "degC")
+    if not len(kept):
+        return kept
+    usual = float(np.median(kept.values))
+    off = ZERO_CELSIUS_K if channel.unit.lower() in ("k", "kelvin") else usual - celsius_of(usual)
+    return Scalars(kept.t_ns, kept.values - off, "degC")
 
 
-def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, start_ns: int, end_ns: int) -> BiasModel:
-    """Model with its drift in one log; the model itself where it follows no temperature.
-
-    Without a channel there is no drift, and the rest bias varies as much as the drift did in training. `remarks` say so, and
-    what else makes the drift less sure.
-    """
-    if not model.temperature_parameters():
-        return model
-    scale, out = scale_of(model), copy.copy(model)
-    low, high = scale.centre - scale.half_range, scale.centre + scale.half_range
-    trained = f"{scale.channel}, {low:.1f} to {high:.1f} °C in training"
-    found = channel_of(scalars, imu_topic, scale.channel)
-    if found is None:
-        several = [name for name in scalars if is_temperature(name)]
-        what = f"names no temperature as the IMU's among {', '.join(several)}" if several else "has no temperature"
-        out.remarks = (f"the log {what}; the model's bias follows it ({trained}), and varies unseen",)
-        return _widened(out)
-    name, channel = found
-    out.log_drift = TemperatureDrift(model, channel, name)
-    out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high, trained))
-    return out
-
-
-def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float, high: float, trained: str) -> Sequence[str]:
-    """What makes the drift of a log less sure."""
-    out, within = [], channel.between(start_ns, end_ns)
-    T = within.values[:, 0] if len(within) else channel.values[:1, 0]
-    if T.min() < low - MOST_BEYOND_K or T.max() > high + MOST_BEYOND_K:
-        out.append(f"{name} goes from {T.min():.1f} to {T.max():.1f} °C, beyond the model's range ({trained}): it is clamped")
-    edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
-    age_s = float(np.diff(edges).max()) * 1e-9
-    if age_s > MOST_AGE_S:
-        out.append(f"{name} is silent for {age_s:.0f} s: its last number holds")
-    return out
-
-
-def _widened(model: BiasModel) -> BiasModel:
-    """Model whose rest bias varies as the drift did in training; a copy."""
-    spread, walk = (model.tensors[f"temperature.{name}"] for name in ("spread", "walk"))
-
-    def wider(std: Vector6) -> Vector6:
-        return np.sqrt(np.asarray(std) ** 2 + spread**2)
-
-    model.tensors = model.tensors | {
-        "prior_std": wider(model.prior_std),
-        "walk_std": np.sqrt(model.walk_std**2 + walk**2),
-    }
-    sessions = [{**session, "std": wider(session["std"]).tolist()} for session in model.card.get("sessions", [])]
-    least = model.card.get("turn_on_least_std")
-    model.card = {**model.card, "sessions": sessions, "turn_on_least_std": None if least is None else wider(least).tolist()}
-    return model
-
-
-def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
-    """Model with its drift in a recording (`bound`)."""
-    t_ns = recording.imu.t_ns
-    return bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
-
-
-def split_drift(model: BiasModel, t_ns: Int64[np.ndarray, " n"], gyro: Rows3, accel: Rows3) -> tuple[Drift, Rows3, Rows3]:
-    """Drift that a model follows in its log, None for most models, and samples without it."""
-    if model.log_drift is None:
-        return None, gyro, accel
-    drift = model.log_drift(t_ns)
-    return drift, gyro - drift[:, :3], accel - drift[:, 3:]
-
-
-def without_drift(model: BiasModel, imu: Imu) -> Imu:
-    """Samples without the drift that a model follows in their log."""
-    _, gyro, accel = split_drift(model, imu.t_ns, imu.gyro, imu.accel)
-    return imu if model.log_drift is None else Imu(imu.t_ns, gyro, accel)
+def celsius_of(temperature: float) -> float:
+    """°C of a temperature in °C or kelvin, told by its size."""
+    return temperature - ZERO_CELSIUS_K if temperature > LEAST_KELVIN else temperature

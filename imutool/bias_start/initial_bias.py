@@ -30,7 +30,7 @@ from imutool.bias.model import (
     Stream,
     Vector6,
 )
-from imutool.bias.temperature import without_drift
+from imutool.bias.temperature_drift import without_drift
 from imutool.bias_start.bias_tracking import (
     BiasTrajectory,
     Samples,

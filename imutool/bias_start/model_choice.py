@@ -16,7 +16,7 @@ from imutool.array_types import Float64, Int64
 from imutool.bias import static
 from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature import bound, split_drift, without_drift
+from imutool.bias.temperature_drift import bound, split_drift, without_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth

@@ -16,13 +16,17 @@ from imutool.bias.model import BiasModel
 from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_tensors
-from imutool.bias.temperature import FORMS, Scale, TemperatureFilter, bound_to, channel_of
-from imutool.bias_start.initial_bias import prior
+from imutool.bias.temperature import FORMS, Scale, TemperatureFilter, channel_of
+from imutool.bias.temperature_drift import bound_to
+from imutool.bias_start.correction import apply
+from imutool.bias_start.initial_bias import prior, tracked_from_prior
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.debiasing import debias
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, Scalars
 from imutool.sensor.signals import LOAD_TAU_S, TEMPERATURE_TERMS
+from imutool.viewing.stream import session, sources
+from imutool.viewing.stream.samples import Malformed, decoded
 
 MakeModel = Callable[..., BiasNetwork]
 RATE_HZ, START_NS = 50.0, 1_700_000_000_000_000_000
@@ -180,7 +184,7 @@ def test_without_a_temperature_it_says_so_and_is_less_sure(model: BiasModel) -> 
     log = recording(None)
     bound = bound_to(model, log)
     assert bound.log_drift is None
-    assert "has no temperature" in bound.remarks[0]
+    assert "there is no temperature" in bound.remarks[0]
     assert CHANNEL in bound.remarks[0]
     rms = SIZE / np.sqrt(3.0)
     assert prior(bound).std[0] == pytest.approx(np.hypot(1e-3, rms), rel=0.05)
@@ -188,7 +192,7 @@ def test_without_a_temperature_it_says_so_and_is_less_sure(model: BiasModel) -> 
     assert bound.walk_std[0] > 10.0 * model.walk_std[0]
     debiased = imutool.debias(log, model)
     assert debiased.fitness.verdict == "doubtful"
-    assert "has no temperature" in debiased.fitness.reasons[0]
+    assert "there is no temperature" in debiased.fitness.reasons[0]
     assert debiased.std[0, 0] > imutool.debias(recording(warming()), model).std[0, 0]
 
 
@@ -217,3 +221,44 @@ def test_a_model_without_it_is_the_same_object(build: MakeModel) -> None:
     plain = build("linear").frozen()
     assert bound_to(plain, recording(warming())) is plain
     assert FORMS["gyro"].name == "gyro_temperature"
+
+
+# a live stream
+
+
+def test_a_live_stream_has_the_drift_of_the_log(model: BiasModel) -> None:
+    log = recording(warming())
+    log = replace(log, imu=Imu(log.imu.t_ns, log.imu.gyro + expected(log, warming())[:, None] * [1.0, 0.0, 0.0], log.imu.accel))
+    bound, online = bound_to(model, log), imutool.OnlineDebiaser(model)
+    whole = apply(bound, tracked_from_prior(bound, START_NS), log.imu)
+    numbers = dict(zip(warming().t_ns.tolist(), warming().values[:, 0].tolist(), strict=True))
+    rows = [online(t, *u, numbers.get(t)) for t, *u in zip(log.imu.t_ns.tolist(), log.imu.gyro, log.imu.accel, strict=True)]
+    np.testing.assert_allclose([rate for rate, _, _ in rows], whole.imu.gyro, rtol=0, atol=1e-9)
+    np.testing.assert_allclose([bias for _, _, bias in rows], whole.bias, rtol=0, atol=1e-9)
+
+
+def test_a_live_stream_without_temperature_is_told(model: BiasModel, caplog: pytest.LogCaptureFixture) -> None:
+    online = imutool.OnlineDebiaser(model)
+    for k in range(3):
+        online(START_NS + k * 20_000_000, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+    assert [record.message for record in caplog.records if "there is no temperature" in record.message] != []
+    assert len(caplog.records) == 1
+
+
+def test_a_replayed_log_brings_its_temperature(model: BiasModel, tmp_path: Path) -> None:
+    log = recording(warming(10.0), 10.0)
+    imutool.write(tmp_path / "log.mcap", log)
+    replayed = sources.open_source(str(tmp_path / "log.mcap"), Malformed(), speed=1e6, temperature=CHANNEL)
+    seen = {sample.stamp_ns: sample.temperature for sample in replayed if sample is not None and sample.temperature is not None}
+    assert seen == dict(zip(warming(10.0).t_ns.tolist(), warming(10.0).values[:, 0].tolist(), strict=True))
+    corrected: list[float] = []
+    session.run(
+        sources.open_source(str(tmp_path / "log.mcap"), Malformed(), speed=1e6, temperature=CHANNEL),
+        model,
+        Malformed(),
+        each=lambda sample, rate, force: corrected.append(float(rate[0])),
+    )
+    slope = np.polyfit(np.arange(len(corrected)) / RATE_HZ, corrected, 1)[0]
+    assert slope == pytest.approx(-2.0 * SIZE / 10.0, rel=0.2)
+    line = b'{"t_ns": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8], "temperature": 21.5}'
+    assert next(decoded(line, 0.0, Malformed())).temperature == 21.5
