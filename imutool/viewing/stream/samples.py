@@ -83,7 +83,7 @@ DECODER = msgspec.json.Decoder(_Message)
 
 
 def sample(text: bytes | str, arrival_s: float) -> Sample:
-    """Sample from JSON with t_ns or t_s, gyro, accel and perhaps temperature, or from a sensor_msgs/Imu in JSON.
+    """Sample from JSON with t_ns or t_s, gyro, accel, or from a sensor_msgs/Imu in JSON.
 
     Raises:
         ValueError: it is none.
