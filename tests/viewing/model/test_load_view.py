@@ -26,8 +26,8 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model.events import FINDINGS
+from imutool.viewing.model.load_view import MAX_ENTRIES, MAX_VALUE_LENGTH, build, load, provenance
 from imutool.viewing.model.run_data import Run
-from imutool.viewing.model.runs import MAX_ENTRIES, MAX_VALUE_LENGTH, build, load, provenance
 
 LAST_BITS = 1e-12  # rad/s and m/s²: the bias in blocks and in one go
 
