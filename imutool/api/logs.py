@@ -15,8 +15,8 @@ from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
@@ -84,7 +84,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
         >>> imutool.read("bench.mcap") == recording
         True
     """
-    check_outputs([OutputFile("path", path, outputs.LOG)], overwrite=overwrite)
+    check_outputs([OutputFile("path", path, output_conflicts.LOG)], overwrite=overwrite)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
 

@@ -26,8 +26,8 @@ from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smo
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu, Recording
 
 Model = str | Path | BiasModel
@@ -198,7 +198,7 @@ def debias(
     if in_place == (target is not None):
         raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
     out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
-    check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
+    check_outputs([OutputFile("target", out, output_conflicts.LOG)], [source, given], overwrite=overwrite)
     run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth, check=check)
     return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
 

@@ -242,8 +242,7 @@ class SensorSamples:
         """States of a slow drift (`Signals.load`), which only it needs."""
         if self.online is not None:
             return self.online.load
-        rate_hz = (len(self.stamp_s) - 1) / (self.stamp_s[-1] - self.stamp_s[0])
-        return SignalFilter(float(rate_hz))(self.stamp_s, self.gyro, self.accel).load
+        return SignalFilter(self._mean_rate_hz)(self.stamp_s, self.gyro, self.accel).load
 
     @classmethod
     def joined(cls, parts: Sequence[SensorSamples]) -> SensorSamples:

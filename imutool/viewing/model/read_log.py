@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -33,7 +33,8 @@ NO_SAMPLES = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 class LogContents:
     """Contents of a log; `debiased` are the channels that imutool derived from this IMU.
 
-    `survey` covers the messages as recorded; `notes` list what could not be read and what was left out.
+    `survey` covers the messages as recorded; `notes` list what could not be read and what was left out. `opened` opens the
+    log again, in the way it could be read.
     """
 
     recording: Recording
@@ -42,6 +43,7 @@ class LogContents:
     survey: Survey
     metadata: Sequence[tuple[str, Mapping[str, str]]]
     notes: tuple[str, ...]
+    opened: Callable[[Location], Log] = Log
 
 
 class _Read(NamedTuple):
@@ -67,11 +69,13 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         LogError: nothing can be recovered, no IMU or several without `imu`, fewer than two samples, no such topic.
     """
     notes: list[str] = []
+    opened: Callable[[Location], Log] = Log
     try:
         contents = _read(Log(path), imu, truth, notes)
     except LogError:  # reading with recovery is slower; an error that is not damage comes again
         notes.clear()
-        contents = _read(RecoveredLog(path), imu, truth, notes)
+        opened = RecoveredLog
+        contents = _read(opened(path), imu, truth, notes)
     topic, derived, batches, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
@@ -90,7 +94,7 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
             notes.append(f"{name} is left out: its samples are not those of {topic}.")
         else:
             debiased.append(replace(run, start=start))
-    return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
+    return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes), opened)
 
 
 def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> _Read:
