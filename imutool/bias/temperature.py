@@ -131,6 +131,12 @@ class Scale(NamedTuple):
         rows = [follow(t_ns, T) for t_ns, T in zip(channel.t_ns.tolist(), channel.values[:, 0].tolist(), strict=True)]
         return np.asarray(np.array(rows).reshape(-1, TEMPERATURE_TERMS) - self.mean)
 
+    def beyond(self, channel: Scalars) -> Terms:
+        """What the terms would gain beyond the range, by their slope at its end once all lags are over."""
+        s = (channel.values - self.centre) / self.half_range
+        slope = np.concatenate([np.sign(s), 3.0 * np.ones_like(s), 6.0 * np.sign(s)], axis=1)
+        return np.asarray(np.tile(np.maximum(np.abs(s) - 1.0, 0.0) * slope, 1 + len(LOAD_TAU_S)))
+
 
 def holding(channel_ns: Int64[np.ndarray, " m"], t_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     """Row of a channel that holds at each time; before the first, the first."""

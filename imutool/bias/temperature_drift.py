@@ -26,11 +26,15 @@ class TemperatureDrift:
 
     def __init__(self, model: BiasModel, channel: Scalars, name: str) -> None:
         self.name, self._t_ns = name, channel.t_ns
-        self._terms = scale_of(model).terms(channel)
+        scale = scale_of(model)
+        self._terms = scale.terms(channel)
         self._by_sensor = model.temperature_parameters()
-        self._bias = np.zeros((len(self._terms), 6))
+        self._bias, self._clamped = np.zeros((2, len(self._terms), 6))
+        slopes = scale.beyond(channel)
         for sensor, (theta, _) in self._by_sensor.items():
-            self._bias[:, COLUMNS[sensor]] = self._terms @ theta.reshape(3, TEMPERATURE_TERMS).T
+            K = theta.reshape(3, TEMPERATURE_TERMS).T
+            self._bias[:, COLUMNS[sensor]] = self._terms @ K
+            self._clamped[:, COLUMNS[sensor]] = slopes @ K
 
     def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
         """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
@@ -39,7 +43,8 @@ class TemperatureDrift:
     def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
         """Covariance of the drift relative to its mean so far.
 
-        The mean acts like a rest bias, and counts in its covariance (`imutool.bias_start.bias_covariance`).
+        The mean acts like a rest bias, and counts in its covariance (`imutool.bias_start.bias_covariance`). Beyond the trained
+        range the drift is as unsure as it would change if it went on with its slope at the end of the range.
         """
         out, rows = np.zeros((len(t_ns), 6, 6)), holding(self._t_ns, t_ns)
         if not len(rows):
@@ -51,6 +56,7 @@ class TemperatureDrift:
             blocks = covariance.reshape(3, TEMPERATURE_TERMS, 3, TEMPERATURE_TERMS)
             S = np.einsum("nq,iqjr,nr->nij", off, blocks, off, optimize=True)
             out[:, COLUMNS[sensor], COLUMNS[sensor]] = S[place]
+        out[:, range(6), range(6)] += self._clamped[rows] ** 2
         return out
 
 

@@ -6,6 +6,7 @@ the rate of the channel: sixteen bytes for each half second.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
@@ -22,13 +23,14 @@ from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, UNIT_KEY, Topic
 from imutool.recording import Recording, Scalars
 
 WORD = "temperature"
+NAME = re.compile(r"temperature|(?<![a-z])temp(?![a-z])")
 EVERY_NS = 500_000_000
 CELSIUS = "degC"
 
 
 def is_temperature(name: str) -> bool:
     """Whether a channel, TOPIC or TOPIC.field, is called a temperature."""
-    return "temp" in name.lower().replace(".data", "").rpartition("/")[2]
+    return NAME.search(name.rpartition("/")[2].lower()) is not None
 
 
 def thinned(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, " n"], unit: str) -> Scalars:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_ros2.writer import Writer as Ros2Writer
 
 import imutool
 from imutool.bias.io import load, save
@@ -21,10 +27,12 @@ from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior, tracked_from_prior
 from imutool.bias_start.model_choice import find_initial_bias
+from imutool.bias_start.stretches import read_stretches
 from imutool.debiasing import debias
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, Scalars
 from imutool.sensor.signals import LOAD_TAU_S, TEMPERATURE_TERMS
+from imutool.viewing.model.load_view import load as load_view
 from imutool.viewing.stream import session, sources
 from imutool.viewing.stream.samples import Malformed, decoded
 
@@ -34,6 +42,17 @@ CENTRE, HALF = 30.0, 10.0
 CHANNEL = "/imu0/temperature"
 SAME = 1e-12  # rounding of sums
 STORED = 1e-6  # a model file holds float32
+TEMPERATURE = """std_msgs/Header header
+float64 temperature
+float64 variance
+===
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+===
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec""".replace("===", 80 * "=")
 SIZE = 0.01  # rad/s from the centre to the end of the range
 
 
@@ -207,6 +226,12 @@ def test_another_range_is_clamped_and_told(model: BiasModel) -> None:
     assert "beyond the model's range" in bound.remarks[0]
     assert bound.log_drift is not None
     np.testing.assert_allclose(bound.log_drift(channel.t_ns)[:, 0], SIZE, atol=STORED)
+    below = scalars(np.arange(100.0), np.full(100, CENTRE - 3.0 * HALF))
+    for log_drift in (bound.log_drift, bound_to(model, recording(below)).log_drift):
+        assert log_drift is not None
+        covariance = log_drift.covariance(channel.t_ns)
+        np.testing.assert_allclose(np.sqrt(covariance[:, 0, 0]), 2.0 * SIZE, rtol=1e-5)  # two half ranges beyond the end
+        assert not covariance[:, 1:, 1:].any()
 
 
 def test_a_long_silence_is_told(model: BiasModel) -> None:
@@ -221,6 +246,51 @@ def test_a_model_without_it_is_the_same_object(build: MakeModel) -> None:
     plain = build("linear").frozen()
     assert bound_to(plain, recording(warming())) is plain
     assert FORMS["gyro"].name == "gyro_temperature"
+
+
+# a message of another writer
+
+
+def with_message(own: Path, out: Path, celsius: Scalars) -> None:
+    """The log with its temperature as `sensor_msgs/Temperature` on /imu/temperature, by the library of MCAP, at 10 Hz."""
+    alone = out.with_suffix(".alone.mcap")
+    with alone.open("wb") as file, Ros2Writer(file) as ros:
+        kind = ros.register_msgdef("sensor_msgs/msg/Temperature", TEMPERATURE)
+        for t_ns, T in zip(celsius.t_ns.tolist(), celsius.values[:, 0].tolist(), strict=True):
+            stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+            ros.write_message(
+                "/imu/temperature", kind, {"header": {"stamp": stamp, "frame_id": ""}, "temperature": T}, t_ns, t_ns
+            )
+    with out.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        channels: dict[str, int] = {}
+        for path in (own, alone):
+            for schema, channel, message in make_reader(BytesIO(path.read_bytes())).iter_messages():
+                if channel.topic not in channels and schema is not None:
+                    of = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", of, dict(channel.metadata))
+                at = channels[channel.topic]
+                writer.add_message(at, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()
+
+
+def test_every_way_in_reads_a_temperature_message(model: BiasModel, tmp_path: Path) -> None:
+    log, file = recording(None), tmp_path / "warm.safetensors"
+    imutool.write(tmp_path / "own.mcap", log)
+    with_message(tmp_path / "own.mcap", tmp_path / "ros.mcap", warming(100.0, 0.1))
+    wanted = expected(log, Scalars(*(column[::5] for column in (warming(100.0, 0.1).t_ns, warming(100.0, 0.1).values))))
+    path = tmp_path / "ros.mcap"
+    (stretch,), opened = read_stretches(path), imutool.read(path)
+    assert list(opened.scalars) == list(stretch.scalars) == ["/imu/temperature.temperature"]
+    np.testing.assert_allclose(imutool.debias(opened, model, init="prior").bias[:, 0], wanted, atol=STORED)
+    for command in (["debias", str(path), str(tmp_path / "out.mcap")], ["fleet", "debias", str(path), str(tmp_path / "fleet")]):
+        subprocess.run([sys.executable, "-m", "imutool", *command, "--model", str(file), "--init", "prior", "-q"], check=True)
+    for out in (tmp_path / "out.mcap", next((tmp_path / "fleet").glob("*.mcap"))):
+        rate = read(out, imu="/imu0/debiased").imu.gyro
+        np.testing.assert_allclose(log.imu.gyro[:, 0] - rate[:, 0], wanted, atol=STORED)
+    (run,) = [run for run in (trace.run for trace in load_view(path, models=[file], init="prior").traces) if run.name == "warm"]
+    np.testing.assert_allclose(run.gyro_bias[:, 0], wanted, atol=STORED)
 
 
 # a live stream
