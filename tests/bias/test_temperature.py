@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, Scalars
 from imutool.sensor.signals import LOAD_TAU_S, TEMPERATURE_TERMS
 from imutool.viewing.model.load_view import load as load_view
-from imutool.viewing.stream import session, sources
+from imutool.viewing.stream import sources
 from imutool.viewing.stream.samples import Malformed, decoded
 
 MakeModel = Callable[..., BiasNetwork]
@@ -154,6 +155,12 @@ def expected(log: Recording, channel: Scalars) -> np.ndarray:
     return SIZE * np.clip((channel.values[row, 0] - CENTRE) / HALF, -1.0, 1.0)
 
 
+def planted(seconds: float = 100.0) -> Recording:
+    """Recording whose gyro has the drift."""
+    log, channel = recording(warming(seconds), seconds), warming(seconds)
+    return replace(log, imu=Imu(log.imu.t_ns, log.imu.gyro + expected(log, channel)[:, None] * [1.0, 0.0, 0.0], log.imu.accel))
+
+
 @pytest.mark.parametrize("shift_s", [0.0, 30.0])
 def test_the_drift_is_that_of_the_last_number(model: BiasModel, shift_s: float) -> None:
     channel = warming()
@@ -165,22 +172,33 @@ def test_the_drift_is_that_of_the_last_number(model: BiasModel, shift_s: float) 
     assert not drift(log.imu.t_ns)[:, 1:].any()
 
 
-def test_a_model_in_memory_and_on_a_log_subtract_the_same(model: BiasModel, tmp_path: Path) -> None:
-    log = recording(warming())
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_model_in_memory_and_on_a_log_subtract_the_same(model: BiasModel, tmp_path: Path, smooth: bool) -> None:
+    log, parts = planted(), list[np.ndarray]()
+    init = "auto" if smooth else "prior"
     imutool.write(tmp_path / "log.mcap", log)
-    in_memory = imutool.debias(log, model, init="prior")
-    np.testing.assert_allclose(in_memory.bias[:, 0], expected(log, warming()), atol=STORED)
-    report = debias(tmp_path / "log.mcap", tmp_path / "out.mcap", model=tmp_path / "warm.safetensors", init="prior")
+    in_memory = imutool.debias(log, model, init=init, smooth=smooth)
+    report = debias(
+        tmp_path / "log.mcap",
+        tmp_path / "out.mcap",
+        model=tmp_path / "warm.safetensors",
+        init=init,
+        smooth=smooth,
+        watch=lambda block: parts.append(block.std),
+    )
     on_log = read(tmp_path / "out.mcap", imu="/imu0/debiased").imu
     np.testing.assert_array_equal(on_log.gyro, in_memory.imu.gyro)
     np.testing.assert_array_equal(on_log.accel, in_memory.imu.accel)
-    assert "temperature" not in " ".join(report.fits["/imu0"].reasons)
+    np.testing.assert_array_equal(np.concatenate(parts), in_memory.std)
+    assert report.fits["/imu0"].verdict == in_memory.fitness.verdict != "unfit"
+    np.testing.assert_allclose(in_memory.bias[:, 0], expected(log, warming()), atol=2e-4 if smooth else STORED)
+    if not smooth:  # of the rest bias alone about y, and of the drift about x: half the range from its mean so far
+        assert in_memory.std[-1, 0] == pytest.approx(np.hypot(in_memory.std[-1, 1], 0.1 * SIZE), rel=0.02)
 
 
 def test_the_rest_bias_is_measured_without_the_drift(model: BiasModel) -> None:
     """A stop of the whole log: with the drift in it no constant would fit."""
-    log = recording(warming())
-    log = replace(log, imu=Imu(log.imu.t_ns, log.imu.gyro + expected(log, warming())[:, None] * [1.0, 0.0, 0.0], log.imu.accel))
+    log = planted()
     start = find_initial_bias("auto", bound_to(model, log), log)
     assert np.abs(start.rest[:3]).max() < 1e-4
     debiased = imutool.debias(log, model)
@@ -297,8 +315,7 @@ def test_every_way_in_reads_a_temperature_message(model: BiasModel, tmp_path: Pa
 
 
 def test_a_live_stream_has_the_drift_of_the_log(model: BiasModel) -> None:
-    log = recording(warming())
-    log = replace(log, imu=Imu(log.imu.t_ns, log.imu.gyro + expected(log, warming())[:, None] * [1.0, 0.0, 0.0], log.imu.accel))
+    log = planted()
     bound, online = bound_to(model, log), imutool.OnlineDebiaser(model)
     whole = apply(bound, tracked_from_prior(bound, START_NS), log.imu)
     numbers = dict(zip(warming().t_ns.tolist(), warming().values[:, 0].tolist(), strict=True))
@@ -321,14 +338,13 @@ def test_a_replayed_log_brings_its_temperature(model: BiasModel, tmp_path: Path)
     replayed = sources.open_source(str(tmp_path / "log.mcap"), Malformed(), speed=1e6, temperature=CHANNEL)
     seen = {sample.stamp_ns: sample.temperature for sample in replayed if sample is not None and sample.temperature is not None}
     assert seen == dict(zip(warming(10.0).t_ns.tolist(), warming(10.0).values[:, 0].tolist(), strict=True))
-    corrected: list[float] = []
-    session.run(
-        sources.open_source(str(tmp_path / "log.mcap"), Malformed(), speed=1e6, temperature=CHANNEL),
-        model,
-        Malformed(),
-        each=lambda sample, rate, force: corrected.append(float(rate[0])),
+    imutool.write(tmp_path / "planted.mcap", planted(10.0))
+    command = ["live", str(tmp_path / "planted.mcap"), "--model", str(tmp_path / "warm.safetensors"), "--speed", "1e6"]
+    printed = subprocess.run(
+        [sys.executable, "-m", "imutool", *command, "--no-view", "--print"], check=True, capture_output=True
     )
-    slope = np.polyfit(np.arange(len(corrected)) / RATE_HZ, corrected, 1)[0]
-    assert slope == pytest.approx(-2.0 * SIZE / 10.0, rel=0.2)
+    rates = [json.loads(line)["gyro"][0] for line in printed.stdout.splitlines()]
+    assert len(rates) == 500
+    assert np.abs(rates).mean() < 2e-4, "of a drift of a hundredth"
     line = b'{"t_ns": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8], "temperature": 21.5}'
     assert next(decoded(line, 0.0, Malformed())).temperature == 21.5
