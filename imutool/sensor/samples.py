@@ -149,7 +149,7 @@ def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"])
     first = np.minimum(at.astype(np.int32), n - 2)
     values = np.empty((len(at), 4))
     u = at - first
-    for x, end, inner in ((u, 3, 1), (1.0 - u, 0, 2)):  # products: numpy's cubes take ten times as long
+    for x, end, inner in ((u, 3, 1), (1.0 - u, 0, 2)):  # products: a cube by `**` takes five times as long
         values[:, end] = x * x * x / 6.0
         values[:, inner] = 2.0 / 3.0 - x * x * (1.0 - 0.5 * x)
     columns = np.add.outer(first, np.arange(PAD - 1, PAD + 3, dtype=np.int32))
