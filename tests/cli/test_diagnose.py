@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.diagnosis.wording.conclusion import conclusion
+from imutool.diagnosis_output import FILES
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -216,6 +218,41 @@ def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytes
     assert remark == "view.rrd is left out: rerun is not installed (pip install 'imutool[view]')"
     files = ["findings.json", "noise.toml", "physics.toml", "report.html"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == files
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_of_two_diagnoses_that_end_together_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
+) -> None:
+    """Both have looked whether the folder holds a diagnosis before either puts its own there."""
+    folder, both, looks = tmp_path / "out", threading.Barrier(2), threading.local()
+    refuse, refused = diagnosis_output.refuse, list[ConfigError]()
+
+    def look(place: Path, *, overwrite: bool = False) -> None:
+        looks.made = getattr(looks, "made", 0) + 1
+        refuse(place, overwrite=overwrite)
+        if looks.made == 2:  # the last look before it writes
+            both.wait(timeout=60.0)
+
+    def run() -> None:
+        try:
+            diagnosis_output.write(diagnoses.NOTHING, folder)
+        except ConfigError as error:
+            refused.append(error)
+
+    if exists:
+        folder.mkdir()
+    monkeypatch.setattr(diagnosis_output, "refuse", look)
+    monkeypatch.setattr(diagnosis_output, "_make", lambda d, place, logs: [(place / name).touch() for name in FILES][:0])
+    threads = [threading.Thread(target=run) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (error,) = refused
+    assert "holds a diagnosis already" in error.what
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
 
 
 def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

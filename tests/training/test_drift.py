@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from support.drifting import Drifting, Kind, log
+from support.drifting import TEMPERATURE, Drifting, Kind, log
 
 from imutool.bias import neural_ode
 from imutool.bias.hybrid import Config
@@ -63,3 +63,16 @@ def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path) -> None:
     (test,) = saved(tmp_path, "rate", 50, TEST_S)
     _, static, ode = (result["aoe_deg"] for result in evaluate(test, models=models, init="truth"))
     assert BETTER * ode < static
+
+
+def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path) -> None:
+    logs = saved(tmp_path, "ambient", 0, TRAINING_S)
+    model = trained(tmp_path, logs, "hybrid", *ALONE)
+    assert isinstance(model.config, Config)
+    assert "gyro_temperature" in (model.config.gyro_effects or ())
+    assert model.config.temperature == TEMPERATURE
+    (test,) = saved(tmp_path, "ambient", 50, (60.0,))
+    _, static, hybrid = (
+        result["aoe_deg"] for result in evaluate(test, models=["static", str(tmp_path / "hybrid.safetensors")], init="truth")
+    )
+    assert BETTER * hybrid < static
