@@ -14,7 +14,7 @@ from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.read import read as read_log
+from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.temperature import with_temperatures
@@ -56,9 +56,9 @@ def read(
         >>> list(recording.truths)
         ['/ground_truth/pose']
     """
-    recording = read_log(location(path), imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns)
     with Log(location(path)) as log:
-        return with_temperatures([recording], log)[0]
+        found = read_recordings(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns)
+        return longest_recording(with_temperatures(found, log, start_ns, end_ns))
 
 
 def write(path: LogPath, recording: Recording, *, compression: str = "zstd", overwrite: bool = False) -> None:

@@ -41,10 +41,13 @@ def thinned(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, " n"], un
     return Scalars(t_ns[first], np.ascontiguousarray(values[first, None]), unit)
 
 
-def temperatures(log: Log, skip: Collection[str] = ()) -> dict[str, Scalars]:
+def temperatures(
+    log: Log, skip: Collection[str] = (), start_ns: int | None = None, end_ns: int | None = None
+) -> dict[str, Scalars]:
     """Temperatures of a log by channel: TOPIC of a Float64, TOPIC.field of other messages.
 
     Float64 topics are those called a temperature, fields those called `temperature`. Topics in `skip` are not read.
+    `start_ns` and `end_ns` select by log time.
 
     Raises:
         LogError: the log is damaged.
@@ -58,7 +61,7 @@ def temperatures(log: Log, skip: Collection[str] = ()) -> dict[str, Scalars]:
                     readers[name] = None
             elif paths := _paths(log, topic):
                 readers[name] = _Reader(log, topic, tuple(paths), strict=False)
-    for name, rows in log.rows(list(readers)):
+    for name, rows in log.rows(list(readers), start_ns, end_ns):
         with log.named(name):
             for channel, part in (
                 _floats(log.topics[name], rows) if (reader := readers[name]) is None else _fields(reader, rows)
@@ -67,10 +70,12 @@ def temperatures(log: Log, skip: Collection[str] = ()) -> dict[str, Scalars]:
     return {channel: _joined(parts) for channel, parts in found.items()}
 
 
-def with_temperatures(recordings: Sequence[Recording], log: Log) -> list[Recording]:
-    """Recordings of a log with the temperatures that are no scalar topic."""
+def with_temperatures(
+    recordings: Sequence[Recording], log: Log, start_ns: int | None = None, end_ns: int | None = None
+) -> list[Recording]:
+    """Recordings of a log with the temperatures (`temperatures`) that are no scalar topic."""
     known = set().union(*(recording.scalars for recording in recordings))
-    found = temperatures(log, skip=known)
+    found = temperatures(log, known, start_ns, end_ns)
     return [replace(recording, scalars={**recording.scalars, **found}) for recording in recordings] if found else [*recordings]
 
 

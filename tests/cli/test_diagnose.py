@@ -31,7 +31,7 @@ from imutool.report import json_values
 from imutool.sensor import physics_file
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.samples import SensorSamples
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import simulate
 from imutool.units import AXES
 
@@ -308,7 +308,7 @@ def test_what_is_driven_keeps_its_driver_and_lag() -> None:
     (physics, theta), _ = file.acting()
     assert theta.tolist() == [0.0, 0.1, 0.2, 0.05]
     t = np.arange(50) * 0.01
-    there = SensorSamples(t, np.zeros((50, 3)), np.zeros((50, 3)), np.zeros((50, 3)), None, {"/motor/current": t})
+    there = IdealMotion(t, *(np.zeros((50, 3)) for _ in range(3)), channels={"/motor/current": t}).sample(t, t)
     assert np.ptp(physics.forward(there, theta).accel[:, 2]) > 0.0
 
 
@@ -317,7 +317,8 @@ def test_a_term_without_a_name_acts_as_it_was_found() -> None:
     said = finding("unknown", "gyro", c, kind="unknown", axis="z", variable="omega_x omega_y")
     (physics, theta), _ = to_physics_file(only(said)).acting()
     gyro = np.random.default_rng(1).normal(size=(20, 3))
-    there = SensorSamples(np.arange(20) * 0.01, gyro, gyro, gyro)
+    t_s = np.arange(20) * 0.01
+    there = IdealMotion(t_s, gyro, gyro, gyro).sample(t_s, t_s)
     added = physics.forward(there, theta).gyro - gyro
     assert np.allclose(added, np.outer(gyro[:, 0] * gyro[:, 1], [0.0, 0.0, 0.3]), rtol=0, atol=EXACT)
 
@@ -333,7 +334,8 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
     said = finding("unknown", "accel", {}, kind="unknown", axis="z", variable="omega_x", curve=curve)
     acting = to_physics_file(only(said)).acting()
     gyro = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
-    there = SensorSamples(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
+    t_s = np.arange(41) * 0.01
+    there = IdealMotion(t_s, gyro, np.zeros((41, 3)), gyro).sample(t_s, t_s)
     for physics, theta in acting:
         there = physics.forward(there, theta)
     assert np.allclose(there.accel[:, 2], shape.basis(x) @ c, rtol=0, atol=EXACT)
@@ -343,7 +345,8 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
 def test_every_term_there_can_be_is_written_as_it_acts() -> None:
     """Whatever `unnamed` can propose, the file can say: same signal, same axis, same numbers."""
     gyro, accel, alpha = (np.random.default_rng(k).normal(size=(30, 3)) for k in (1, 2, 3))
-    there = SensorSamples(np.arange(30) * 0.01, gyro, accel, alpha)
+    t_s = np.arange(30) * 0.01
+    there = IdealMotion(t_s, gyro, accel, alpha).sample(t_s, t_s)
     for physics in unnamed.terms(there):
         c = {"c": Estimate(0.7, 0.01, physics.parameters[0].unit)}
         assert physics.axis is not None

@@ -55,6 +55,13 @@ def test_messages_and_numbers_of_any_writer_are_found_by_their_stamps(tmp_path: 
     assert found["/imu/temperature.temperature"].unit == "degC"
 
 
+def test_read_selects_them_by_log_time_too(tmp_path: Path) -> None:
+    ros_log(tmp_path / "log.mcap", 20.0 + np.arange(100.0), late_ns=0)
+    with Log(tmp_path / "log.mcap") as log:
+        found = temperatures(log, start_ns=START_NS + 2 * EVERY_NS, end_ns=START_NS + 5 * EVERY_NS)
+    assert [len(channel) for channel in found.values()] == [4, 4]
+
+
 def test_nan_is_no_temperature_and_the_next_number_counts(tmp_path: Path) -> None:
     celsius = 20.0 + np.arange(100.0)
     celsius[5:8] = np.nan
