@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool import __version__
-from imutool.array_types import Float64, Int64, UInt8
+from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias.temperature_drift import split_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
@@ -44,7 +45,6 @@ from imutool.recording import seconds
 
 SUFFIX = "/debiased"
 CLEAN_RECORD = "imutool_clean"
-
 logger = logging.getLogger(__name__)
 
 
@@ -101,7 +101,7 @@ class Debiaser:
             NewTopic(f"{source_topic}/bias/accel", schemas.VECTOR3),
             NewTopic(f"{source_topic}/bias", schemas.TWIST),
         )
-        self._estimator, self._start_ns = BiasEstimator(model, start), -1
+        self._estimator, self._start_ns, self._model = BiasEstimator(model, start), -1, model
         self.sieve = Sieve(source_topic)
         self._white = np.diag(np.where(model.noise_std > 0, model.noise_std, start.noise) ** 2)
 
@@ -119,7 +119,10 @@ class Debiaser:
         if self._start_ns < 0 and len(t_ns):
             self._start_ns = int(t_ns[0])
         t_s = seconds(t_ns, self._start_ns)
-        bias, covariance = self._estimator(t_s, batch.gyro, batch.accel)
+        drift, gyro, accel = split_drift(self._model, batch.stamp_ns, batch.gyro, batch.accel)
+        bias, covariance = self._estimator(t_s, gyro, accel)
+        if drift is not None and self._model.log_drift is not None:
+            bias, covariance = bias + drift, covariance + self._model.log_drift.covariance(batch.stamp_ns)
         if not (np.isfinite(bias).all() and np.isfinite(covariance).all()):
             raise ModelError("the model gives a bias that is not finite", where=self.source_topic, fix="Choose another `model`")
         total = covariance + self._white
@@ -133,8 +136,8 @@ class Debiaser:
         )
         payloads = (
             corrected,
-            _vector(batch.stamp_ns, bias[:, :3], batch.frame_id),
-            _vector(batch.stamp_ns, bias[:, 3:], batch.frame_id),
+            encode_vector3(batch.stamp_ns, np.ascontiguousarray(bias[:, :3]), batch.frame_id),
+            encode_vector3(batch.stamp_ns, np.ascontiguousarray(bias[:, 3:]), batch.frame_id),
             encode_twist(batch.stamp_ns, bias[:, :3], bias[:, 3:], covariance, batch.frame_id),
         )
         if self._watch is not None and len(batch.stamp_ns):
@@ -291,10 +294,7 @@ def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smo
         "rest": json.dumps(start.rest.tolist()),
         "rest_std": json.dumps(start.std.tolist()),
         "smooth": "true" if smooth else "false",
+        **({"temperature": model.log_drift.name} if model.log_drift else {}),
         # without a model: the mean over all rest, also later
         "causal": "false" if smooth or (init == "auto" and model.method == static.Model.method) else "true",
     }
-
-
-def _vector(stamp_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n 3"], frame_id: str) -> UInt8[np.ndarray, "n L"]:
-    return encode_vector3(stamp_ns, np.ascontiguousarray(values), frame_id)

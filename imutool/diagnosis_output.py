@@ -72,11 +72,7 @@ def write(
         try:
             complete.mkdir(parents=True)
             remarks = _make(d, complete, logs)
-            refuse(folder, overwrite=overwrite)
-            if folder.exists():
-                _move(complete, folder)
-            else:
-                complete.rename(folder)
+            _publish(complete, folder, overwrite=overwrite)
         finally:
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(partial)
@@ -130,6 +126,29 @@ def _recording(d: Diagnosis, path: Path) -> None:
     from imutool.viewing.rerun.diagnosis import save
 
     save(d, path)
+
+
+def _publish(complete: Path, folder: Path, *, overwrite: bool) -> None:
+    """Put a whole diagnosis in its folder; of two that end together one is refused.
+
+    Raises:
+        ConfigError: as `refuse`, if another diagnosis came meanwhile.
+    """
+    refuse(folder, overwrite=overwrite)
+    if not folder.exists():
+        try:
+            complete.rename(folder)
+        except OSError:
+            if not folder.is_dir():
+                raise
+        else:
+            return
+    if not overwrite:
+        try:
+            (folder / FINDINGS).open("xb").close()  # only one of two can make it
+        except FileExistsError:
+            refuse(folder)
+    _move(complete, folder)
 
 
 def _move(complete: Path, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -15,10 +16,11 @@ from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
+from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
-from imutool.bias_start.initial_bias import InitialBias, relative_samples
+from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
@@ -28,6 +30,8 @@ from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.recording import Imu, Poses, Recording
+
+logger = logging.getLogger(__name__)
 
 RAW = "raw"
 DRIFT_S = 5.0
@@ -91,7 +95,7 @@ def _evaluated(
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
         found, std = _corrected(recording.imu, model, start)
-        fit = judge(model, start, [relative_samples(recording.imu)], about) if model and start else None
+        fit = judge(model, start, [model_samples(model, recording.imu)], about) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
         estimates = {PURE: integrated}
@@ -188,9 +192,11 @@ def _model_and_start(
 ) -> tuple[BiasModel, InitialBias]:
     if trained is None and init == "auto" and not smooth:
         return estimate_at_rest(recording.imu, where)
-    model: BiasModel = static.Model() if trained is None else trained
+    model: BiasModel = static.Model() if trained is None else bound_to(trained, recording)
     if trained is not None:
         check_rate(model, 1.0 / recording.imu.period_s, where)
+    for remark in model.remarks:
+        logger.warning("%s: %s", recording.name, remark)
     if smooth:
         return model, smooth_in_memory(model, recording.imu, where)
     return model, find_initial_bias(init, model, recording)

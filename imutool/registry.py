@@ -26,8 +26,10 @@ GROUPS = {
     "imutool.clean": "imutool.cleaning.rules",
 }
 NOT_PLUGINS = {
-    "imutool.bias": frozenset({"effects_stream", "io", "model", "networks", "neural_stream", "physics"}),
-    "imutool.networks": frozenset({"joint_ode", "network", "ode"}),
+    "imutool.bias": frozenset(
+        {"effects_stream", "io", "model", "networks", "neural_stream", "physics", "temperature", "temperature_drift"}
+    ),
+    "imutool.networks": frozenset({"joint_ode", "network", "ode", "temperature"}),
 }
 
 

@@ -102,13 +102,14 @@ def test_lower_rooms_never_import_higher_ones() -> None:
 
 def test_the_order_is_really_looked_at() -> None:
     wrong = ast.parse(
-        "def f():\n    from imutool import debiasing\n    import imutool.cli\n    from imutool.viewing.model.runs import load\n"
+        "def f():\n    from imutool import debiasing\n    import imutool.cli\n"
+        "    from imutool.viewing.model.load_view import load\n"
     )
     planted = {**package(), "imutool.inertial.metrics": wrong}
     assert against_the_order(planted) == [
         "imutool.inertial.metrics imports imutool.cli",
         "imutool.inertial.metrics imports imutool.debiasing",
-        "imutool.inertial.metrics imports imutool.viewing.model.runs",
+        "imutool.inertial.metrics imports imutool.viewing.model.load_view",
     ]
 
 

@@ -16,8 +16,8 @@ from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport
 from imutool.mcap_io.repair import repair as repair_log
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def clean(
         'good'
     """
     wanted = chosen(rules, skip_rules, force, fix)
-    check_outputs([OutputFile("target", target, outputs.LOG)], [source, model], overwrite=overwrite)
+    check_outputs([OutputFile("target", target, output_conflicts.LOG)], [source, model], overwrite=overwrite)
     if target is None:
         return survey_imus(source, imus, wanted)
     from imutool.debiasing import debias
@@ -148,7 +148,7 @@ def repair(
         >>> report.whole, report.messages["/imu0"] > 0
         (False, True)
     """
-    check_outputs([OutputFile("target", target, (*outputs.LOG, ".bag"))], [source], overwrite=overwrite)
+    check_outputs([OutputFile("target", target, (*output_conflicts.LOG, ".bag"))], [source], overwrite=overwrite)
     here, there = location(source), location(target)
     if not is_bag(here):
         return repair_log(here, there, damaged=damaged, max_chunk=max_chunk, overwrite=overwrite, progress=progress)

@@ -13,9 +13,11 @@ from imutool.exporting import ExportReport, euroc, rosbag2, simulators
 from imutool.location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
-from imutool.mcap_io.read import read as read_log
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import longest_recording, read_recordings
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
+from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.write import write as write_log
 from imutool.recording import Recording
 
@@ -33,7 +35,7 @@ def read(
     """Read a log as numpy arrays; `read(write(recording)) == recording`, bit for bit.
 
     A log of another program gets the file's name. Its pose topics become `truths`, its Float64 and Vector3Stamped topics
-    become `scalars`.
+    become `scalars`, and the field `temperature` of any other message as `TOPIC.temperature`, two numbers a second at most.
 
     Args:
         path: MCAP log: a file, or a URL such as `s3://bucket/log.mcap`.
@@ -54,7 +56,9 @@ def read(
         >>> list(recording.truths)
         ['/ground_truth/pose']
     """
-    return read_log(location(path), imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns)
+    with Log(location(path)) as log:
+        found = read_recordings(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns)
+        return longest_recording(with_temperatures(found, log, start_ns, end_ns))
 
 
 def write(path: LogPath, recording: Recording, *, compression: str = "zstd", overwrite: bool = False) -> None:
@@ -80,7 +84,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
         >>> imutool.read("bench.mcap") == recording
         True
     """
-    check_outputs([OutputFile("path", path, outputs.LOG)], overwrite=overwrite)
+    check_outputs([OutputFile("path", path, output_conflicts.LOG)], overwrite=overwrite)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
 

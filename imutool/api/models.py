@@ -16,17 +16,18 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.fitness import judge
-from imutool.bias_start.initial_bias import InitialBias, relative_samples
+from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu, Recording
 
 Model = str | Path | BiasModel
@@ -197,7 +198,7 @@ def debias(
     if in_place == (target is not None):
         raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
     out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
-    check_outputs([OutputFile("target", out, outputs.LOG)], [source, given], overwrite=overwrite)
+    check_outputs([OutputFile("target", out, output_conflicts.LOG)], [source, given], overwrite=overwrite)
     run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth, check=check)
     return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
 
@@ -207,7 +208,7 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     name, chosen, start = _model_and_start(recording, model, init, smooth)
     about = recording.metadata.get("imutool", {})
-    fitness = judge(chosen, start, [relative_samples(recording.imu)], about).report(name, recording.name, force=force)
+    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
     return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
 
@@ -220,5 +221,6 @@ def _model_and_start(recording: Recording, model: Model | None, init: str, smoot
         ((name, chosen, start),) = evaluation.started(recording, [given], init, recording.name, smooth=smooth)
         return name, chosen, start
     check_smooth(init, smooth)
+    model = bound_to(model, recording)
     start = smooth_in_memory(model, recording.imu, recording.name) if smooth else find_initial_bias(init, model, recording)
     return str(model.card.get("name", model.method)), model, start

@@ -13,8 +13,8 @@ from imutool.api import NamedProgress
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.location import LogPath, local, location
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
@@ -84,7 +84,7 @@ def simulate(
         >>> len(simulation.recording.imu) > 3900
         True
     """
-    check_outputs([OutputFile("out", out, outputs.LOG)], [trajectory, physics, noise], overwrite=overwrite)
+    check_outputs([OutputFile("out", out, output_conflicts.LOG)], [trajectory, physics, noise], overwrite=overwrite)
     return simulate_log(
         local(trajectory, "trajectory"),
         local(out, "out"),
@@ -145,7 +145,7 @@ def diagnose(
     if folder is not None:
 
         def runs(findings: Path) -> list[RunData]:
-            from imutool.viewing.model.runs import load
+            from imutool.viewing.model.load_view import load
 
             return [load(real, imu=imu, truth=truth, findings=findings) for real in logs]
 

@@ -10,8 +10,8 @@ from imutool import evaluation
 from imutool.bias.model import BiasModel
 from imutool.config import build
 from imutool.location import LogPath, local, locals_of
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
 if TYPE_CHECKING:
     from imutool.training.fit import Epoch
@@ -60,7 +60,7 @@ def train(
     from imutool.training.settings import settings_of
 
     chosen = None if settings is None else build(settings_of(method), dict(settings), where="settings")
-    check_outputs([OutputFile("out", out, outputs.MODEL)], [logs], overwrite=overwrite)
+    check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [logs], overwrite=overwrite)
     return run(
         locals_of(logs, "logs"),
         local(out, "out"),

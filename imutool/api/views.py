@@ -13,12 +13,12 @@ from imutool.array_types import Float64
 from imutool.debiasing import DebiasedBlock
 from imutool.location import LogPath, local, location
 from imutool.mcap_io.codec.decode import ImuBatch
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu
 from imutool.viewing import Output, notebook
+from imutool.viewing.model.load_view import load
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.model.runs import load
 from imutool.viewing.model.trajectory_error import alignment
 from imutool.viewing.outputs import Outputs, RequestedOutputs
 from imutool.viewing.rerun import live
@@ -141,10 +141,10 @@ def view(
 
 def _outputs(save: Path | None, export_web: Path | None, png: Path | None, html: Path | None) -> list[OutputFile]:
     return [
-        OutputFile("save", save, outputs.RRD, may_be_folder=True),
+        OutputFile("save", save, output_conflicts.RRD, may_be_folder=True),
         OutputFile("export_web", export_web, files=("*",), keeps=True),
         OutputFile("png", png, files=("*.png",), keeps=True, of_each="{}-*.png"),
-        OutputFile("html", html, outputs.HTML),
+        OutputFile("html", html, output_conflicts.HTML),
     ]
 
 
@@ -239,6 +239,6 @@ def watch(
         1
     """
     file, instead = None if save is None else Path(save), Path(f"{name}.rrd")
-    check_outputs([OutputFile("save", file, outputs.RRD)], overwrite=overwrite)
+    check_outputs([OutputFile("save", file, output_conflicts.RRD)], overwrite=overwrite)
     with live.live_view(name, connect_to=connect, save=file, instead=instead, overwrite=overwrite) as show:
         yield LiveView(topic, show)

@@ -12,26 +12,31 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
+import msgspec
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
 from imutool.bias import neural_ode
 from imutool.bias.effects_stream import EffectsStream
-from imutool.bias.model import BiasModel, CovarianceModel, Shapes, Stream, Vector6
+from imutool.bias.model import Array, BiasModel, CovarianceModel, Shapes, Stream, Vector6
+from imutool.bias.temperature import columns_of, forms, samples_alone
 from imutool.config import Settings
-from imutool.sensor import catalogue
 from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, patterns
 from imutool.sensor.signals import SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 
 
 class Config(Settings, frozen=True):
-    """Effects of each sensor by name (None: the training chooses), and the neural ODE."""
+    """Effects of each sensor by name (None: the training chooses), and the neural ODE.
+
+    `temperature` is the log's channel that the drifts `gyro_temperature` and `accel_temperature` follow.
+    """
 
     gyro_effects: tuple[str, ...] | None = None
     accel_effects: tuple[str, ...] | None = None
     remainder: bool = True
     ode: neural_ode.Config = neural_ode.Config()
+    temperature: str | msgspec.UnsetType = msgspec.UNSET
 
     def effects(self, sensor: Sensor) -> tuple[str, ...] | None:
         """Effects that the settings name for a sensor; None if the training chooses."""
@@ -55,7 +60,7 @@ class Model(BiasModel):
         effects: Mapping[Sensor, tuple[LinearForm, ...]] | None = None,
     ) -> None:
         super().__init__(config, rate_hz, tensors)
-        self.effects = effects or {sensor: catalogue.trained(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
+        self.effects = effects or {sensor: forms(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
         self.ode: neural_ode.Model | None = None
         if self.config.remainder:
             held = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
@@ -71,7 +76,7 @@ class Model(BiasModel):
         assert isinstance(config, Config)
         shapes = super().shapes(config)
         for sensor in SENSORS:
-            effects = catalogue.trained(sensor, config.effects(sensor) or ())
+            effects = forms(sensor, config.effects(sensor) or ())
             size = sum(len(effect.parameters) for effect in effects)
             shapes |= {f"theta_{sensor}": (size,), f"covariance_{sensor}": (size, size)}
         ode = neural_ode.Model.shapes(config.ode) if config.remainder else {}
@@ -91,26 +96,42 @@ class Model(BiasModel):
         """Rest dynamics of the neural ODE."""
         return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
 
+    def temperature_parameters(self) -> Mapping[Sensor, tuple[Array, Array]]:
+        """Parameters of the drifts with a log's temperature, by sensor."""
+        found: dict[Sensor, tuple[Array, Array]] = {}
+        for sensor in SENSORS:
+            own = columns_of(self.effects[sensor], temperature=True)
+            if len(own):
+                found[sensor] = self.tensors[f"theta_{sensor}"][own], self.tensors[f"covariance_{sensor}"][np.ix_(own, own)]
+        return found
+
     def calibration_covariance(self) -> CovarianceModel | None:
         """Root T Sigma^1/2 of the covariance of the effects' error, T Sigma T^T."""
         roots: dict[Sensor, Float64[np.ndarray, "3 q p"]] = {}
-        for sensor in SENSORS:
-            values, vectors = np.linalg.eigh(self.tensors[f"covariance_{sensor}"])
+        of_samples = {sensor: self._of_samples(sensor) for sensor in SENSORS}
+        for sensor, (effects, own) in of_samples.items():
+            values, vectors = np.linalg.eigh(self.tensors[f"covariance_{sensor}"][np.ix_(own, own)])
             root = vectors * np.sqrt(np.maximum(values, 0.0))
-            roots[sensor] = patterns(self.effects[sensor]) @ root
+            roots[sensor] = patterns(effects) @ root
         filter_ = SignalFilter(self.rate_hz, max(self._compiled(sensor).wanted for sensor in SENSORS))
 
         def root_at(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
         ) -> dict[Sensor, Float64[np.ndarray, "n 3 p"]]:
             signals, out = filter_(t_s, gyro, accel), {}
-            for sensor in SENSORS:
-                if self.effects[sensor]:
-                    terms = np.concatenate([effect.terms(signals) for effect in self.effects[sensor]], axis=1)
+            for sensor, (effects, _) in of_samples.items():
+                if effects:
+                    terms = np.concatenate([effect.terms(signals) for effect in effects], axis=1)
                     out[sensor] = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
             return out
 
         return root_at
 
     def _compiled(self, sensor: Sensor) -> CompiledEffects:
-        return compiled(self.effects[sensor], self.tensors[f"theta_{sensor}"])
+        effects, own = self._of_samples(sensor)
+        return compiled(effects, self.tensors[f"theta_{sensor}"][own])
+
+    def _of_samples(self, sensor: Sensor) -> tuple[tuple[LinearForm, ...], Int64[np.ndarray, " p"]]:
+        """Effects that follow from the samples, and where their parameters stand."""
+        effects = self.effects[sensor]
+        return samples_alone(effects), columns_of(effects, temperature=False)

@@ -16,8 +16,9 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
@@ -31,6 +32,11 @@ Vector6 = Float64[np.ndarray, "6"]  # gyro (rad/s) then accel (m/s²)
 Covariances = Float64[np.ndarray, "n 6 6"]
 Array = Float64[np.ndarray, "..."]
 Shapes = dict[str, tuple[int, ...]]
+TEMPERATURE_SHAPES: Shapes = {  # of the temperature in training: range (°C, K), mean terms, and the drift that it made
+    **{f"temperature.{name}": (1,) for name in ("centre", "units")},
+    "temperature.mean": (12,),
+    **{f"temperature.{name}": (6,) for name in ("spread", "walk")},
+}
 
 
 @runtime_checkable
@@ -91,6 +97,18 @@ class StretchedStream(Stream, Protocol):
         """Take over the states of the stream of the stretch before."""
 
 
+class LogDrift(Protocol):
+    """Drift of a bias that follows from the time in one log (`imutool.bias.temperature`)."""
+
+    name: str  # of the channel
+
+    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+        """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
+
+    def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
+        """Covariance of the drift at some stamps, relative to its mean so far."""
+
+
 @runtime_checkable
 class CovarianceModel(Protocol):
     """Roots S of the covariance S S^T of the motion-dependent bias, by sensor.
@@ -110,11 +128,14 @@ class BiasModel(ABC):
     """Bias model with the statistics of its sensor's training runs, from which every run starts.
 
     It computes in float64; files hold float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
-    those that are not given are zero.
+    those that are not given are zero. `log_drift` is that of the log that the model is bound to, and its streams take samples
+    without it; `remarks` say what makes it less sure.
     """
 
     method: ClassVar[str]
     card: Mapping[str, Any]
+    log_drift: LogDrift | None = None
+    remarks: tuple[str, ...] = ()
 
     def __init__(self, config: Settings, rate_hz: float, tensors: Mapping[str, np.ndarray] | None = None) -> None:
         self.config, self.rate_hz, self.card = config, rate_hz, {}
@@ -128,7 +149,8 @@ class BiasModel(ABC):
         Raises:
             ConfigError: settings that do not fit each other, or an unknown effect.
         """
-        return dict.fromkeys(STATISTICS, (6,))
+        shapes: Shapes = dict.fromkeys(STATISTICS, (6,))
+        return shapes | (TEMPERATURE_SHAPES if getattr(config, "temperature", UNSET) is not UNSET else {})
 
     @property
     def prior_mean(self) -> Vector6:
@@ -163,6 +185,10 @@ class BiasModel(ABC):
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics d(drift of the rest bias) / d(rest bias) per second; zero for most models."""
         return np.zeros((6, 6))
+
+    def temperature_parameters(self) -> Mapping[Sensor, tuple[Array, Array]]:
+        """Parameters of the drift with a log's temperature, and their covariance, by sensor."""
+        return {}
 
     def calibration_covariance(self) -> CovarianceModel | None:
         """Covariance of the motion-dependent part as a root for each sample; None if unknown."""

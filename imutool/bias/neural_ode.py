@@ -33,9 +33,9 @@ from imutool.array_types import Float64
 from imutool.bias.effects_stream import EffectsStream
 from imutool.bias.model import COLUMNS, Array, BiasModel, DriftStream, Shapes, Vector6
 from imutool.bias.neural_stream import HALF_ROOT, Curves, CurveWeights, NeuralStream, erf, gelu
+from imutool.bias.temperature import columns_of, forms, samples_alone
 from imutool.config import Settings
 from imutool.errors import ConfigError
-from imutool.sensor import catalogue
 from imutool.sensor.linear_form import compiled
 from imutool.units import SENSORS, Sensor
 
@@ -63,6 +63,7 @@ class Config(Settings, frozen=True):
     solver: Literal["euler", "rk4", "dopri5"] = "euler"
     adjoint: bool = False
     loads: tuple[str, ...] | msgspec.UnsetType = msgspec.UNSET  # drifts of the gyro behind its load; unset: training chooses
+    temperature: str | msgspec.UnsetType = msgspec.UNSET  # channel that the load gyro_temperature follows
     gyro_scale_rad_s: Positive = 0.2
     gyro_curve_rad_s: Positive = 0.02
     gyro_drift_rad_s2: Positive = 1e-4
@@ -119,7 +120,7 @@ class Model(BiasModel):
         for sensor in dict.fromkeys(config.drift):
             shapes |= Drift.shapes(_drift_name(config, sensor), HIDDEN[sensor])
         if config.loads:
-            shapes["theta_loads"] = (sum(len(form.parameters) for form in catalogue.trained("gyro", config.loads)),)
+            shapes["theta_loads"] = (sum(len(form.parameters) for form in forms("gyro", config.loads)),)
         return shapes | ({"drift.gyro.W": (3, 3)} if config.joint else {})
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
@@ -139,10 +140,16 @@ class Model(BiasModel):
         split = NeuralStream(curves, drifts, stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
         if config.joint:
             return JointStream(self.drift("gyro"), self.tensors["drift.gyro.W"], rest, split)
-        if not config.loads:
+        of_samples = samples_alone(effects := forms("gyro", config.loads or ()))
+        if not of_samples:
             return split
-        loads = compiled(catalogue.trained("gyro", config.loads), self.tensors["theta_loads"])
+        loads = compiled(of_samples, self.tensors["theta_loads"][columns_of(effects, temperature=False)])
         return EffectsStream(self.rate_hz, loads, compiled((), np.zeros(0)), split, rest, start_s)
+
+    def temperature_parameters(self) -> Mapping[Sensor, tuple[Array, Array]]:
+        """Parameters of the gyro's drift with a log's temperature; their covariance is not kept."""
+        own = columns_of(forms("gyro", self.config.loads or ()), temperature=True)
+        return {"gyro": (self.tensors["theta_loads"][own], np.zeros((len(own), len(own))))} if len(own) else {}
 
     def drift(self, sensor: Sensor) -> Drift:
         """Drift of one sensor's rest bias."""

@@ -5,6 +5,7 @@ Causal: after the initial bias, the bias at a sample depends on that sample and 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,11 +13,14 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
+from imutool.bias.temperature_drift import OnlineDrift, bound
 from imutool.bias_start.bias_covariance import BiasEstimator
-from imutool.bias_start.initial_bias import InitialBias, relative_samples, tracked_from_prior
+from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
 from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured
 from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import MOST_GAP_S
+
+logger = logging.getLogger(__name__)
 
 GAP_NS, MOST_GAP_NS = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
 BLOCK_SAMPLES = 1 << 14  # corrected at once: a covariance has 288 bytes
@@ -32,7 +36,7 @@ class DebiasedImu(NamedTuple):
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
     """Corrected samples and bias of a model."""
     good = measured(imu.gyro, imu.accel)
-    bias = _to_all(good, start.stream(model)(*relative_samples(imu)))
+    bias = _with_drift(model, imu, _to_all(good, start.stream(model)(*model_samples(model, imu))))
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
@@ -42,14 +46,22 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
     Gyro (rad/s), then accel (m/s²); see `imutool.bias_start.bias_covariance`. Computed in blocks, as for a log.
     """
     estimator = BiasEstimator(model, start)
-    good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), relative_samples(imu)
+    good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), model_samples(model, imu)
+    t_ns = imu.t_ns[good]
     bias, std = np.empty((len(t_s), 6)), np.empty((len(t_s), 6))
     for first in range(0, len(t_s), BLOCK_SAMPLES):
         rows = slice(first, first + BLOCK_SAMPLES)
         bias[rows], covariance = estimator(t_s[rows], gyro[rows], accel[rows])
+        if model.log_drift is not None:
+            covariance += model.log_drift.covariance(t_ns[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
-    bias, std = _to_all(good, bias), _to_all(good, std)
+    bias, std = _with_drift(model, imu, _to_all(good, bias)), _to_all(good, std)
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+
+
+def _with_drift(model: BiasModel, imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
+    """Bias of the samples as recorded, from that of the samples without the drift."""
+    return bias if model.log_drift is None else bias + model.log_drift(imu.t_ns)
 
 
 def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) -> Float64[np.ndarray, "n 6"]:
@@ -65,25 +77,42 @@ class OnlineDebiaser:
     """Corrects IMU samples one at a time, for a live node.
 
     `start` is a rest bias, for instance `bias_at_rest.at_rest` over the first seconds, or `initial_bias.prior`. Without `start`
-    it begins at the prior and tracks the rest bias, as `init="auto"` does.
+    it begins at the prior and tracks the rest bias, as `init="auto"` does. A model whose bias follows the temperature takes it
+    with the samples that have one (°C).
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
         self._model, self._start = model, start
         self._start_ns, self._before_ns, self._bias = -1, -1, np.zeros(6)
+        self._drift = OnlineDrift(model) if model.temperature_parameters() else None
 
     def __call__(
-        self, stamp_ns: int, gyro: Float64[np.ndarray, "3"], accel: Float64[np.ndarray, "3"]
+        self,
+        stamp_ns: int,
+        gyro: Float64[np.ndarray, "3"],
+        accel: Float64[np.ndarray, "3"],
+        temperature: float | None = None,
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
         """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias."""
         u = np.concatenate((gyro, accel))
         size = np.abs(u)
         if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
-            t_s = self._seconds(stamp_ns)
-            self._bias = self._correct(t_s, u)
+            if self._drift is None:
+                t_s = self._seconds(stamp_ns)
+                self._bias = self._correct(t_s, u)
+            else:
+                self._warn_without(stamp_ns, temperature)
+                drift, t_s = self._drift(stamp_ns, temperature), self._seconds(stamp_ns)
+                self._bias = self._correct(t_s, u - drift) + drift
         bias = self._bias.copy()
         clean = u - bias
         return clean[:3], clean[3:], bias
+
+    def _warn_without(self, stamp_ns: int, temperature: float | None) -> None:
+        """Warn of a first sample without temperature; the rest bias then varies as much as the drift did in training."""
+        if self._start_ns < 0 and temperature is None:
+            self._model = bound(self._model, {}, "", stamp_ns, stamp_ns)
+            logger.warning("live stream: %s", "; ".join(self._model.remarks))
 
     def _seconds(self, stamp_ns: int) -> float:
         """Seconds since the first sample; a jump of the clock counts as at most `stretches.MOST_GAP_S`."""

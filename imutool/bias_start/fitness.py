@@ -92,7 +92,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
         if worse:
             return Fitness("unfit", (*contradictions, *worse))
-    doubts = [*contradictions, *_other_conditions(model, samples), *_other_unit(model, about)]
+    doubts = [*contradictions, *model.remarks, *_other_conditions(model, samples), *_other_unit(model, about)]
     if not doubts and not _same_unit(model, about) and not _telling(found, prior):
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:

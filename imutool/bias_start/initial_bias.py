@@ -30,6 +30,7 @@ from imutool.bias.model import (
     Stream,
     Vector6,
 )
+from imutool.bias.temperature_drift import without_drift
 from imutool.bias_start.bias_tracking import (
     BiasTrajectory,
     Samples,
@@ -242,6 +243,12 @@ def relative_samples(imu: Imu) -> Samples:
     good = measured(imu.gyro, imu.accel)
     imu = imu if good.all() else imu.rows(good)
     return seconds(StretchClock()(imu.t_ns), int(imu.t_ns[0]) if len(imu) else 0), imu.gyro, imu.accel
+
+
+def model_samples(model: BiasModel, imu: Imu) -> Samples:
+    """Samples as `relative_samples`, without the drift that the model follows in their log."""
+    good = measured(imu.gyro, imu.accel)
+    return relative_samples(without_drift(model, imu if good.all() else imu.rows(good)))
 
 
 def bias_over(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:

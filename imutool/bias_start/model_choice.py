@@ -16,6 +16,7 @@ from imutool.array_types import Float64, Int64
 from imutool.bias import static
 from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
+from imutool.bias.temperature_drift import bound, split_drift, without_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
@@ -25,8 +26,8 @@ from imutool.bias_start.initial_bias import (
     InitialBias,
     NoRestError,
     from_numbers,
+    model_samples,
     prior,
-    relative_samples,
     smoothed_start,
 )
 from imutool.bias_start.stretches import Sieve, measured
@@ -41,6 +42,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
+from imutool.mcap_io.temperature import temperatures
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 
 HEAD_S = 60.0  # start of a log that the search for the initial bias reads
@@ -64,6 +66,7 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
         DataError: `stationary` on a log that does not start at rest, `truth` without truth at its start, or `auto` with an
             untrained model and no stationary stretch.
     """
+    recording = replace(recording, imu=without_drift(model, recording.imu))
     if init == "prior":
         return prior(model, int(recording.imu.t_ns[0]))
     if init == "truth" or init.startswith("truth:"):
@@ -132,8 +135,11 @@ def choose_model_and_start(
     model: BiasModel = static.Model() if name is None or untrained else shared_model(name, 1.0 / period_s)
     if not untrained:
         check_rate(model, 1.0 / period_s, log.path)
+    if model.temperature_parameters():
+        start_ns = int(first_minute.imu.t_ns[0])
+        model = bound(model, temperatures(log), topic, start_ns, start_ns + _duration_ns(log, topic))
     if smooth:
-        start = _smoothed(model, _Batches(log, topic, survey), log.path, int(first_minute.imu.t_ns[0]))
+        start = _smoothed(model, _Batches(log, topic, survey, model), log.path, int(first_minute.imu.t_ns[0]))
     else:
         start = find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
@@ -151,9 +157,15 @@ def _after(log: Log, topic: str, length_s: float) -> int | None:
     return None if first is None else first + nanoseconds(length_s)
 
 
+def _duration_ns(log: Log, topic: str) -> int:
+    """Log time from the first to the last block that may hold a topic."""
+    blocks = [block for block in log.index.blocks if block.may_hold(log.channel_ids(topic))]
+    return max((block.end_ns for block in blocks), default=0) - min((block.start_ns for block in blocks), default=0)
+
+
 def fitness_in_log(log: Log, topic: str, model: BiasModel, start: InitialBias, survey: Survey | None) -> Fitness:
     """Fitness of a model, started in a log, for one of its IMUs."""
-    return judge(model, start, _Batches(log, topic, survey), log.metadata().get("imutool", {}))
+    return judge(model, start, _Batches(log, topic, survey, model), log.metadata().get("imutool", {}))
 
 
 def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:
@@ -163,7 +175,7 @@ def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> Initi
         DataError: too few samples.
         ModelError: an untrained model, and no rest to measure a bias on.
     """
-    return _smoothed(model, [relative_samples(imu)], where, int(imu.t_ns[0]) if len(imu) else 0)
+    return _smoothed(model, [model_samples(model, imu)], where, int(imu.t_ns[0]) if len(imu) else 0)
 
 
 def _smoothed(model: BiasModel, batches: Iterable[Samples], where: str | Location, first_ns: int) -> InitialBias:
@@ -187,18 +199,23 @@ def _imu_batches(
 
 @dataclass(frozen=True)
 class _Batches:
-    """IMU samples with seconds since the first; every iteration reads the log again."""
+    """IMU samples with seconds since the first, without the model's drift.
+
+    Every iteration reads the log again.
+    """
 
     log: Log
     topic: str
     survey: Survey | None
+    model: BiasModel
 
     def __iter__(self) -> Iterator[Samples]:
         start_ns = None
         for batch, t_ns in _imu_batches(self.log, self.topic, self.survey):
             if len(t_ns):
                 start_ns = int(t_ns[0]) if start_ns is None else start_ns
-                yield seconds(t_ns, start_ns), batch.gyro, batch.accel
+                _, gyro, accel = split_drift(self.model, batch.stamp_ns, batch.gyro, batch.accel)
+                yield seconds(t_ns, start_ns), gyro, accel
 
 
 def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Recording:

@@ -21,6 +21,7 @@ from imutool.location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
+from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import CLEAN_FIX
 from imutool.recording import Imu, Recording, nanoseconds
 from imutool.recording.columns import MOST_GAP_S, jump_warnings
@@ -102,13 +103,14 @@ def longest_stretch(recording: Recording) -> Recording:
 def read_stretches(path: Location, *, imu: str | None = None, truth: str | None = None) -> list[Recording]:
     """Recordings of a log, one for each stretch between jumps of its clock.
 
-    They are as `read` gives them, with the names NAME_1, NAME_2 and so on.
+    They are as `read` gives them, with all temperatures as scalars, and the names NAME_1, NAME_2 and so on.
 
     Raises:
         ConfigError, LogError: as `read`.
     """
     with Log(path) as log:
-        parts = [part for whole in read_recordings(log, imu=imu, truth=truth) for part in whole.between_jumps()]
+        whole = with_temperatures(read_recordings(log, imu=imu, truth=truth), log)
+    parts = [part for one in whole for part in one.between_jumps()]
     found = [part for part in parts if len(part.imu) > 1 and (any(map(len, part.truths.values())) or not part.truths)]
     if len(found) < len(parts) > 1:
         logger.warning("%s: %d stretches of its clock hold no poses, and are left out", path, len(parts) - len(found))

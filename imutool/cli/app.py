@@ -20,8 +20,8 @@ from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
-from imutool.mcap_io.storage import outputs
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage import output_conflicts
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
 LOST = 3  # the command did what it could, and something of the log is lost
 REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
@@ -213,8 +213,9 @@ Imus = Annotated[
     typer.Option("--imu", help="IMU topic, where a log has several; gyro=TOPIC,accel=TOPIC joins two. Repeatable."),
 ]
 Truth = Annotated[str | None, typer.Option(help="Topic of the true poses, where a log has several.")]
-JSON, HTML, PNG, TOML = (Written(suffixes) for suffixes in (outputs.JSON, outputs.HTML, outputs.PNG, outputs.TOML))
-RRD, MODEL, LOG = (Written(suffixes) for suffixes in (outputs.RRD, outputs.MODEL, outputs.LOG))
+JSON, HTML = Written(output_conflicts.JSON), Written(output_conflicts.HTML)
+PNG, TOML = Written(output_conflicts.PNG), Written(output_conflicts.TOML)
+RRD, MODEL, LOG = (Written(suffixes) for suffixes in (output_conflicts.RRD, output_conflicts.MODEL, output_conflicts.LOG))
 Json = Annotated[str | None, typer.Option("--json", metavar="FILE|-", help="Write the report as JSON; - is stdout."), JSON]
 ReportPage = Annotated[
     Path | None, typer.Option(metavar="F.html", help="Write an HTML page with figures, paths, errors and spectra."), HTML

@@ -209,7 +209,7 @@ def _watching(
 def _draw(log: Location, fits: Mapping[str, Fitness], page: Path, overwrite: bool) -> None:
     """Write a page about the debiased log; of several IMUs each has its topic as name."""
     from imutool.viewing.html.report import name_by_topic, write_page
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
 
     shown = [load(log, imu=topic) for topic in fits]
     shown = [replace(run, notes=(*run.notes, fit.sentence("The model"))) for run, fit in zip(shown, fits.values(), strict=True)]

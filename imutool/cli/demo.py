@@ -112,7 +112,7 @@ def run(
     from imutool.training.run import train
     from imutool.training.settings import TrainSettings
     from imutool.viewing.html import report
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
     from imutool.viewing.rerun import scene
 
     _check(out, overwrite)

@@ -76,7 +76,7 @@ def diagnose(
     from imutool.config import load as load_settings
     from imutool.diagnosis.diagnose import diagnose as run
     from imutool.diagnosis.settings import DiagnoseSettings
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
 
     def look(findings: Path) -> list[RunData]:
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]

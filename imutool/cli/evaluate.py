@@ -108,7 +108,7 @@ def evaluate(
     from imutool.evaluation import evaluate as run
     from imutool.viewing.html import report as pages
     from imutool.viewing.html.drawing import require_matplotlib
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
 
     if report is not None:
         require_matplotlib()

@@ -15,7 +15,7 @@ from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import out, plain, progress, say, write_json
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
-from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage import output_conflicts
 
 if TYPE_CHECKING:
     from imutool.fleet.run import FleetReport
@@ -28,7 +28,7 @@ fleet = App(
 )
 app.add_typer(fleet)
 
-FOLDER, PAGE = Written(files=(), keeps=True), Written(outputs.HTML, keeps=True)  # the journal says whose the files are
+FOLDER, PAGE = Written(files=(), keeps=True), Written(output_conflicts.HTML, keeps=True)  # the journal says whose the files are
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
 PAGES_HELP = "Also write a page beside each log, with a link from --report; 5 to 10 s for a log of minutes."

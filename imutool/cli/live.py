@@ -59,6 +59,7 @@ def live(
     sensor_msgs/Imu in CDR.
     """
     from imutool.api.models import load_model
+    from imutool.bias.temperature import scale_of
     from imutool.viewing.stream.samples import Malformed
     from imutool.viewing.stream.session import run
     from imutool.viewing.stream.sources import open_source
@@ -69,7 +70,8 @@ def live(
     if origin is None or (source and log):
         raise ConfigError("one source is needed", where="live", expected="a log, or --from SOURCE")
     found = load_model(model)
-    samples = open_source(origin, malformed, imu=imu, speed=speed)
+    channel = scale_of(found).channel if found.temperature_parameters() else None
+    samples = open_source(origin, malformed, imu=imu, speed=speed, temperature=channel)
     with _view(connect, save, overwrite) if not no_view else nullcontext() as show:
         stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds)
     shown = [] if show is None else show.shown

@@ -11,7 +11,7 @@ import typer
 
 from imutool.cli.app import HTML, Aid, Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
 from imutool.cli.terminal import progress, say, write_json
-from imutool.mcap_io.storage import outputs
+from imutool.mcap_io.storage import output_conflicts
 from imutool.report import Report
 from imutool.viewing import Output
 
@@ -20,7 +20,7 @@ ALIGN_HELP = "Align each path with the truth before taking errors: by its start,
 SOURCE_HELP = "Also show other topics of the log, such as cameras."
 
 
-SAVED = Written(outputs.RRD, may_be_folder=True)
+SAVED = Written(output_conflicts.RRD, may_be_folder=True)
 PICTURES, SITE = Written(files=("*.png",), keeps=True, of_each="{}-*.png"), Written(files=("*",), keeps=True)
 
 
@@ -68,7 +68,7 @@ def view(
     Without one of --save, --connect, --web, --export-web, --png and --html a viewer opens; where it cannot, an .rrd is
     saved.
     """
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
     from imutool.viewing.model.trajectory_error import alignment
     from imutool.viewing.outputs import Outputs, RequestedOutputs
 

@@ -27,7 +27,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.outputs import refuse_existing
+from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, VELOCITY_KEY
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 

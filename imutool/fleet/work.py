@@ -176,7 +176,7 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
     from imutool.viewing.html import report
     from imutool.viewing.html.page import is_imutool_page
     from imutool.viewing.html.report_wording import conclusion
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
 
     path = job.target.with_name(page_name(job.target.name))
     try:

@@ -30,7 +30,7 @@ from imutool.mcap_io.recovery import chunk_repair
 from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
-from imutool.mcap_io.storage.outputs import refuse_existing
+from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.system import collector_paused
 from imutool.mcap_io.storage.target import Target

@@ -17,6 +17,7 @@ from imutool.mcap_io.codec.schemas import IMU, TF
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording import Recording, Scalars, seconds
+from imutool.units import AXES
 
 MOST_READ, MOST_TRIED = 200, 6  # fields of a log that are read, and those that become channels
 LEAST_MESSAGES = 5
@@ -122,3 +123,16 @@ def _correlation(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> 
     a, b = a - a.mean(), b - b.mean()
     size = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / size if size > 0.0 else 0.0
+
+
+def channels_at(
+    recording: Recording, t_s: Float64[np.ndarray, " n"], start_ns: int, least_messages: int = 1
+) -> dict[str, Float64[np.ndarray, " n"]]:
+    """Scalar channels of a log at seconds from `start_ns`, interpolated, by topic or `topic.x`."""
+    out = {}
+    for topic, scalars in recording.scalars.items():
+        if len(scalars) >= least_messages:
+            own_s, width = seconds(scalars.t_ns, start_ns), scalars.values.shape[1]
+            for axis, column in zip(AXES, scalars.values.T, strict=False):
+                out[topic if width == 1 else f"{topic}.{axis}"] = np.interp(t_s, own_s, column)
+    return out

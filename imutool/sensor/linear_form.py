@@ -186,11 +186,9 @@ def _error(effect: Effect, sensor: Sensor, signals: Signals, theta: Theta) -> Fl
     if effect.stage == Stage.CLOCK:
         shift_s = effect.forward(signals.t_s, theta) - signals.t_s
         return np.asarray(shift_s[:, None] * (signals.gyro_dot if sensor == "gyro" else signals.accel_dot))
-    before: IdealMotion | SensorSamples
-    if effect.stage < Stage.CLOCK:
-        before = IdealMotion(signals.t_s, signals.gyro, signals.accel, signals.alpha)
-    else:
-        before = SensorSamples(signals.t_s, signals.gyro, signals.accel, signals.alpha, online=signals)
+    motion = IdealMotion(signals.t_s, signals.gyro, signals.accel, signals.alpha)
+    samples = SensorSamples(signals.t_s, signals.gyro, signals.accel, motion, online=signals)
+    before: IdealMotion | SensorSamples = motion if effect.stage < Stage.CLOCK else samples
     after = effect.forward(before, theta)
     return np.asarray(after.gyro - before.gyro if sensor == "gyro" else after.accel - before.accel)
 

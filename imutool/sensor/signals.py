@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.recording import GRAVITY_M_S2
 
 SLOW_S = 0.1  # of the samples: what is faster counts as vibration
 TURN_S = 0.02  # of the rate whose derivative is the angular acceleration
@@ -34,23 +35,27 @@ FILTERED = slice(6, 18)
 GYRO_DOT, ACCEL_DOT, DOTS, ALPHA = slice(18, 21), slice(21, 24), slice(18, 24), slice(24, 27)
 
 LOAD_TAU_S = np.array([5.0, 20.0, 80.0])  # a response in between is a sum of two of them, right within 3 % of its size
-G_M_S2 = 9.81
 TURNING_RAD_S = np.array([0.0, 0.3, 0.7, 1.5, 3.0])  # knots of the ramps
 SHAKING_M_S2 = np.array([0.0, 0.5, 2.0, 6.0])
 RAMPS = (len(TURNING_RAD_S) - 1, len(SHAKING_M_S2) - 1)
 LOADS = 1 + RAMPS[0] + 2 * RAMPS[1]
 LOAD = slice(27, 27 + len(LOAD_TAU_S) * LOADS)  # the loads behind the first filter, then behind the next
 COUNT = LOAD.stop
+TEMPERATURE_TERMS = 3 * (1 + len(LOAD_TAU_S))  # polynomials of a temperature, at once and behind the filters
 
 Vectors = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)²."""
+    """Signals, one row a sample: rad/s, m/s², derivatives, vibration power in (m/s²)².
+
+    `temperature` has the terms of the log's temperature in a training (`imutool.bias.temperature`).
+    """
 
     t_s: Float64[np.ndarray, " n"]
     columns: Float64[np.ndarray, "n 60"]
+    temperature: Float64[np.ndarray, "n 12"] | None = None
 
     @property
     def gyro(self) -> Vectors:
@@ -94,7 +99,7 @@ class Signals:
 
     def rows(self, rows: slice | np.ndarray) -> Signals:
         """The signals of some rows."""
-        return Signals(self.t_s[rows], self.columns[rows])
+        return Signals(self.t_s[rows], self.columns[rows], None if self.temperature is None else self.temperature[rows])
 
 
 class SignalFilter:
@@ -188,7 +193,7 @@ def _loads(gyro: Vectors, accel: Vectors, fast: Vectors) -> Float64[np.ndarray, 
     """Loads between zero and one: on, turning, shaking (force without its mean), and force other than gravity's."""
     turning, size, shaking = (np.sqrt(np.einsum("ij,ij->i", x, x)) for x in (gyro, accel, fast))
     on = np.ones((len(gyro), 1))
-    ramps = (_ramps(turning, TURNING_RAD_S), _ramps(shaking, SHAKING_M_S2), _ramps(np.abs(size - G_M_S2), SHAKING_M_S2))
+    ramps = (_ramps(turning, TURNING_RAD_S), _ramps(shaking, SHAKING_M_S2), _ramps(np.abs(size - GRAVITY_M_S2), SHAKING_M_S2))
     return np.concatenate([on, *ramps], axis=1)
 
 

@@ -26,10 +26,10 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
 from imutool.sensor import physics_file
-from imutool.sensor.channels import with_channels
+from imutool.sensor.channels import channels_at, with_channels
 from imutool.sensor.effect import Acting, Effect, Stage, Theta, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.samples import IdealMotion, SensorSamples, channels_at
+from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 from imutool.sensor.unnamed_effects import DRIVEN
 

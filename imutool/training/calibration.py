@@ -21,13 +21,14 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from imutool.array_types import Float
-from imutool.bias import neural_ode
+from imutool.bias import neural_ode, temperature
 from imutool.bias.hybrid import Config
 from imutool.bias.networks import hybrid
 from imutool.bias.networks import neural_ode as ode_network
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.temperature import log_signals, online_signals, temperature_scale, temperature_tensors
 from imutool.config import build, plain
-from imutool.recording import Imu, Recording, seconds
+from imutool.recording import Imu, Recording
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import SignalFilter, Signals
@@ -40,7 +41,7 @@ from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none
 LEAST_GAIN = 0.03  # of the judged loss, for an effect to be worth its parameters
-DRIFTS = {"gyro_warm_up": 0.3, "gyro_rate_load": 0.3, "gyro_force_load": 0.3}  # likewise: many parameters that look alike
+DRIFTS = dict.fromkeys(("gyro_warm_up", "gyro_rate_load", "gyro_force_load", *temperature.EFFECTS), 0.3)  # they look alike
 TINY = 1e-12  # of a loss, whose unit is a window's noise
 LINEAR: Mapping[Sensor, tuple[str, ...]] = {sensor: (f"{sensor}_misalignment", f"{sensor}_scale") for sensor in SENSORS}
 CONTAINED = {"rate_curve": "gyro_scale"}  # a curve imitates a scale, which then needs evidence as any other effect
@@ -97,7 +98,11 @@ def calibrate(
         DataError: a log without a stretch of truth that is free of gaps.
         ConfigError: a name that no effect on the sensor has.
     """
-    effects = catalogue.trained(sensor, names)
+    if names is None:
+        also = () if signals is None or signals.temperature is None else (temperature.FORMS[sensor],)
+        effects = catalogue.trained(sensor) + also
+    else:
+        effects = temperature.forms(sensor, names)
     cut = folded(pool) if part == "train" else pool
     seen = Seen(cut, sensor, signals_of(pool) if signals is None else signals, gyro, sensors or SensorPrior())
     if own_prior is None and len(pool.names) < FOLDS:
@@ -208,6 +213,7 @@ class PhysicsFirst:
     model: hybrid.Network
     fits: dict[Sensor, Calibration]
     recordings: list[Recording]
+    scale: temperature.Scale | None = None
 
     @classmethod
     def of(
@@ -221,8 +227,10 @@ class PhysicsFirst:
         """
         pool = Pool.of(recordings, device=device, floors=settings.pose_floors)
         torch.manual_seed(settings.seed)
-        model = hybrid.Network(config_of(settings), pool.rate_hz).double()
-        signals, fits = _online_signals(recordings, pool), {}
+        config = config_of(settings)
+        scale = temperature_scale(recordings, config.temperature or "", wanted=bool(_warm(config)))
+        model = hybrid.Network(msgspec.structs.replace(config, temperature=msgspec.UNSET), pool.rate_hz).double()
+        signals, fits = online_signals(recordings, torch.bincount(pool.log).tolist(), pool.rate_hz, scale), {}
         gyro = pool.gyro
         for sensor in SENSORS:
             report(note(f"looking for effects on the {sensor}"))
@@ -235,14 +243,17 @@ class PhysicsFirst:
             if sensor == "gyro":
                 error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)
                 gyro = pool.gyro - error - fits[sensor].rest[pool.log]
-        return cls(model, fits, [replace(recording, imu=_corrected(model, recording.imu)) for recording in recordings])
+        if scale is not None and _warm(model.config):
+            model.take_temperature(scale.channel, temperature_tensors(scale, recordings, model.temperature_theta()))
+        return cls(model, fits, [_corrected(model, recording, scale) for recording in recordings], scale)
 
     def with_gyro_effects(self, recordings: Sequence[Recording], names: Sequence[str]) -> PhysicsFirst:
         """The same with some effects of the gyro alone, and recordings corrected for these."""
-        fit, chosen = self.fits["gyro"], parameter_columns(catalogue.trained("gyro", self.fits["gyro"].effects), names)
+        fit = self.fits["gyro"]
+        chosen = parameter_columns(temperature.forms("gyro", fit.effects), names)
         own = replace(fit, effects=tuple(names), theta=fit.theta[chosen], covariance=fit.covariance[chosen][:, chosen])
         self.model.take("gyro", names, own.theta, own.covariance)
-        corrected = [replace(recording, imu=_corrected(self.model, recording.imu)) for recording in recordings]
+        corrected = [_corrected(self.model, recording, self.scale) for recording in recordings]
         return replace(self, fits=self.fits | {"gyro": own}, recordings=corrected)
 
     def ode_settings(self, settings: TrainSettings) -> TrainSettings:
@@ -270,24 +281,17 @@ def config_of(settings: TrainSettings) -> Config:
         ConfigError: an unknown setting or effect (the nearest is named), or an effect on the wrong sensor.
     """
     config = build(Config, settings.model, where="model settings of hybrid")
-    catalogue.trained("gyro", config.gyro_effects or ())
-    catalogue.trained("accel", config.accel_effects or ())
+    for sensor in SENSORS:
+        temperature.forms(sensor, config.effects(sensor) or ())
     return config
 
 
-def _online_signals(recordings: Sequence[Recording], pool: Pool) -> Signals:
-    """Signals of a pool's samples as online: filters and time start where the log does."""
-    parts: list[Signals] = []
-    for recording, count in zip(recordings, torch.bincount(pool.log).tolist(), strict=True):
-        first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))
-        parts.append(_signals(recording.imu, pool.rate_hz).rows(slice(first, first + count)))
-    return Signals(np.concatenate([part.t_s for part in parts]), np.concatenate([part.columns for part in parts]))
+def _warm(config: Config) -> tuple[str, ...]:
+    """Effects of the temperature among those of a model."""
+    return tuple(name for sensor in SENSORS for name in config.effects(sensor) or () if name in temperature.EFFECTS)
 
 
-def _signals(imu: Imu, rate_hz: float) -> Signals:
-    return SignalFilter(rate_hz)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
-
-
-def _corrected(model: hybrid.Network, imu: Imu) -> Imu:
-    signals = _signals(imu, model.rate_hz)
-    return Imu(imu.t_ns, imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals))
+def _corrected(model: hybrid.Network, recording: Recording, scale: temperature.Scale | None) -> Recording:
+    imu, signals = recording.imu, log_signals(recording, model.rate_hz, scale)
+    gyro, accel = imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals)
+    return replace(recording, imu=Imu(imu.t_ns, gyro, accel))

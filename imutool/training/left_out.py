@@ -25,6 +25,9 @@ from imutool.bias.hybrid import Config
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.temperature import temperature_tensors
+from imutool.bias.temperature import Scale
+from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.errors import DataError, ModelError
@@ -68,14 +71,21 @@ class Comparison:
 
 
 def compare(
-    recordings: Sequence[Recording], pool: Pool, fits: Mapping[Sensor, Calibration], trained: BiasNetwork
+    recordings: Sequence[Recording],
+    pool: Pool,
+    fits: Mapping[Sensor, Calibration],
+    trained: BiasNetwork,
+    scale: Scale | None = None,
 ) -> Comparison:
-    """Scores of every left-out log; `trained` has the statistics of all logs."""
+    """Scores of every left-out log.
+
+    `trained` has the statistics of all logs, `scale` is that of their temperature.
+    """
     scores: list[Score] = []
     candidates = [c for c in CANDIDATES if all(_known(fit, c, sensor) for sensor, fit in fits.items())]
     for index, recording in enumerate(_logs(recordings, pool, fits["gyro"])):
         effects = {c: {sensor: _names(fit, c, sensor, index) for sensor, fit in fits.items()} for c in candidates}
-        models = {c: left_out_model(fits, pool, trained, effects[c], index) for c in candidates}
+        models = {c: bound_to(left_out_model(fits, pool, trained, effects[c], index, scale), recording) for c in candidates}
         log = _without_nuisances(recording, fits["gyro"], (), index)
         scores.append(_score(log, "raw", "", log.imu))
         scores += [_score(log, "static", start, imu) for start in STARTS for imu in _corrected(log, None, start)]
@@ -153,8 +163,12 @@ def left_out_model(
     trained: BiasNetwork,
     effects: Mapping[Sensor, Sequence[str]],
     index: int,
+    scale: Scale | None = None,
 ) -> BiasModel:
-    """Model of a candidate's effects, with its prior of the rest bias, from all logs but one."""
+    """Model of a candidate's effects, with its prior of the rest bias, from all logs but one.
+
+    `scale` is that of the logs' temperature.
+    """
     network = hybrid.Network(Config(remainder=False), pool.rate_hz).double()
     rest = []
     for sensor, fit in fits.items():
@@ -162,6 +176,8 @@ def left_out_model(
         theta, covariance = fit.problem.solve(columns, without=index)
         network.take(sensor, effects[sensor], theta[columns], covariance)
         rest.append(np.delete(fit.problem.own_at(theta)[:, :3].cpu().numpy(), index, axis=0))
+    if scale is not None and network.temperature_theta():
+        network.take_temperature(scale.channel, temperature_tensors(scale, [], {}))
     for name, value in trained.named_buffers(recurse=False):
         getattr(network, name).copy_(value)
     per_log = len(fits["gyro"].problem.own) // len(pool.names)

@@ -145,7 +145,9 @@ def _physics_first(
     compared: dict[str, Any] = {}
     if settings.compare:
         descent.say(note("scoring left-out logs"))
-        comparison = compare(recordings, Pool.of(recordings, floors=settings.pose_floors), physics.fits, without.model)
+        comparison = compare(
+            recordings, Pool.of(recordings, floors=settings.pose_floors), physics.fits, without.model, physics.scale
+        )
         compared["left_out"] = comparison.card()
         if simpler := simpler_effects(physics.fits, comparison.kept):
             named = msgspec.structs.replace(settings, model=settings.model | simpler)
@@ -168,9 +170,11 @@ def _drift_first(
     """Drift behind the load as far as it helps left-out logs, then the neural ODE; the card's entries."""
 
     def physics_of(**effects: Sequence[str]) -> PhysicsFirst:
-        alone = msgspec.structs.replace(settings, model={"accel_effects": (), **effects})
+        alone = msgspec.structs.replace(settings, model={"accel_effects": (), **effects, **channel})
         return PhysicsFirst.of(recordings, alone, descent.device, lambda epoch: None)
 
+    channel = {name: value for name, value in settings.model.items() if name == "temperature"}
+    settings = msgspec.structs.replace(settings, model={k: v for k, v in settings.model.items() if k not in channel})
     loads = settings.model.get("loads")
     if loads is None:
         joint = settings.model.get("scheme") == "joint"
@@ -182,6 +186,10 @@ def _drift_first(
         training = descent(physics.recordings, neural_ode.Model.method, settings)
         assert isinstance(training.model, neural_ode_network.Network)
         training.model.take_loads(loads, physics.fits["gyro"].theta)
+        if "gyro_temperature" in loads:
+            training.model.take_temperature(
+                str(physics.model.config.temperature), dict(physics.model.temperature.named_buffers())
+            )
     return training.model, {"held_out": _held_out(training), **_turn_on(training)}
 
 

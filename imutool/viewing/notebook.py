@@ -3,7 +3,7 @@
 ::
 
     from imutool.viewing import notebook
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
 
     notebook.show([load("MH_04.mcap", models=["euroc-adis16448-hybrid"])])
 """

@@ -13,13 +13,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
-
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from never_worse import mean_aoe
 from support.drifting import KINDS, Drifting, log
 
 from imutool.config import load
-from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.training.run import train
 from imutool.training.settings import settings_of
@@ -52,20 +50,14 @@ def score(folder: Path, sensor: Drifting, methods: list[str], words: list[str], 
     models = ["static"]
     for method in methods:
         models.append(str(folder / f"{method}.safetensors"))
-        said = (
-            [word for word in words if method == "hybrid" or not word.startswith("model.remainder")]
-            if method != "linear"
-            else []
-        )
-        card = train(training, Path(models[-1]), method=method, settings=load(settings_of(method), None, said)).card
+        known = {"hybrid": words, "neural_ode": [word for word in words if not word.startswith("model.remainder")]}
+        settings = load(settings_of(method), None, known.get(method, []))
+        card = train(training, Path(models[-1]), method=method, settings=settings).card
         print(
             sensor.kind, method, {key: card[key] for key in ("physics", "compared", "held_out") if key in card}, file=sys.stderr
         )
     for start in starts:
-        smooth = start == "smooth"
-        rows = [evaluate(test, models=models, init="auto" if smooth else start, smooth=smooth) for test in tests]
-        table = np.array([[result["aoe_deg"] for result in row] for row in rows])
-        print(f"| {sensor.kind}, {start} | {' | '.join(f'{value:.2f}' for value in table.mean(axis=0))} |", flush=True)
+        print(f"| {sensor.kind}, {start} | {mean_aoe(tests, models, start)} |", flush=True)
 
 
 def save(folder: Path, seed: int, sensor: Drifting, duration_s: float) -> Path:

@@ -60,12 +60,15 @@ def score(folder: Path, kind: Switchings, methods: list[str], words: list[str]) 
     names = ["raw", *(Path(model).stem for model in models)]
     print(f"| sensor {kind.sensor_seed} | {' | '.join(names)} |\n|{'---|' * (len(names) + 1)}")
     for start in STARTS:
-        rows = [
-            evaluate(test, models=models, init="auto" if start == "smooth" else start, smooth=start == "smooth")
-            for test in tests
-        ]
-        table = np.array([[result["aoe_deg"] for result in row] for row in rows])
-        print(f"| {start} | {' | '.join(f'{value:.2f}' for value in table.mean(axis=0))} |", flush=True)
+        print(f"| {start} | {mean_aoe(tests, models, start)} |", flush=True)
+
+
+def mean_aoe(tests: list[Path], models: list[str], start: str) -> str:
+    """Cells of a table: mean AOE over the logs, of the raw samples and of each model."""
+    smooth = start == "smooth"
+    rows = [evaluate(test, models=models, init="auto" if smooth else start, smooth=smooth) for test in tests]
+    table = np.array([[result["aoe_deg"] for result in row] for row in rows])
+    return " | ".join(f"{value:.2f}" for value in table.mean(axis=0))
 
 
 def save(folder: Path, seed: int, switching: int, kind: Switchings) -> Path:

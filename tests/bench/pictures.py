@@ -21,8 +21,8 @@ from unittest import mock
 from PIL import Image
 
 from imutool.viewing.html import report
+from imutool.viewing.model.load_view import load
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import layout, scene
 from imutool.viewing.rerun.entities.styles import MODEL_COLORS, RAW_COLOR
 from imutool.viewing.rerun.web import export

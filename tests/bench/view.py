@@ -1,9 +1,9 @@
 """What it costs to make a log ready to be looked at: `python tests/bench/view.py [--minutes 60] [--profile]`.
 
 A made-up log of that length at 200 Hz, truth at 200 Hz too and a debiased channel in it, in a temporary folder. Prints seconds
-of `imutool.viewing.model.runs.load` (all of it), of `runs.build` (its last part: paths, errors, drift, windows, spectra,
-events), and
-how much memory the process took at most beyond what the imports take. On one core, the log in the page cache.
+of `load` and `build` of `imutool.viewing.model.load_view` (all of it, and its last part: paths, errors, drift, windows,
+spectra, events), and how much memory the process took at most beyond what the imports take. On one core, the log in the page
+cache.
 
 Then the viewer, Rerun's own without a window and drawing in software (the slowest that there is): seconds until everything is
 sent (`sent_s`), and until gyro and accel, raw and debiased, stand on the screen and stay (`drawn_s`, from the same moment: the
@@ -30,7 +30,7 @@ from typing import Any
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
-from imutool.viewing.model import runs
+from imutool.viewing.model import load_view
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout, scene
 
@@ -65,7 +65,7 @@ def measure(log: Path, profile: bool) -> dict[str, float]:
     began = time.perf_counter()
     if profile:
         profiler.enable()
-    data = runs.load(log)
+    data = load_view.load(log)
     profiler.disable()
     loaded_s, more_mb = time.perf_counter() - began, peak_mb() - before
     if profile:
@@ -73,7 +73,7 @@ def measure(log: Path, profile: bool) -> dict[str, float]:
     read_only = [trace.run for trace in data.traces]
     recording = read(log)
     began = time.perf_counter()
-    runs.build(recording, read_only)
+    load_view.build(recording, read_only)
     built_s = time.perf_counter() - began
     costs = {"samples": len(recording.imu), "runs": len(read_only), "load_s": loaded_s, "build_s": built_s, "more_mb": more_mb}
     return costs | look(data)

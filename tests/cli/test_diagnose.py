@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.diagnosis.wording.conclusion import conclusion
+from imutool.diagnosis_output import FILES
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -29,7 +31,7 @@ from imutool.report import json_values
 from imutool.sensor import physics_file
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
-from imutool.sensor.samples import SensorSamples
+from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import simulate
 from imutool.units import AXES
 
@@ -218,6 +220,41 @@ def test_an_absent_extra_costs_its_file_alone(tmp_path: Path, monkeypatch: pytes
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == files
 
 
+@pytest.mark.parametrize("exists", [False, True])
+def test_of_two_diagnoses_that_end_together_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
+) -> None:
+    """Both have looked whether the folder holds a diagnosis before either puts its own there."""
+    folder, both, looks = tmp_path / "out", threading.Barrier(2), threading.local()
+    refuse, refused = diagnosis_output.refuse, list[ConfigError]()
+
+    def look(place: Path, *, overwrite: bool = False) -> None:
+        looks.made = getattr(looks, "made", 0) + 1
+        refuse(place, overwrite=overwrite)
+        if looks.made == 2:  # the last look before it writes
+            both.wait(timeout=60.0)
+
+    def run() -> None:
+        try:
+            diagnosis_output.write(diagnoses.NOTHING, folder)
+        except ConfigError as error:
+            refused.append(error)
+
+    if exists:
+        folder.mkdir()
+    monkeypatch.setattr(diagnosis_output, "refuse", look)
+    monkeypatch.setattr(diagnosis_output, "_make", lambda d, place, logs: [(place / name).touch() for name in FILES][:0])
+    threads = [threading.Thread(target=run) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    (error,) = refused
+    assert "holds a diagnosis already" in error.what
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+
+
 def test_nothing_is_left_of_what_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> Iterator[str]:
         raise KeyboardInterrupt
@@ -271,7 +308,7 @@ def test_what_is_driven_keeps_its_driver_and_lag() -> None:
     (physics, theta), _ = file.acting()
     assert theta.tolist() == [0.0, 0.1, 0.2, 0.05]
     t = np.arange(50) * 0.01
-    there = SensorSamples(t, np.zeros((50, 3)), np.zeros((50, 3)), np.zeros((50, 3)), None, {"/motor/current": t})
+    there = IdealMotion(t, *(np.zeros((50, 3)) for _ in range(3)), channels={"/motor/current": t}).sample(t, t)
     assert np.ptp(physics.forward(there, theta).accel[:, 2]) > 0.0
 
 
@@ -280,7 +317,8 @@ def test_a_term_without_a_name_acts_as_it_was_found() -> None:
     said = finding("unknown", "gyro", c, kind="unknown", axis="z", variable="omega_x omega_y")
     (physics, theta), _ = to_physics_file(only(said)).acting()
     gyro = np.random.default_rng(1).normal(size=(20, 3))
-    there = SensorSamples(np.arange(20) * 0.01, gyro, gyro, gyro)
+    t_s = np.arange(20) * 0.01
+    there = IdealMotion(t_s, gyro, gyro, gyro).sample(t_s, t_s)
     added = physics.forward(there, theta).gyro - gyro
     assert np.allclose(added, np.outer(gyro[:, 0] * gyro[:, 1], [0.0, 0.0, 0.3]), rtol=0, atol=EXACT)
 
@@ -296,7 +334,8 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
     said = finding("unknown", "accel", {}, kind="unknown", axis="z", variable="omega_x", curve=curve)
     acting = to_physics_file(only(said)).acting()
     gyro = np.stack([x, np.zeros(41), np.zeros(41)], axis=1)
-    there = SensorSamples(np.arange(41) * 0.01, gyro, np.zeros((41, 3)), gyro)
+    t_s = np.arange(41) * 0.01
+    there = IdealMotion(t_s, gyro, np.zeros((41, 3)), gyro).sample(t_s, t_s)
     for physics, theta in acting:
         there = physics.forward(there, theta)
     assert np.allclose(there.accel[:, 2], shape.basis(x) @ c, rtol=0, atol=EXACT)
@@ -306,7 +345,8 @@ def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
 def test_every_term_there_can_be_is_written_as_it_acts() -> None:
     """Whatever `unnamed` can propose, the file can say: same signal, same axis, same numbers."""
     gyro, accel, alpha = (np.random.default_rng(k).normal(size=(30, 3)) for k in (1, 2, 3))
-    there = SensorSamples(np.arange(30) * 0.01, gyro, accel, alpha)
+    t_s = np.arange(30) * 0.01
+    there = IdealMotion(t_s, gyro, accel, alpha).sample(t_s, t_s)
     for physics in unnamed.terms(there):
         c = {"c": Estimate(0.7, 0.01, physics.parameters[0].unit)}
         assert physics.axis is not None

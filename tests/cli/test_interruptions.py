@@ -366,10 +366,10 @@ def test_an_input_that_changes_at_a_read(
 
 
 @pytest.mark.parametrize("name", ["convert", "debias", "view", "train", "diagnose", "live"])
-def test_of_two_runs_at_once_to_one_target_one_wins(brief: Path, command: str, name: str) -> None:
+def test_of_two_runs_at_once_to_one_target_one_wins(brief: Path, name: str) -> None:
     words, target = WRITERS[name]
     words = words if name == "train" else [word.replace("in.mcap", "short.mcap") for word in words]
-    runs = [installed(command, words, brief) for _ in range(2)]
+    runs = [started(words, brief) for _ in range(2)]
     said = [run.communicate(timeout=WAIT_S)[1] for run in runs]
     assert sorted(run.returncode for run in runs) == [0, CONFIG], said
     (loser,) = (text for run, text in zip(runs, said, strict=True) if run.returncode)

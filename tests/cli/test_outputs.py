@@ -21,7 +21,7 @@ import typer
 from imutool import cli
 from imutool.cli.app import Written, caught, written
 from imutool.errors import ConfigError
-from imutool.mcap_io.storage.outputs import OutputFile, check_outputs
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
 Refused = Callable[..., str]
 

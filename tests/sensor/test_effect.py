@@ -153,7 +153,7 @@ def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect
     assert one.starts is not None
     felt = lively()
     real = simulate_samples(felt, felt.t_s, [(one, some_theta(one))])
-    starts = one.starts(felt, SensorSamples(felt.t_s, real.gyro, real.accel, np.zeros_like(real.gyro)))
+    starts = one.starts(felt, SensorSamples(felt.t_s, real.gyro, real.accel, felt))
     assert starts
     for start in starts:
         assert start.shape == one.null_value.shape
@@ -422,7 +422,7 @@ def test_biases_follow_the_temperature() -> None:
     close(out.gyro - felt.gyro, np.outer(warmer, [1e-3, 0.0, 0.0]))
     close(out.accel - felt.accel, np.outer(warmer, [0.0, 2e-2, 0.0]))
     with pytest.raises(DataError, match="no temperature channel"):
-        act("temperature", replace(out, channels={"/motor.current": felt.t_s}), *np.ones(6))
+        act("temperature", replace(out, at=replace(felt, channels={"/motor.current": felt.t_s})), *np.ones(6))
 
 
 def test_vibration_that_is_rectified_has_the_power_of_a_sine() -> None:

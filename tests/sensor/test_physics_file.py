@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from imutool.errors import ConfigError, DataError
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value, read, write
-from imutool.sensor.samples import SensorSamples
+from imutool.sensor.samples import IdealMotion, SensorSamples
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 POSITIVE = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
@@ -151,7 +151,7 @@ def ideal() -> SensorSamples:
     rng = np.random.default_rng(0)
     t_s = 0.01 * np.arange(200)
     gyro, accel, alpha = (rng.normal(size=(200, 3)) for _ in range(3))
-    return SensorSamples(t_s + 5.0, gyro, accel, alpha, channels={"/motor": np.sin(t_s)})
+    return IdealMotion(t_s, gyro, accel, alpha, channels={"/motor": np.sin(t_s)}).sample(t_s, t_s + 5.0)
 
 
 def one(file: PhysicsFile) -> tuple[Effect, Theta]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from support.drifting import Drifting, Kind, log
+from support.drifting import TEMPERATURE, Drifting, Kind, log
 
 from imutool.bias import neural_ode
 from imutool.bias.hybrid import Config
@@ -64,3 +64,22 @@ def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path) -> None:
     (test,) = saved(tmp_path, "rate", 50, TEST_S)
     _, static, ode = (result["aoe_deg"] for result in evaluate(test, models=models, init="truth"))
     assert BETTER * ode < static
+
+
+def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path) -> None:
+    """Logs that are left out decide that the drift stays, and the files of both methods have it."""
+    logs = saved(tmp_path, "ambient", 0, TRAINING_S)
+    hybrid = trained(tmp_path, logs, "hybrid", *ALONE, "compare=true")
+    ode = trained(tmp_path, logs, "neural_ode", "steps=1")
+    assert isinstance(hybrid.config, Config)
+    assert isinstance(ode.config, neural_ode.Config)
+    assert "gyro_temperature" in (hybrid.config.gyro_effects or ())
+    assert "gyro_temperature" in (ode.config.loads or ())
+    assert hybrid.config.temperature == ode.config.temperature == TEMPERATURE
+    scores = hybrid.card["left_out"]["scores"]
+    effects, linear = (np.mean([s["aoe_deg"] for s in scores if s["model"] == name]) for name in ("effects", "linear"))
+    assert effects < 0.5 * linear
+    (test,) = saved(tmp_path, "ambient", 50, (60.0,))
+    models = ["static", *(str(tmp_path / f"{method}.safetensors") for method in ("hybrid", "neural_ode"))]
+    _, static, *learnt = (result["aoe_deg"] for result in evaluate(test, models=models, init="truth"))
+    assert BETTER * max(learnt) < static

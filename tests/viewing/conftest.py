@@ -7,8 +7,8 @@ import pytest
 
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, flight
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData
-from imutool.viewing.model.runs import build
 
 
 @pytest.fixture(scope="session")

@@ -17,8 +17,8 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.viewing import notebook
+from imutool.viewing.model.load_view import load
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import viewer
 
 # In a process of its own: where the widget's program comes from is settled once, by an import that takes seconds.
@@ -27,7 +27,7 @@ import gzip, sys
 from pathlib import Path
 gzip.compress = lambda program: program[:1]  # 67 MB, which nobody runs here
 from imutool.viewing import notebook
-from imutool.viewing.model.runs import load
+from imutool.viewing.model.load_view import load
 viewer = notebook.show([load(Path(sys.argv[1]))], source=False)
 assert not __import__("rerun_notebook").ASSET_IS_URL, "the program would come from the network"
 parts = [buffer for event, buffers in viewer._viewer._event_queue for buffer in buffers]

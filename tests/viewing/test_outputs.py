@@ -15,8 +15,8 @@ from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.viewing import outputs
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData
-from imutool.viewing.model.runs import build
 from imutool.viewing.outputs import Outputs, RequestedOutputs, cursor_s
 
 

@@ -16,9 +16,9 @@ from imutool.array_types import Float, Float64
 from imutool.bias.hybrid import Config, Model
 from imutool.bias.networks import neural_ode
 from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.bias.temperature import columns_of, forms, samples_alone
 from imutool.config import Settings
 from imutool.errors import ConfigError
-from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import POWER_S, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
@@ -75,6 +75,11 @@ class Network(BiasNetwork):
         theta: Tensor = getattr(self, f"theta_{sensor}")
         return compiled(self.effects[sensor], theta.detach().cpu().double().numpy())(signals)
 
+    def temperature_theta(self) -> dict[Sensor, Float64[np.ndarray, " p"]]:
+        """Parameters of the drifts with a log's temperature, by sensor."""
+        own = {sensor: columns_of(effects, temperature=True) for sensor, effects in self.effects.items()}
+        return {sensor: getattr(self, f"theta_{sensor}").cpu().double().numpy()[at] for sensor, at in own.items() if len(at)}
+
     def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
         """Error of the effects plus the curve of the neural ODE; filters start at the first sample."""
         error = self._on(sensor, segment)
@@ -94,12 +99,12 @@ class Network(BiasNetwork):
         return torch.stack(rows).to(segment.t)
 
     def _set_effects(self, sensor: Sensor, names: tuple[str, ...]) -> None:
-        self.effects[sensor] = catalogue.trained(sensor, names)
+        self.effects[sensor] = forms(sensor, names)
         size = sum(len(effect.parameters) for effect in self.effects[sensor])
         like = self.prior_mean
         self.register_buffer(f"theta_{sensor}", like.new_zeros(size))
         self.register_buffer(f"covariance_{sensor}", like.new_zeros(size, size))
-        looks_back = any(self.effects.values())
+        looks_back = any(samples_alone(effects) for effects in self.effects.values())
         self.context = math.ceil(SETTLING * POWER_S * self.rate_hz) if looks_back else 0
 
 

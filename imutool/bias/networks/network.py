@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
+import msgspec
 import torch
 from torch import Tensor, nn
 
@@ -63,6 +64,13 @@ class BiasNetwork(nn.Module, ABC):
         self.card: Mapping[str, Any] = {}
         for name in STATISTICS:
             self.register_buffer(name, torch.zeros(6))
+
+    def take_temperature(self, channel: str, tensors: Mapping[str, Tensor]) -> None:
+        """Take over the channel and the range of the temperature that a drift follows."""
+        self.config = msgspec.structs.replace(self.config, temperature=channel)
+        self.temperature = nn.Module()
+        for name, value in tensors.items():
+            self.temperature.register_buffer(name, value.to(self.prior_mean))
 
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
         """Set the scales of the inputs from all training samples, before the first step."""

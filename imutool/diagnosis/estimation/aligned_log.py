@@ -174,8 +174,8 @@ class Pair(AlignedLog):
             "angular acceleration": ("rad/s²", np.linalg.norm(read.alpha, axis=1)),
             "time": ("s", self.stamp_s),
         }
-        if read.R_wb is not None:
-            out["tilt"] = ("rad", np.arccos(np.clip(read.R_wb[:, 2, 2], -1.0, 1.0)))
+        if read.at.R_wb is not None:
+            out["tilt"] = ("rad", np.arccos(np.clip(read.at.R_wb[:, 2, 2], -1.0, 1.0)))
         for k, axis in enumerate(AXES):
             out[f"rate about {axis}"] = ("rad/s", np.abs(read.gyro[:, k]))
             out[f"force along {axis}"] = ("m/s²", np.abs(read.accel[:, k]))
@@ -183,7 +183,9 @@ class Pair(AlignedLog):
 
     def recorded(self) -> tuple[IdealMotion, SensorSamples]:
         """The ideal motion and the recorded samples; angular acceleration is not recorded."""
-        return self.ideal, SensorSamples(self.stamp_s, self.real[:, :3], self.real[:, 3:], np.zeros((len(self.real), 3)))
+        gyro, accel = self.real[:, :3], self.real[:, 3:]
+        at = IdealMotion(self.stamp_s, gyro, accel, np.zeros_like(gyro))
+        return self.ideal, SensorSamples(self.stamp_s, gyro, accel, at)
 
 
 def split(

@@ -24,7 +24,8 @@ from imutool.inertial.kinematics import fit_trajectory
 from imutool.inertial.stationary import white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
-from imutool.sensor.samples import IdealMotion, channels_at
+from imutool.sensor.channels import channels_at
+from imutool.sensor.samples import IdealMotion
 
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
 MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there are at least

@@ -94,8 +94,8 @@ class CandidateScore:
         self.logs, self.now = logs, now
         q = sum(len(theta) for _, theta in now.chosen)
         self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
-        for number, (log, forward) in enumerate(zip(logs, now.passes, strict=True)):
-            mask, residual = log.rows("fitted"), log.residual(forward.expected)
+        for number, log in enumerate(logs):
+            mask, residual = log.rows("fitted"), now.residuals[number]
             fitted = np.flatnonzero(mask)
             for k in range(log.pair.columns):
                 where, A = now.jacobians.on_axis(number, k, np.ones(len(mask), bool))
@@ -110,14 +110,12 @@ class CandidateScore:
 
     def linear(self, effect: Effect, start: Theta) -> _Linear:
         """Derivatives of a candidate beside the fit, and what its start adds."""
-        moves = np.array([not parameter.begins for parameter in effect.parameters])  # onsets are searched, not stepped
         rows, N = [], np.zeros((len(start), len(start)))
         for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
             with_it = forward if effect.linear else ForwardPass(log.pair, (*self.now.chosen, (effect, start)), forward)
-            B, added = effect_jacobian(log.whiten, with_it, effect), with_it.added(forward)
+            B, added = effect_jacobian(log.whiten, with_it, effect, onsets=False), with_it.added(forward)  # they are searched
             for column in range(log.pair.columns):
                 axis, on = self.axes[log.pair.columns * k + column], B.on(column)
-                on = on[moves[B.parameters[on]]]
                 if len(on) or column in added:
                     js, b, more = B.parameters[on], axis.free(B.rows[on]), None
                     N[np.ix_(js, js)] += b @ b.T

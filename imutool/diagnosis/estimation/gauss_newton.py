@@ -11,15 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, bound, free, step_of
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, bound, free, step_of, with_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import FitSettings
 from imutool.sensor.effect import Parameter, Theta
+
+_objective = attrgetter("objective")
 
 
 def parameters_of(chosen: Chosen) -> list[Parameter]:
@@ -30,13 +33,6 @@ def parameters_of(chosen: Chosen) -> list[Parameter]:
 def free_of(chosen: Chosen) -> Theta:
     """All free parameters in order."""
     return np.concatenate([np.zeros(0), *(free(effect, theta) for effect, theta in chosen)])
-
-
-def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
-    """The effects with another value of one parameter."""
-    theta = chosen[k][1].copy()
-    theta[j] = value
-    return (*chosen[:k], (chosen[k][0], theta), *chosen[k + 1 :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +49,7 @@ class Fit:
     logs: tuple[WhitenedLog, ...]
     part: str
     passes: tuple[ForwardPass, ...]
+    residuals: tuple[Float64[np.ndarray, "n k"], ...]  # white, bias included
     prior: Float64[np.ndarray, " p"]
 
     @property
@@ -129,16 +126,17 @@ def fit(
 ) -> Fit:
     """Fit effects together from where they begin, and a bias for each log.
 
-    `near` is a fit of the same logs: the Jacobians of the effects that both share serve for the first step. A fit whose
-    objective is not below `give_up_above` after a few steps goes no further.
+    `near` is a fit of the same logs: its forward passes and the Jacobians of the effects that both share serve for the first
+    step. A fit whose objective is not below `give_up_above` after a few steps goes no further.
     """
     problem = _Problem(logs, begun, part)
     iterations = problem.settings.iterations if iterations is None else iterations
-    now = _descended(problem, problem.state(begun, None), iterations, near, give_up_above)
+    now = _descended(problem, problem.state(begun, near), iterations, near, give_up_above)
     if iterations and any(effect.jumps for effect, _ in begun):
         now = _descended(problem, _polished(problem, now), iterations, None, np.inf)
     numbers = sum(log.count(part) for log in logs)
-    return Fit(now.chosen, now.bias, now.objective, numbers, tuple(logs), part, tuple(now.passes), problem.std)
+    passes, residuals = tuple(now.passes), tuple(now.residuals)
+    return Fit(now.chosen, now.bias, now.objective, numbers, tuple(logs), part, passes, residuals, problem.std)
 
 
 class _State(NamedTuple):
@@ -160,10 +158,13 @@ class _Problem:
         self.settings = logs[0].pair.settings.fit
         self.mean, self.std = priors(begun, self.settings)
 
-    def state(self, chosen: Chosen, like: _State | None) -> _State:
-        """Residuals and objective of parameters; forward passes continue from a state like it."""
-        passes = [ForwardPass(log.pair, chosen, None if like is None else like.passes[k]) for k, log in enumerate(self.logs)]
-        residuals = [log.residual(forward.expected) for log, forward in zip(self.logs, passes, strict=True)]
+    def state(self, chosen: Chosen, like: _State | Fit | None) -> _State:
+        """Residuals and objective of parameters; what equals a state like it is taken from there."""
+        passes, residuals = list[ForwardPass](), list[Float64[np.ndarray, "n k"]]()
+        for k, log in enumerate(self.logs):
+            passes.append(ForwardPass(log.pair, chosen, None if like is None else like.passes[k]))
+            known = None if like is None else (like.passes[k].blocks, like.residuals[k])
+            residuals.append(log.residual(passes[k].blocks, known))
         total = float((((free_of(chosen) - self.mean) / self.std) ** 2).sum()) if len(self.mean) else 0.0
         bias = np.zeros((len(self.logs), self.logs[0].pair.columns))
         for k, (log, residual, mask) in enumerate(zip(self.logs, residuals, self.masks, strict=True)):
@@ -245,10 +246,6 @@ def _polished(problem: _Problem, now: _State) -> _State:
     return now
 
 
-def _objective(state: _State) -> float:
-    return state.objective
-
-
 def _bound(chosen: Chosen, x: Theta) -> Chosen:
     """Effects with their parameters from free ones."""
     cuts = np.cumsum([len(theta) for _, theta in chosen])[:-1]
@@ -267,9 +264,10 @@ def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
             if not parameter.begins:
                 continue
             at, excess = [], []
-            for log, mask, bias, forward in zip(problem.logs, problem.masks, now.bias, now.passes, strict=True):
+            each = zip(problem.logs, problem.masks, now.bias, now.passes, now.residuals, strict=True)
+            for log, mask, bias, forward, residual in each:
                 passes = (ForwardPass(log.pair, with_value(now.chosen, k, j, t), forward) for t in (np.inf, -np.inf))
-                ends = (log.residual(end.expected) - log.constants * bias for end in passes)
+                ends = (log.residual(end.blocks, (forward.blocks, residual)) - log.constants * bias for end in passes)
                 never, always = ((end[mask] ** 2).sum(1) for end in ends)
                 at.append(log.pair.stamp_s[:: log.whiten.every][mask])
                 excess.append(never - always)

@@ -35,10 +35,14 @@ class AddedColumns(ABC):
     def columns_at(self, samples: SensorSamples) -> Float64[np.ndarray, "n q"]:
         """Columns at some samples, one for each parameter."""
 
+    def added_at(self, samples: SensorSamples, theta: Theta) -> Float64[np.ndarray, " n"]:
+        """What the columns add."""
+        return np.asarray(self.columns_at(samples) @ theta)
+
     def __call__(self, samples: SensorSamples, theta: Theta) -> SensorSamples:
         """The samples with the columns on them."""
         out = (samples.gyro if self.sensor == 0 else samples.accel).copy()
-        out[:, self.axis] += self.columns_at(samples) @ theta
+        out[:, self.axis] += self.added_at(samples, theta)
         return samples.with_readings(gyro=out) if self.sensor == 0 else samples.with_readings(accel=out)
 
 
@@ -66,10 +70,8 @@ class ForwardPass:
         rows = {first + k: row for first, own, other in pairs if own is not other for k, row in enumerate((own - other).T)}
         return {axis: row for axis, row in rows.items() if row.any()}
 
-    def derivatives(self, effect: Effect) -> Iterator[tuple[int, int, Float64[np.ndarray, " n"]]]:
-        """Finite differences d expected / d (free parameters): axis, parameter, nonzero row.
-
-        They are forward differences.
+    def derivatives(self, effect: Effect, *, onsets: bool = True) -> Iterator[tuple[int, int, Float64[np.ndarray, " n"]]]:
+        """Forward differences d expected / d (free parameters): axis, parameter, nonzero row; `onsets` or without them.
 
         An effect outside this pass is inserted at its null value, for which it has to be linear.
         """
@@ -87,6 +89,8 @@ class ForwardPass:
             yield from ((3 * effect.forward.sensor + effect.forward.axis, j, row) for j, row in enumerate(rows) if row.any())
             return
         for j, parameter in enumerate(effect.parameters):
+            if parameter.begins and not onsets:
+                continue
             h = step_of(parameter)
             only_j = np.arange(len(x)) == j  # the others stay to the last bit: their rounding would look like a derivative
             state = before.through(effect, np.where(only_j, bound(effect, x + h), theta))
@@ -111,6 +115,13 @@ def _shared(a: list[tuple[Effect, Theta]], b: list[tuple[Effect, Theta]]) -> int
 def expected(pair: AlignedLog, chosen: Chosen) -> Float64[np.ndarray, "n k"]:
     """Expected readings of a sensor with some effects, without bias."""
     return ForwardPass(pair, chosen).expected
+
+
+def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
+    """The effects with another value of one parameter."""
+    theta = chosen[k][1].copy()
+    theta[j] = value
+    return (*chosen[:k], (chosen[k][0], theta), *chosen[k + 1 :])
 
 
 def free(effect: Effect, theta: Theta) -> Theta:
@@ -143,12 +154,12 @@ class EffectJacobian(NamedTuple):
 
     def on(self, axis: int) -> Int64[np.ndarray, " q"]:
         """Rows of an axis, in the order of the parameters."""
-        return np.asarray(np.flatnonzero(self.axes == axis))
+        return np.asarray((self.axes == axis).nonzero()[0])
 
 
-def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect) -> EffectJacobian:
+def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect, *, onsets: bool = True) -> EffectJacobian:
     """Jacobian of an effect in a forward pass, or of a linear one outside it."""
-    entries = list(forward.derivatives(effect))
+    entries = list(forward.derivatives(effect, onsets=onsets))
     axes, js = (np.array([entry[k] for entry in entries], np.int64) for k in (0, 1))
     width, length = len(effect.parameters), len(forward.pair.stamp_s)
     rows = np.stack([row for _, _, row in entries]) if entries else np.zeros((0, length))
@@ -185,10 +196,11 @@ class Jacobians:
         for jacobians in self._by_effect.values():
             jacobian = jacobians[log]
             on = jacobian.on(axis)
-            where.append(first + jacobian.parameters[on])
-            rows += [jacobian.rows[k][mask] for k in on]
+            if len(on):
+                where.append(first + jacobian.parameters[on])
+                rows.append(jacobian.rows[on].compress(mask, axis=1))
             first += jacobian.width
-        return np.concatenate(where), np.stack(rows) if rows else np.zeros((0, int(mask.sum())))
+        return np.concatenate(where), np.concatenate(rows) if rows else np.zeros((0, int(mask.sum())))
 
     def along(self, log: int, axis: int, step: Theta, mask: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
         """Predicted change of an axis' white samples in a step of all parameters."""

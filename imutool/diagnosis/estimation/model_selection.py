@@ -172,7 +172,7 @@ class _Search:
             others, mine = (*now.chosen[:k], *now.chosen[k + 1 :]), now.chosen[k][0]
             without = fit(self.logs, others, iterations=2, near=now)
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
-            unfitted = fit(self.logs, others, iterations=0)  # refitted, a nonlinear effect may diverge for good
+            unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
                 if effect.key == mine.key:
                     if effect.linear:  # its score is its gain

@@ -124,9 +124,8 @@ def _rich(pair: Pair, candidates: Sequence[Effect]) -> list[Float64[np.ndarray, 
         if effect.starts is not None and not effect.linear:
             passes = [ForwardPass(pair, ((effect, start),), ideal) for start in pair.starts(effect)] or passes
         for forward in passes:
-            for axis, j, row in forward.derivatives(effect):
-                if not effect.parameters[j].begins:
-                    columns[axis].append(row)
+            for axis, _, row in forward.derivatives(effect, onsets=False):
+                columns[axis].append(row)
     return [np.stack(rows) for rows in columns]
 
 

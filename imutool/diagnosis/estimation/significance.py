@@ -21,8 +21,8 @@ from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors, with_value
-from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, with_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 
@@ -70,8 +70,9 @@ def held_out_gains(fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]
     """Gain in squares by an effect, and squares of its prediction, on held-out blocks."""
     others, out = (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), []
     block_s = fitted.logs[0].pair.settings.search.held_out_block_s
-    for log, forward in zip(fitted.logs, fitted.passes, strict=True):
-        with_, without = (_white(log, one.expected, part) for one in (forward, ForwardPass(log.pair, others, forward)))
+    for log, forward, residual in zip(fitted.logs, fitted.passes, fitted.residuals, strict=True):
+        other = log.residual(ForwardPass(log.pair, others, forward).blocks, (forward.blocks, residual))
+        with_, without = (_white(log, one, part) for one in (residual, other))
         block = np.floor(log.pair.stamp_s[:: log.whiten.every][log.rows(part)] / block_s).astype(int)
         each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
         names, inverse = np.unique(block, return_inverse=True)
@@ -79,10 +80,10 @@ def held_out_gains(fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]
     return np.concatenate(out)
 
 
-def _white(log: WhitenedLog, expected: Float64[np.ndarray, "m k"], part: str) -> Float64[np.ndarray, "n k"]:
+def _white(log: WhitenedLog, residual: Float64[np.ndarray, "m k"], part: str) -> Float64[np.ndarray, "n k"]:
     """White residuals of a part, with the best constant for that part."""
     rows = log.rows(part)
-    residual = log.residual(expected)[rows]
+    residual = residual[rows]
     constant = log.constants[rows]
     return np.asarray(residual - constant * ((constant * residual).sum(0) / np.maximum((constant * constant).sum(0), 1e-300)))
 
@@ -147,7 +148,7 @@ def _dilution(
     squares = np.zeros(logs[0].pair.columns)
     for k, log in enumerate(logs):
         rows = log.rows(part)
-        squares += ((log.residual(found.passes[k].expected)[rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
+        squares += ((found.residuals[k][rows] - log.constants[rows] * found.bias[k]) ** 2).sum(axis=0)
     out = {}
     for effect, _ in found.chosen:
         for signal, columns in logs[0].pair.signals.items():
@@ -201,7 +202,7 @@ def _seen_from(lower: Matrix, H: Matrix) -> Matrix:
 def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> list[tuple[Matrix, Float64[np.ndarray, " p"]]]:
     """Information and score J^T r of each block, a constant taken out of the whole log."""
     rows, begins = log.rows(part), _begins(found)
-    residual = log.residual(found.passes[k].expected)[rows] - log.constants[rows] * found.bias[k]
+    residual = found.residuals[k][rows] - log.constants[rows] * found.bias[k]
     J = np.zeros((log.pair.columns, len(begins), int(rows.sum())))
     for axis in range(log.pair.columns):
         where, J_axis = found.jacobians.on_axis(k, axis, rows)
@@ -239,12 +240,12 @@ def estimate_onsets(
             step_s = max(period_s, 2.0 * settings.onset_near_s / (settings.onset_times - 1))
             t_s = theta[j] + step_s * np.arange(-(settings.onset_times // 2), settings.onset_times // 2 + 1)
             moved = (with_value(found.chosen, k, j, float(t)) for t in t_s)  # all else as it is but for the constants
-            squares = np.array([fit(logs, chosen, part=part, iterations=0).objective for chosen in moved])
+            squares = np.array([fit(logs, chosen, part=part, iterations=0, near=found).objective for chosen in moved])
             likely = np.exp(-(squares - squares.min()) / (2.0 * inflation))
             likely /= likely.sum()
             mean = float(likely @ t_s)
             spread[effect.key, j] = float(np.sqrt(likely @ (t_s - mean) ** 2 + step_s**2 / 12.0))
-            found = fit(logs, with_value(found.chosen, k, j, mean), part=part, iterations=0)
+            found = fit(logs, with_value(found.chosen, k, j, mean), part=part, iterations=0, near=found)
     return found, spread
 
 

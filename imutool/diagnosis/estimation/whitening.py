@@ -16,12 +16,12 @@ from scipy.ndimage import median_filter, minimum_filter1d
 from scipy.signal import firwin, lfilter, periodogram
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Pair
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Blocks, Pair
 from imutool.diagnosis.settings import NoiseSettings
 
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
-AT_ONCE = 16  # values of a band in one product of matrices
+AT_ONCE = 8  # values of a band in one product of matrices
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,20 +48,25 @@ class Band:
 
     def rows(self, x: Float64[np.ndarray, "r n"]) -> Float64[np.ndarray, "r m"]:
         """The slow part of some rows, one after another in time; `upfirdn` takes two to four times as long."""
-        count, reach, hop = len(range(0, x.shape[1], self.every)), len(self._matrix), AT_ONCE * self.every
-        blocks = -(-count // AT_ONCE)
-        before, length = len(self.taps) // 2, (blocks - 1) * hop + reach
-        padded = np.pad(x, ((0, 0), (before, max(0, length - before - x.shape[1]))))
-        pieces = np.lib.stride_tricks.sliding_window_view(padded, reach, axis=1)[:, : blocks * hop : hop]
-        return np.asarray(pieces.reshape(-1, reach) @ self._matrix).reshape(len(x), blocks * AT_ONCE)[:, :count]
+        count, hop = len(range(0, x.shape[1], self.every)), AT_ONCE * self.every
+        blocks, parts, before = -(-count // AT_ONCE), self._matrix.shape[1] // AT_ONCE, len(self.taps) // 2
+        padded = np.zeros((len(x), (blocks + parts - 1) * hop))
+        padded[:, before : before + x.shape[1]] = x[:, : padded.shape[1] - before]
+        each = (padded.reshape(-1, hop) @ self._matrix).reshape(len(x), blocks + parts - 1, parts, AT_ONCE)
+        out = each[:, :blocks, 0].copy()
+        for k in range(1, parts):
+            out += each[:, k : blocks + k, k]
+        return np.asarray(out.reshape(len(x), blocks * AT_ONCE)[:, :count])
 
     @cached_property
-    def _matrix(self) -> Float64[np.ndarray, "reach _"]:
-        """Matrix from the samples that `AT_ONCE` values of the output depend on to these values."""
-        matrix = np.zeros(((AT_ONCE - 1) * self.every + len(self.taps), AT_ONCE))
+    def _matrix(self) -> Float64[np.ndarray, "hop _"]:
+        """Matrix from a block of samples to its part in `AT_ONCE` values of each block of the output that it reaches."""
+        hop = AT_ONCE * self.every
+        parts = -(-(hop - self.every + len(self.taps)) // hop)
+        whole = np.zeros((parts * hop, AT_ONCE))
         for k in range(AT_ONCE):
-            matrix[k * self.every : k * self.every + len(self.taps), k] = self.taps[::-1]
-        return matrix
+            whole[k * self.every : k * self.every + len(self.taps), k] = self.taps[::-1]
+        return np.concatenate(np.split(whole, parts), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +144,22 @@ class WhitenedLog:
         """A constant on each axis, whitened."""
         return self.whiten(np.ones_like(self.pair.real))
 
-    def residual(self, expected: Float64[np.ndarray, "m k"]) -> Float64[np.ndarray, "n k"]:
-        """White residuals, bias included."""
-        rows = np.subtract(self.pair.real.T, expected.T, order="C")
-        return np.asarray(self.whiten.rows(rows, np.arange(len(rows))).T)
+    def residual(
+        self, blocks: Blocks, known: tuple[Blocks, Float64[np.ndarray, "m k"]] | None = None
+    ) -> Float64[np.ndarray, "m k"]:
+        """White residuals of expected readings, bias included; columns as of other readings are taken from theirs."""
+        columns = [column for _, block in blocks for column in block.T]
+        others, theirs = ([], None) if known is None else ([column for _, block in known[0] for column in block.T], known[1].T)
+        new = [k for k, column in enumerate(columns) if theirs is None or not np.array_equal(column, others[k])]
+        rows = np.empty((len(new), len(self.pair.real)))
+        for row, k in zip(rows, new, strict=True):
+            np.subtract(self.pair.real[:, k], columns[k], out=row)
+        white = self.whiten.rows(rows, np.array(new, np.int64))
+        if theirs is None or len(new) == len(columns):
+            return np.asarray(white.T)
+        out = theirs.copy()
+        out[new] = white
+        return np.asarray(out.T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,6 +97,11 @@ class Recording:
                 return False
         return True
 
+    def outweighed(self, definitions: Iterable[Any], rest: set[int]) -> bool:
+        """Whether only definitions without a CRC contradict them, and ones with a CRC say what the rest of their chunk is."""
+        compared = [record for record in definitions if (_opcode(record), record.id) in self.proven]
+        return bool(rest) and self.agrees(compared) and {(int(Opcode.CHANNEL), i) for i in rest} <= self.proven
+
     def fits(self, channel: int, read: Callable[[], messages.Messages]) -> bool:
         """Whether messages of a channel decode by its definition here; True if unknown."""
         known = self.channels.get(channel)

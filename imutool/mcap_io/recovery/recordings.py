@@ -47,14 +47,12 @@ class Recordings:
         self._follows = True  # the next block may go on with the one before: no data section ends between them
         self._behind_gap: list[ScannedBlock] | None = None  # blocks since the last gap, where one came since the log began
         for summary in summaries:
-            recording = Recording(summary.base)
-            if summary.chunks:
-                recording.lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks}
+            lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks or ()}
+            recording = Recording(summary.base, lists=lists or None)
             definitions = parsed(summary.definitions, summary.base, losses)
             twice = {key for key, number in Counter((type(d), d.id) for d in different(definitions)).items() if number > 1}
-            for record in definitions:
-                if (type(record), record.id) not in twice:
-                    recording.define(record, proven=True)
+            for record in (d for d in definitions if (type(d), d.id) not in twice):
+                recording.define(record, proven=True)
             for kind, number in sorted(twice, key=str):
                 losses.add_harmless(f"a summary defines {kind.__name__.lower()} {number} twice; neither is used")
             self.each.append(recording)
@@ -213,7 +211,9 @@ class Recordings:
         """The recording of a block, which may be a new one."""
         own = parsed(found.definitions, found.block.offset, self.losses) if found.definitions else []
         rest = set(found.block.counts or {}) - {record.id for record in own if isinstance(record, Channel)}
-        agreeing = [r for r in (self._now, *self.each) if r.agrees(own, proven=bool(found.crc))]
+        every = (self._now, *self.each)
+        agreeing = [r for r in every if r.agrees(own, proven=bool(found.crc))]
+        agreeing = agreeing or [r for r in every if found.crc and r.outweighed(own, rest)]
         listed = [r for r in agreeing if r.lists and found.key in r.lists]
         if not agreeing:
             chosen = self._new_behind_gap(found)

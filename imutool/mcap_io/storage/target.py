@@ -20,7 +20,7 @@ from imutool.errors import ConfigError
 from imutool.location import Location, io_errors, reason
 from imutool.mcap_io.codec.records import crc32
 from imutool.mcap_io.storage.local import LocalFile, Stream, is_stream, remove_abandoned, temporary_path
-from imutool.mcap_io.storage.outputs import refuse_existing
+from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.upload import Upload
 

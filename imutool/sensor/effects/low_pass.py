@@ -70,13 +70,16 @@ def slowed(motion: IdealMotion, x: Vectors, by: Filter) -> Vectors:
 
 def filtered(x: Float64[np.ndarray, "n k"], by: Filter) -> Float64[np.ndarray, "n k"]:
     """Columns behind a filter of gain 1 at rest, held constant beyond the ends."""
-    from_first = np.concatenate([x, np.repeat(x[-1:], AHEAD, axis=0)]) - x[0]
-    driven, half = np.zeros_like(from_first), len(by.taps) // 2
-    for out, column in zip(driven.T, np.ascontiguousarray(from_first.T), strict=True):
-        for first, few in ((0, by.taps[:half]), (half, by.taps[half:])):  # numpy is quick for up to 11 taps
-            out[first:] += np.convolve(column, few)[: len(column) - first]
-    y: Float64[np.ndarray, "n k"] = lfilter([1.0], by.denominator, driven, axis=0)[AHEAD:] + x[0]
-    return y
+    n, half = len(x), len(by.taps) // 2
+    from_first = np.empty((x.shape[1], n + AHEAD))  # a column in a row
+    np.subtract(x.T, x[0, :, None], out=from_first[:, :n])
+    from_first[:, n:] = from_first[:, n - 1 : n]
+    driven = np.empty_like(from_first)
+    for out, column in zip(driven, from_first, strict=True):  # numpy is quick for up to 11 taps
+        out[:] = np.convolve(column, by.taps[:half])[: len(column)]
+        out[half:] += np.convolve(column, by.taps[half:])[: len(column) - half]
+    y = lfilter([1.0], by.denominator, driven, axis=1)[:, AHEAD:]
+    return np.asarray(np.add(y.T, x[0], order="C"))
 
 
 def _taps(numerator: Complex128[np.ndarray, " w"]) -> Float64[np.ndarray, " taps"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
+from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import DERIVED_KEY
 from imutool.recording import Imu, Recording
 from imutool.recording.columns import clock_jumps, jump_warnings
@@ -32,7 +33,8 @@ NO_SAMPLES = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 class LogContents:
     """Contents of a log; `debiased` are the channels that imutool derived from this IMU.
 
-    `survey` covers the messages as recorded; `notes` list what could not be read and what was left out.
+    `survey` covers the messages as recorded; `notes` list what could not be read and what was left out. `opened` opens the
+    log again, in the way it could be read.
     """
 
     recording: Recording
@@ -41,6 +43,7 @@ class LogContents:
     survey: Survey
     metadata: Sequence[tuple[str, Mapping[str, str]]]
     notes: tuple[str, ...]
+    opened: Callable[[Location], Log] = Log
 
 
 class _Read(NamedTuple):
@@ -66,11 +69,13 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
         LogError: nothing can be recovered, no IMU or several without `imu`, fewer than two samples, no such topic.
     """
     notes: list[str] = []
+    opened: Callable[[Location], Log] = Log
     try:
         contents = _read(Log(path), imu, truth, notes)
     except LogError:  # reading with recovery is slower; an error that is not damage comes again
         notes.clear()
-        contents = _read(RecoveredLog(path), imu, truth, notes)
+        opened = RecoveredLog
+        contents = _read(opened(path), imu, truth, notes)
     topic, derived, batches, biases_by_topic, rest, metadata = contents
     where = f"{path} {topic}"
     survey = examine(lambda: batches[topic], truth_of(rest), CleaningSettings(), where=str(path), topic=topic)
@@ -89,7 +94,7 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
             notes.append(f"{name} is left out: its samples are not those of {topic}.")
         else:
             debiased.append(replace(run, start=start))
-    return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes))
+    return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes), opened)
 
 
 def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> _Read:
@@ -101,9 +106,10 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
         biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)
-        rest = longest_recording(
-            read_recordings(log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused)
+        found = read_recordings(
+            log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
         )
+        rest = longest_recording(with_temperatures(found, log))
         metadata = log.metadata_records()
         if isinstance(log, RecoveredLog):
             notes += [f"The log is damaged; {line}." for line in describe(log.losses.plain())]

@@ -95,7 +95,7 @@ def load_first_imu(path: Location, findings: Path | None = None) -> RunData | No
     """Data of the first IMU of a log, with the events of `findings`; None without an IMU.
 
     Raises:
-        ConfigError, LogError, DataError: as `imutool.viewing.model.runs.load`.
+        ConfigError, LogError, DataError: as `imutool.viewing.model.load_view.load`.
     """
     from imutool.errors import LogError
     from imutool.mcap_io.log import Log
@@ -109,7 +109,7 @@ def load_first_imu(path: Location, findings: Path | None = None) -> RunData | No
             imu, model = _imu_and_model(log)
     if imu is None:
         return None
-    from imutool.viewing.model.runs import load
+    from imutool.viewing.model.load_view import load
 
     return load(path, models=() if model is None else [model], imu=imu, findings=findings)
 

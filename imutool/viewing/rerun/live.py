@@ -270,7 +270,7 @@ class _Imu:
 
 
 class _GrowingPath:
-    """Dead-reckoned path, batch by batch; equals that of `runs.build` to the last digits."""
+    """Dead-reckoned path, batch by batch; equals that of `load_view.build` to the last digits."""
 
     def __init__(self) -> None:
         self._end: tuple[Imu, StartPose] | None = None

@@ -18,12 +18,13 @@ Vector = tuple[float, float, float]
 
 
 class Sample(NamedTuple):
-    """Sample of an IMU: stamp (ns), rad/s, m/s², time of arrival (s of `time.perf_counter`)."""
+    """Sample of an IMU: stamp (ns), rad/s, m/s², arrival (s of `time.perf_counter`), perhaps °C."""
 
     stamp_ns: int
     gyro: Vector
     accel: Vector
     arrival_s: float
+    temperature: float | None = None
 
 
 class _Vector(msgspec.Struct):
@@ -60,6 +61,7 @@ class _Message(msgspec.Struct):
     t_s: float | None = None
     gyro: Vector | None = None
     accel: Vector | None = None
+    temperature: float | None = None
     header: _Header | None = None
     angular_velocity: _Vector | None = None
     linear_acceleration: _Vector | None = None
@@ -81,7 +83,7 @@ DECODER = msgspec.json.Decoder(_Message)
 
 
 def sample(text: bytes | str, arrival_s: float) -> Sample:
-    """Sample from JSON with t_ns or t_s, gyro and accel, or from a sensor_msgs/Imu in JSON.
+    """Sample from JSON with t_ns or t_s, gyro, accel, or from a sensor_msgs/Imu in JSON.
 
     Raises:
         ValueError: it is none.
@@ -93,7 +95,7 @@ def sample(text: bytes | str, arrival_s: float) -> Sample:
         raise ValueError("neither gyro and accel nor a sensor_msgs/Imu")
     if stamp_ns is None:
         raise ValueError("no time: t_ns, t_s or header.stamp")
-    return Sample(stamp_ns, gyro, accel, arrival_s)
+    return Sample(stamp_ns, gyro, accel, arrival_s, message.temperature)
 
 
 @dataclass

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from imutool.bias.model import GAP_S, BiasModel
+from imutool.bias.temperature_drift import started_at, without_drift
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.stretches import measured
@@ -182,8 +183,10 @@ class _Session:
         t_ns = np.array([sample.stamp_ns for sample in ordered], dtype=np.int64)
         gyro, accel = (np.array([getattr(sample, name) for sample in ordered]) for name in ("gyro", "accel"))
         good = measured(gyro, accel)
+        warm = [(sample.stamp_ns, float(sample.temperature)) for sample in ordered if sample.temperature is not None]
+        model = started_at(self._model, warm, int(t_ns[0]), int(t_ns[-1]))
         try:
-            start = auto(self._model, Imu(t_ns[good], gyro[good], accel[good]))
+            start = auto(model, without_drift(model, Imu(t_ns[good], gyro[good], accel[good])))
         except DataError as error:
             fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
             raise DataError(error.what, where="source", fix=fix) from error
@@ -197,7 +200,7 @@ class _Session:
     def _correct(self, found: Sample, batches: _Batches) -> None:
         assert self._online is not None
         u = np.array([found.gyro, found.accel])
-        rate, force, bias = self._online(found.stamp_ns, u[0], u[1])
+        rate, force, bias = self._online(found.stamp_ns, u[0], u[1], found.temperature)
         self._bias = bias
         if not np.isfinite(u).all():
             self._not_measured += 1

@@ -14,10 +14,15 @@ from queue import Empty, Full, Queue
 from urllib.parse import urlsplit
 
 import msgspec
+import numpy as np
 
+from imutool.array_types import Int64
+from imutool.bias.temperature import channel_of
 from imutool.cleaning import raw_batches
 from imutool.errors import ConfigError, LogError, not_installed
 from imutool.location import to_location
+from imutool.mcap_io.temperature import temperatures
+from imutool.recording import Scalars
 from imutool.recording.columns import MOST_GAP_S
 from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
@@ -32,19 +37,23 @@ MAX_BYTES = 65_536  # of a message; a sample has some 200
 Samples = Iterator[Sample | None]  # None: nothing came for a while
 
 
-def open_source(name: str, malformed: Malformed, *, imu: str | None = None, speed: float = 1.0) -> Samples:
+def open_source(
+    name: str, malformed: Malformed, *, imu: str | None = None, speed: float = 1.0, temperature: str | None = None
+) -> Samples:
     """Samples of a source as they come; a wrong address is refused at once.
+
+    `temperature` is the channel of a log whose numbers come with the samples.
 
     Raises:
         ConfigError: no such source, or it cannot be opened.
         LogError: a log without an IMU, or with several.
     """
-    samples = _source(name, malformed, imu, speed)
+    samples = _source(name, malformed, imu, speed, temperature)
     next(samples)  # it is open: whoever drops the iterator closes it
     return samples
 
 
-def _source(name: str, malformed: Malformed, imu: str | None, speed: float) -> Samples:
+def _source(name: str, malformed: Malformed, imu: str | None, speed: float, temperature: str | None) -> Samples:
     """Open source; its first item is None."""
     parts = urlsplit(name)
     if name in {"-", "stdin"}:
@@ -57,10 +66,10 @@ def _source(name: str, malformed: Malformed, imu: str | None, speed: float) -> S
         return _zenoh(name, malformed)
     if "://" in name and parts.scheme not in {"file", "s3", "gs", "az"}:
         raise ConfigError(f"{name!r}", where="source", expected=EXPECTED)
-    return _replay(name, imu, speed)
+    return _replay(name, imu, speed, temperature)
 
 
-def _replay(name: str, imu: str | None, speed: float) -> Samples:
+def _replay(name: str, imu: str | None, speed: float, temperature: str | None) -> Samples:
     """Samples of a log at its own speed, times `speed`; a jump of its clock takes no time."""
     from imutool.mcap_io.log import Log
 
@@ -74,17 +83,30 @@ def _replay(name: str, imu: str | None, speed: float) -> Samples:
         with log:
             yield None
             due_s, last_ns = time.perf_counter(), None
-            for batch in raw_batches(log, imu or topics[0]):
-                for stamp_ns, gyro, accel in zip(
-                    batch.stamp_ns.tolist(), batch.gyro.tolist(), batch.accel.tolist(), strict=True
+            topic = imu or topics[0]
+            found = None if temperature is None else channel_of(temperatures(log), topic, temperature)
+            for batch in raw_batches(log, topic):
+                warm = _arriving(batch.stamp_ns, last_ns, None if found is None else found[1])
+                for stamp_ns, gyro, accel, celsius in zip(
+                    batch.stamp_ns.tolist(), batch.gyro.tolist(), batch.accel.tolist(), warm, strict=True
                 ):
                     step_s = 0.0 if last_ns is None else (stamp_ns - last_ns) * 1e-9
                     due_s, last_ns = due_s + (step_s if 0.0 < step_s <= MOST_GAP_S else 0.0) / speed, stamp_ns
                     if (wait_s := due_s - time.perf_counter()) > 0.0:
                         time.sleep(wait_s)
-                    yield Sample(stamp_ns, tuple(gyro), tuple(accel), due_s)
+                    yield Sample(stamp_ns, tuple(gyro), tuple(accel), due_s, celsius)
 
     return samples()
+
+
+def _arriving(stamp_ns: Int64[np.ndarray, " n"], last_ns: int | None, channel: Scalars | None) -> list[float | None]:
+    """Temperature that arrives with each sample since the one before it; None where none does."""
+    out: list[float | None] = [None] * len(stamp_ns)
+    if channel is not None and len(out):
+        known = channel.between(-1 if last_ns is None else last_ns + 1, int(stamp_ns[-1]))
+        for row, celsius in zip(np.searchsorted(stamp_ns, known.t_ns).tolist(), known.values[:, 0].tolist(), strict=True):
+            out[row] = celsius
+    return out
 
 
 def _lines(malformed: Malformed) -> Samples:

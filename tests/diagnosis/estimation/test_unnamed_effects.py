@@ -9,7 +9,7 @@ from support import planted
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.sensor.effect import Effect
-from imutool.sensor.samples import SensorSamples
+from imutool.sensor.samples import IdealMotion
 
 SURE = 4.0
 T = planted.clock()
@@ -154,7 +154,8 @@ def test_a_curve_bends_where_the_samples_are() -> None:
     rng = np.random.default_rng(0)
     x = np.where(rng.random(4000) < 0.02, 6.0, 0.5) * rng.standard_normal(4000)
     gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    like = SensorSamples(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
+    t_s = np.arange(len(x)) * 0.01
+    like = IdealMotion(t_s, gyro, np.zeros_like(gyro), np.zeros_like(gyro)).sample(t_s, t_s)
     curve = next(one for one in unnamed.curves(like) if one.key == "unknown:gyro.z(omega_x)").forward
     assert isinstance(curve, unnamed.Curve)
     y = np.tanh(x / 0.3)
@@ -172,7 +173,8 @@ def test_a_curve_follows_the_range_of_a_robot_that_stands_most_of_the_time() -> 
     turning = np.clip(np.concatenate([np.zeros(7000), np.linspace(0.0, 0.5, 200), np.full(3000, 0.5)]), 0.0, 0.5)
     x = turning + 1e-3 * rng.standard_normal(len(turning))
     gyro = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
-    like = SensorSamples(np.arange(len(x)) * 0.01, gyro, np.zeros_like(gyro), np.zeros_like(gyro))
+    t_s = np.arange(len(x)) * 0.01
+    like = IdealMotion(t_s, gyro, np.zeros_like(gyro), np.zeros_like(gyro)).sample(t_s, t_s)
     coarse = next(one for one in unnamed.curves(like) if one.key == "unknown:gyro.x(omega_x)")
     fine = unnamed.finer(coarse, like)
     assert fine is not None

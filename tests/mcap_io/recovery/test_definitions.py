@@ -244,6 +244,19 @@ def test_a_foreign_chunk_takes_its_definitions_with_it(foreign: Foreign, tmp_pat
     assert back == [m for _, _, each in a for m in each][: 9 - open_]
 
 
+def test_a_definition_that_no_crc_covers_gives_way_to_a_proven_one(foreign: Foreign, tmp_path: Path) -> None:
+    """Seed n9-l, logs 15095: a channel of another log's summary stood in a gap, and the chunk that defines it was foreign."""
+    mine = [text("/mine", 100), *(text(f"/{('two', 'mine')[i % 2]}", 101 + i, 1200) for i in range(5))]
+    first = foreign(mine, "no-summary", chunk_size=CHUNK_SIZE, name="first")
+    a, raw = stretches(first), first.read_bytes()
+    assert [sorted({m[0] for m in each}) for _, _, each in a] == [["/mine"], ["/mine", "/two"], ["/mine", "/two"]]
+    body = struct.pack("<HHI", 2, 1, 6) + b"/other" + struct.pack("<I", 3) + b"cdr" + struct.pack("<I", 0)
+    channel = struct.pack("<BQ", 4, len(body)) + body
+    first.write_bytes(raw[: a[0][1]] + b"\0" * 5 + channel + raw[a[0][1] :])
+    repair(first, tmp_path / "out.mcap")
+    assert by_mcap(tmp_path / "out.mcap") == [m for _, _, each in a for m in each]
+
+
 def test_a_topic_stays_with_the_messages_that_are_on_it() -> None:
     """Seed n8-a, logs 1280: poses went to /pose_2, since a channel without messages said that /pose has another type."""
     imu, pose = Schema(3, b"", "ros2msg", schemas.IMU), Schema(4, b"", "ros2msg", schemas.POSE)

@@ -13,7 +13,7 @@ import pytest
 from support import diagnoses, image_difference, viewers
 
 from imutool.viewing.html import diagnosis_page, report
-from imutool.viewing.model.runs import build
+from imutool.viewing.model.load_view import build
 
 TESTS = Path(__file__).parents[1]
 

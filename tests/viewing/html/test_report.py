@@ -25,8 +25,8 @@ from imutool.sensor.made_up_flight import flight
 from imutool.viewing.html import drawing, report, report_errors, report_paths, report_signals, report_wording
 from imutool.viewing.html.page import DARK, LEVELS, LIGHT, PAPER, is_imutool_page
 from imutool.viewing.model.events import Event
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData, Trace
-from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 
 Page, svgs, curves = markup.Page, markup.svgs, markup.curves

@@ -15,8 +15,9 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import ACCEL, GYRO, flight
-from imutool.viewing.model import runs as runs_module
+from imutool.viewing.model import load_view
 from imutool.viewing.model.events import Event
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import (
     MIN_SAMPLES,
     RAW,
@@ -28,7 +29,6 @@ from imutool.viewing.model.run_data import (
     spectra,
     split_at_gaps,
 )
-from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Alignment, errors
 
 ROUNDING = 1e-9  # degrees and metres: some thousand float64 operations on numbers of size one
@@ -208,7 +208,7 @@ def test_a_log_too_long_to_be_drawn_whole_says_so(
     recording: Recording, runs: list[Run], data: RunData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert not any("at most" in note for note in data.notes)
-    monkeypatch.setattr(runs_module, "MAX_CURVE_ROWS", 1000)
+    monkeypatch.setattr(load_view, "MAX_CURVE_ROWS", 1000)
     assert any("at most 1000 rows" in note for note in build(recording, runs).notes)
 
 

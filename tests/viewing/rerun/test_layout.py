@@ -15,8 +15,8 @@ import rerun.blueprint as rrb
 from support import saved_rrd
 
 from imutool.recording import Recording
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData
-from imutool.viewing.model.runs import build
 from imutool.viewing.rerun import layout
 from imutool.viewing.rerun.plots import error_axis_limit, plot
 

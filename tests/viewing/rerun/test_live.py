@@ -21,7 +21,7 @@ from imutool.debiasing import BlockCallback, DebiasedBlock, debias
 from imutool.errors import ConfigError
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
-from imutool.viewing.model.runs import load
+from imutool.viewing.model.load_view import load
 from imutool.viewing.rerun import live, scene, viewer
 
 SECONDS, BLOCK = 12.0, 250  # samples at 200 Hz, as from a log with images

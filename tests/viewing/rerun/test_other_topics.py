@@ -15,8 +15,8 @@ from support import saved_rrd
 
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording, Scalars
+from imutool.viewing.model.load_view import load
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.model.runs import load
 from imutool.viewing.rerun import layout, other_topics
 
 CAMERA = "/cam0/image_raw/compressed"

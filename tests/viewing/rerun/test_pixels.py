@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from support import drawn_curves, image_difference, saved_rrd, viewers
 
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.model.runs import build
 from imutool.viewing.rerun import layout, scene
 
 HERE = Path(__file__).parent

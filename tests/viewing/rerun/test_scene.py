@@ -14,8 +14,8 @@ from support import saved_rrd
 
 from imutool.recording import Recording
 from imutool.viewing.model.events import Event
+from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import LogTimes, Run, RunData, round_up_125
-from imutool.viewing.model.runs import build
 from imutool.viewing.model.trajectory_error import Drift, Errors, Window
 from imutool.viewing.rerun import scene, sdk
 from imutool.viewing.rerun.entities import paths, signals, styles

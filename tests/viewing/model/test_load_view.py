@@ -26,8 +26,8 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model.events import FINDINGS
+from imutool.viewing.model.load_view import MAX_ENTRIES, MAX_VALUE_LENGTH, build, load, provenance
 from imutool.viewing.model.run_data import Run
-from imutool.viewing.model.runs import MAX_ENTRIES, MAX_VALUE_LENGTH, build, load, provenance
 
 LAST_BITS = 1e-12  # rad/s and m/s²: the bias in blocks and in one go
 
@@ -164,6 +164,7 @@ def test_an_aided_path_is_that_of_evaluate_and_has_no_samples_of_its_own(log: Pa
     assert data.traces[2].figures["ape_m"] != data.traces[1].figures["ape_m"]
     assert [trace.name for trace in data.integrated().traces] == ["raw", "static"]
     assert (data.traces[2].drift, data.traces[2].windows) == (None, ())  # a path with aids has no state to reset
+    assert ([*data.traces[1].spectra], data.traces[2].spectra) == (["gyro", "accel"], {})
     assert "Aids: stops." in data.notes
     assert [trace.name for trace in load(log, aid="stops").traces] == ["raw", "raw aided"]
 
@@ -210,6 +211,7 @@ def test_a_log_cut_short_is_shown_as_far_as_it_goes(log: Path, tmp_path: Path) -
     before = cut.read_bytes()
     data = load(cut)
     assert any(note.startswith("The log is damaged; ") for note in data.notes)
+    assert [trace.name for trace in load(cut, aid="stops").traces] == ["raw", "raw aided"]
     assert 0 < len(data.traces[0].run.imu) <= 4001
     assert cut.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["cut.mcap"]

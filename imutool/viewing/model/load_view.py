@@ -21,7 +21,6 @@ from imutool.inertial.aids import Aids, find_aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, stretch_with_truth, with_velocity
 from imutool.location import Location
-from imutool.mcap_io.log import Log
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
@@ -32,6 +31,7 @@ from imutool.viewing.model.run_data import (
     TRUTH,
     Run,
     RunData,
+    Spectrum,
     Trace,
     level_start,
     spectra,
@@ -67,7 +67,7 @@ def load(
         recording = recording.with_truth(truth or next(iter(recording.truths)))
     aids = None
     if asked is not None:
-        with Log(log) as opened:
+        with contents.opened(log) as opened:
             aids = find_aids(opened, recording, asked)
     with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids) if models else ([], [], {})
     events, notes = survey_events(contents.survey)
@@ -146,7 +146,7 @@ def build(
         traces, of_paths = _scored(runs, truth, recording.name, align)
     else:
         truth, align = None, "none"
-        traces = tuple(Trace(run, run.path_from(run.imu, level_start(run.imu)), None, spectra=spectra(run.imu)) for run in runs)
+        traces = tuple(Trace(run, run.path_from(run.imu, level_start(run.imu)), None, spectra=_spectra(run)) for run in runs)
         of_paths = [
             f"This log has no truth, so there are no errors and nothing to align with. Paths start at the origin, at rest, "
             f"heading 0, levelled by the first {LEVELLING_S:g} s of specific force."
@@ -215,7 +215,7 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     path = run.path_from(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
     figures = MappingProxyType(evaluate(path, true, valid))
-    trace = Trace(run, moved, errors(moved, true, valid), figures=figures, spectra=spectra(run.imu))
+    trace = Trace(run, moved, errors(moved, true, valid), figures=figures, spectra=_spectra(run))
     if not run.is_aided:  # only an integration goes on from a true pose as from its own
         trace = replace(trace, drift=drift_since_reset(path, true, valid), windows=windows(path, true, valid))
     if align == "none":
@@ -223,6 +223,11 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     shift_m = np.linalg.norm(moved.p_wb[valid].mean(axis=0) - path.p_wb[valid].mean(axis=0))
     turn_deg = np.rad2deg(motion.rotation.magnitude())
     return trace, f"{run.name}: alignment {align} turned the path by {turn_deg:.3g} deg, its centre moved {shift_m:.3g} m."
+
+
+def _spectra(run: Run) -> Mapping[str, Spectrum]:
+    """Spectra of the samples; an aided run has those of the run that it aids."""
+    return {} if run.is_aided else spectra(run.imu)
 
 
 def _decimation_note(imu: Imu) -> list[str]:

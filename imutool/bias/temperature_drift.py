@@ -1,0 +1,164 @@
+"""Drift of a bias with the temperature of one log or stream; models bound to it."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from imutool.array_types import Float64, Int64
+from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
+from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
+from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
+from imutool.recording import Imu, Recording, Scalars
+from imutool.sensor.signals import TEMPERATURE_TERMS
+
+MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
+MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
+Rows3 = Float64[np.ndarray, "n 3"]
+Drift = Float64[np.ndarray, "n 6"] | None
+
+
+class TemperatureDrift:
+    """Drift of a model's bias in one log, by its stamps."""
+
+    def __init__(self, model: BiasModel, channel: Scalars, name: str) -> None:
+        self.name, self._t_ns = name, channel.t_ns
+        scale = scale_of(model)
+        self._terms = scale.terms(channel)
+        self._by_sensor = model.temperature_parameters()
+        self._bias, self._clamped = np.zeros((2, len(self._terms), 6))
+        slopes = scale.beyond(channel)
+        for sensor, (theta, _) in self._by_sensor.items():
+            K = theta.reshape(3, TEMPERATURE_TERMS).T
+            self._bias[:, COLUMNS[sensor]] = self._terms @ K
+            self._clamped[:, COLUMNS[sensor]] = slopes @ K
+
+    def __call__(self, t_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 6"]:
+        """Drift at some stamps: gyro (rad/s), then accel (m/s²)."""
+        return np.asarray(self._bias[holding(self._t_ns, t_ns)])
+
+    def covariance(self, t_ns: Int64[np.ndarray, " n"]) -> Covariances:
+        """Covariance of the drift relative to its mean so far.
+
+        The mean acts like a rest bias, and counts in its covariance (`imutool.bias_start.bias_covariance`). Beyond the trained
+        range the drift is as unsure as it would change if it went on with its slope at the end of the range.
+        """
+        out, rows = np.zeros((len(t_ns), 6, 6)), holding(self._t_ns, t_ns)
+        if not len(rows):
+            return out
+        row, place = np.unique(rows, return_inverse=True)
+        means = np.cumsum(self._terms[: row[-1] + 1], axis=0)[row] / (row + 1.0)[:, None]
+        off = self._terms[row] - means
+        for sensor, (_, covariance) in self._by_sensor.items():
+            blocks = covariance.reshape(3, TEMPERATURE_TERMS, 3, TEMPERATURE_TERMS)
+            S = np.einsum("nq,iqjr,nr->nij", off, blocks, off, optimize=True)
+            out[:, COLUMNS[sensor], COLUMNS[sensor]] = S[place]
+        out[:, range(6), range(6)] += self._clamped[rows] ** 2
+        return out
+
+
+class OnlineDrift:
+    """Drift of a model's bias in a live stream, as `TemperatureDrift` has it.
+
+    It is zero before the first temperature.
+    """
+
+    def __init__(self, model: BiasModel) -> None:
+        scale = scale_of(model)
+        self._follow, self._mean = TemperatureFilter(scale.centre, scale.half_range), scale.mean
+        self._K = {
+            sensor: theta.reshape(3, TEMPERATURE_TERMS).T for sensor, (theta, _) in model.temperature_parameters().items()
+        }
+        self._half_second, self._bias = -1, np.zeros(6)
+
+    def __call__(self, t_ns: int, temperature: float | None) -> Vector6:
+        """Drift from a sample on; its temperature is in °C or kelvin, None if it has none."""
+        if temperature is not None and math.isfinite(temperature) and t_ns // EVERY_NS > self._half_second:
+            self._half_second = t_ns // EVERY_NS
+            terms = self._follow(t_ns, celsius_of(temperature)) - self._mean
+            for sensor, K in self._K.items():
+                self._bias[COLUMNS[sensor]] = terms @ K
+        return self._bias
+
+
+def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, start_ns: int, end_ns: int) -> BiasModel:
+    """Model with its drift in one log; the model itself where it follows no temperature.
+
+    Without a channel there is no drift, and the rest bias varies as much as the drift did in training. `remarks` say so, and
+    what else makes the drift less sure.
+    """
+    if not model.temperature_parameters():
+        return model
+    scale, out = scale_of(model), copy.copy(model)
+    low, high = scale.centre - scale.half_range, scale.centre + scale.half_range
+    trained = f"{scale.channel}, {low:.1f} to {high:.1f} °C in training"
+    found = channel_of(scalars, imu_topic, scale.channel)
+    if found is None:
+        several = [name for name in scalars if is_temperature(name)]
+        what = f"none of {', '.join(several)} is named as the IMU's temperature" if several else "there is no temperature"
+        out.remarks = (f"{what}; the model's bias follows it ({trained}), and varies unseen",)
+        return _widened(out)
+    name, channel = found
+    out.log_drift = TemperatureDrift(model, channel, name)
+    out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high, trained))
+    return out
+
+
+def started_at(model: BiasModel, numbers: Sequence[tuple[int, float]], start_ns: int, end_ns: int) -> BiasModel:
+    """Model with its drift in the first samples of a stream, by stamps and temperatures."""
+    t_ns, values = np.array([t for t, _ in numbers], np.int64), np.array([T for _, T in numbers], np.float64)
+    known = {scale_of(model).channel: thinned(t_ns, values, "")} if numbers and model.temperature_parameters() else {}
+    return bound(model, known, "", start_ns, end_ns)
+
+
+def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float, high: float, trained: str) -> Sequence[str]:
+    """What makes the drift of a log less sure."""
+    out, within = [], channel.between(start_ns, end_ns)
+    T = within.values[:, 0] if len(within) else channel.values[:1, 0]
+    if T.min() < low - MOST_BEYOND_K or T.max() > high + MOST_BEYOND_K:
+        out.append(f"{name} goes from {T.min():.1f} to {T.max():.1f} °C, beyond the model's range ({trained}): it is clamped")
+    edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
+    age_s = float(np.diff(edges).max()) * 1e-9
+    if age_s > MOST_AGE_S:
+        out.append(f"{name} is silent for {age_s:.0f} s: its last number holds")
+    return out
+
+
+def _widened(model: BiasModel) -> BiasModel:
+    """Model whose rest bias varies as the drift did in training; a copy."""
+    spread, walk = (model.tensors[f"temperature.{name}"] for name in ("spread", "walk"))
+
+    def wider(std: Vector6) -> Vector6:
+        return np.sqrt(np.asarray(std) ** 2 + spread**2)
+
+    model.tensors = model.tensors | {
+        "prior_std": wider(model.prior_std),
+        "walk_std": np.sqrt(model.walk_std**2 + walk**2),
+    }
+    sessions = [{**session, "std": wider(session["std"]).tolist()} for session in model.card.get("sessions", [])]
+    least = model.card.get("turn_on_least_std")
+    model.card = {**model.card, "sessions": sessions, "turn_on_least_std": None if least is None else wider(least).tolist()}
+    return model
+
+
+def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
+    """Model with its drift in a recording (`bound`)."""
+    t_ns = recording.imu.t_ns
+    return bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
+
+
+def split_drift(model: BiasModel, t_ns: Int64[np.ndarray, " n"], gyro: Rows3, accel: Rows3) -> tuple[Drift, Rows3, Rows3]:
+    """Drift that a model follows in its log, None for most models, and samples without it."""
+    if model.log_drift is None:
+        return None, gyro, accel
+    drift = model.log_drift(t_ns)
+    return drift, gyro - drift[:, :3], accel - drift[:, 3:]
+
+
+def without_drift(model: BiasModel, imu: Imu) -> Imu:
+    """Samples without the drift that a model follows in their log."""
+    _, gyro, accel = split_drift(model, imu.t_ns, imu.gyro, imu.accel)
+    return imu if model.log_drift is None else Imu(imu.t_ns, gyro, accel)
