@@ -17,7 +17,7 @@ from imutool.training.calibration import DRIFTS
 from imutool.training.run import train
 from imutool.training.settings import settings_of
 
-TRAINING_S, TEST_S = (60.0, 60.0, 60.0), (120.0,)
+TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
 FEW = ("steps=1", "samples=500", "gyro_window_s=[1.0]", "accel_window_s=[0.5]")
 BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
