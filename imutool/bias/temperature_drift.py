@@ -103,7 +103,7 @@ def bound(model: BiasModel, scalars: Mapping[str, Scalars], imu_topic: str, star
         return _widened(out)
     name, channel = found
     out.log_drift = TemperatureDrift(model, channel, name)
-    out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high, trained))
+    out.remarks = tuple(_remarks(channel, name, start_ns, end_ns, low, high))
     return out
 
 
@@ -114,12 +114,14 @@ def started_at(model: BiasModel, numbers: Sequence[tuple[int, float]], start_ns:
     return bound(model, known, "", start_ns, end_ns)
 
 
-def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float, high: float, trained: str) -> Sequence[str]:
+def _remarks(channel: Scalars, name: str, start_ns: int, end_ns: int, low: float, high: float) -> Sequence[str]:
     """What makes the drift of a log less sure."""
     out, within = [], channel.between(start_ns, end_ns)
     T = within.values[:, 0] if len(within) else channel.values[:1, 0]
     if T.min() < low - MOST_BEYOND_K or T.max() > high + MOST_BEYOND_K:
-        out.append(f"{name} goes from {T.min():.1f} to {T.max():.1f} °C, beyond the model's range ({trained}): it is clamped")
+        out.append(
+            f"{name} goes from {T.min():.1f} to {T.max():.1f} °C, and training had {low:.1f} to {high:.1f} °C: it is clamped"
+        )
     edges = np.concatenate([[start_ns], within.t_ns, [end_ns]])
     age_s = float(np.diff(edges).max()) * 1e-9
     if age_s > MOST_AGE_S:

@@ -97,7 +97,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:
         return Fitness("doubtful", tuple(doubts))
-    return Fitness("fits", (_agreement(found, prior),))
+    followed = [] if model.log_drift is None else [f"its bias follows {model.log_drift.name}"]
+    return Fitness("fits", (_agreement(found, prior), *followed))
 
 
 def _prior(model: BiasModel) -> BiasPrior:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,9 @@ from imutool.cli.app import MODEL, Imu, Json, Logs, Overwrite, Quiet, Truth, Ver
 from imutool.cli.terminal import epoch_line, progress, say, table, write_json
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
+
+if TYPE_CHECKING:
+    from imutool.bias.model import BiasModel
 
 
 @app.command(
@@ -76,6 +79,7 @@ def train(
         if "left_out" in trained.card and not quiet:
             with redirect_stdout(sys.stderr):  # how the model was chosen is no result
                 left_out_table(trained.card["left_out"])
+                _say_effects(trained)
         say(str(model))
 
 
@@ -97,6 +101,14 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
     cells = [(log, start, *("–" if value is None else f"{value:.2f}" for value in values)) for log, start, values in rows]
     table([("left-out log", "start", *(f"{model}\nAOE °" for model in models)), *cells], keys=2)
     say(", ".join(f"{sensor}: {kept}" for sensor, kept in left_out["kept"].items()) + " kept, the simplest that is not beaten")
+
+
+def _say_effects(trained: BiasModel) -> None:
+    """Print the effects of each sensor, and the temperature that its bias follows."""
+    for sensor, found in trained.card.get("physics", {}).items():
+        say(f"{sensor}: {', '.join(found['effects']) or 'no effect'}")
+    if channel := getattr(trained.config, "temperature", UNSET):
+        say(f"the bias follows {channel}")
 
 
 class TrainingLog(Section, frozen=True):

@@ -203,6 +203,7 @@ def test_the_rest_bias_is_measured_without_the_drift(model: BiasModel) -> None:
     assert np.abs(start.rest[:3]).max() < 1e-4
     debiased = imutool.debias(log, model)
     assert np.abs(debiased.imu.gyro).mean() < 2e-4
+    assert debiased.fitness.reasons[-1] == f"its bias follows {CHANNEL}"
 
 
 def test_the_covariance_of_the_drift_grows_with_the_way_from_its_mean(model: BiasModel) -> None:
@@ -241,7 +242,7 @@ def test_several_that_may_be_meant_are_named(model: BiasModel) -> None:
 def test_another_range_is_clamped_and_told(model: BiasModel) -> None:
     channel = scalars(np.arange(100.0), np.full(100, CENTRE + 3.0 * HALF))
     bound = bound_to(model, recording(channel))
-    assert "beyond the model's range" in bound.remarks[0]
+    assert "it is clamped" in bound.remarks[0]
     assert bound.log_drift is not None
     np.testing.assert_allclose(bound.log_drift(channel.t_ns)[:, 0], SIZE, atol=STORED)
     below = scalars(np.arange(100.0), np.full(100, CENTRE - 3.0 * HALF))
