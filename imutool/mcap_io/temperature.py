@@ -67,7 +67,7 @@ def temperatures(
                 _floats(log.topics[name], rows) if (reader := readers[name]) is None else _fields(reader, rows)
             ):
                 found.setdefault(channel, []).append(part)
-    return {channel: _joined(parts) for channel, parts in found.items()}
+    return {channel: whole for channel, parts in found.items() if len(whole := _joined(parts))}
 
 
 def with_temperatures(

@@ -22,7 +22,7 @@ from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
-from imutool.bias.networks.temperature import temperature_tensors
+from imutool.bias.networks.temperature import temperature_scale, temperature_tensors
 from imutool.bias.temperature import FORMS, Scale, TemperatureFilter, channel_of
 from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.correction import apply
@@ -237,6 +237,15 @@ def test_without_a_temperature_it_says_so_and_is_less_sure(model: BiasModel) -> 
 def test_several_that_may_be_meant_are_named(model: BiasModel) -> None:
     log = replace(recording(None), scalars={"/a/temperature": warming(), "/b/temperature": warming()})
     assert "/a/temperature, /b/temperature" in bound_to(model, log).remarks[0]
+
+
+def test_training_says_that_several_may_be_meant(caplog: pytest.LogCaptureFixture) -> None:
+    log = replace(recording(None), scalars={"/a/temperature": warming(), "/b/temperature": warming()})
+    assert temperature_scale([log]) is None
+    assert "/a/temperature, /b/temperature" in caplog.text
+    scale = temperature_scale([log], "/b/temperature")
+    assert scale is not None
+    assert scale.channel == "/b/temperature"
 
 
 def test_another_range_is_clamped_and_told(model: BiasModel) -> None:

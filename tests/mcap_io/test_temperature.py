@@ -73,6 +73,12 @@ def test_nan_is_no_temperature_and_the_next_number_counts(tmp_path: Path) -> Non
         assert np.isfinite(channel.values).all()
 
 
+def test_a_channel_of_nothing_but_nan_is_none(tmp_path: Path) -> None:
+    ros_log(tmp_path / "log.mcap", np.full(20, np.nan))
+    with Log(tmp_path / "log.mcap") as log:
+        assert temperatures(log) == {}
+
+
 def test_it_is_thinned_alike_in_whole_and_in_parts() -> None:
     rng = np.random.default_rng(1)
     t_ns = START_NS + np.cumsum(rng.integers(1, 300_000_000, 400))

@@ -13,6 +13,7 @@ from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS
 from imutool.bias.temperature import Scale, channel_of, holding
 from imutool.errors import ConfigError
+from imutool.mcap_io.temperature import is_temperature
 from imutool.recording import Recording, Scalars, seconds
 from imutool.sensor.signals import TEMPERATURE_TERMS, SignalFilter, Signals
 from imutool.units import Sensor
@@ -39,8 +40,12 @@ def temperature_scale(recordings: Sequence[Recording], channel: str = "", *, wan
         fix = f"They have {', '.join(recordings[0].scalars) or 'no scalar channel'}"
         raise ConfigError(f"{channel or 'a temperature'} is not in {missing}", where="model.temperature", fix=fix)
     if missing:
+        several = [name for name in recordings[0].scalars if is_temperature(name)]
         if known:
             logger.warning("the bias is not fitted to the temperature: these logs have none: %s", missing)
+        elif len(several) > 1:
+            what = f"each of {', '.join(several)} may be the IMU's, and the setting model.temperature names none"
+            logger.warning("the bias is not fitted to the temperature: %s", what)
         return None
     seen = [_within(channel, recording) for (_, channel), recording in zip(known, recordings, strict=True)]
     low, high = min(float(T.min()) for T in seen), max(float(T.max()) for T in seen)
