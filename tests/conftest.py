@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -50,6 +51,13 @@ from support.shapes import check_shapes  # noqa: E402  (before anything imports 
 check_shapes("imutool")
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def on_disk() -> Iterator[Path]:
+    """Folder in which a file takes its time to be written, so that a signal finds a command in the middle of one."""
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
 
 
 @pytest.hookimpl(wrapper=True)

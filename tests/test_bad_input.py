@@ -449,7 +449,7 @@ def interrupted(line: Sequence[str | Path], cwd: Path, in_the_middle: Callable[[
     """Exit code and stderr of a command interrupted, as by Ctrl-C, at a moment seen to be in the middle.
 
     The whole process group is stopped as soon as the moment seems to have come, looked at again while it stands still,
-    interrupted, and let go; if the moment has passed meanwhile, it goes on and the caller tries again (code 0).
+    interrupted, and let go; if the moment has passed meanwhile, the next one counts. Code 0: there was none, and it ended.
     """
     process = subprocess.Popen(
         list(map(str, line)), cwd=cwd, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
@@ -460,10 +460,11 @@ def interrupted(line: Sequence[str | Path], cwd: Path, in_the_middle: Callable[[
         if in_the_middle():
             os.killpg(process.pid, signal.SIGSTOP)
             time.sleep(0.05)  # every process has stood still by then
-            if in_the_middle():
+            if hit := in_the_middle():
                 os.killpg(process.pid, signal.SIGINT)
             os.killpg(process.pid, signal.SIGCONT)
-            break
+            if hit:
+                break
         time.sleep(0.0005)
     _, stderr = process.communicate(timeout=WAIT_S)
     return process.returncode, stderr
@@ -482,33 +483,34 @@ def partial(folder: Path) -> bool:
 
 
 @pytest.mark.parametrize("count", [1, 3], ids=["one", "in processes"])
-def test_ctrl_c_in_the_middle_of_convert_leaves_whole_logs_only(tmp_path: Path, command: str, count: int) -> None:
+def test_ctrl_c_in_the_middle_of_convert_leaves_whole_logs_only(on_disk: Path, command: str, count: int) -> None:
     for seed in range(count):
-        write_asl(flight(seed, duration_s=30.0), tmp_path / "src" / f"s{seed}")
-    before = digests(tmp_path / "src")
+        write_asl(flight(seed, duration_s=30.0), on_disk / "src" / f"s{seed}")
+    before = digests(on_disk / "src")
     for _ in range(TRIES):
         line = [command, "convert", "src", "out", "--overwrite", "--workers", "2", "-q"]
-        (tmp_path / "out").mkdir(exist_ok=True)
-        code, stderr = interrupted(line, tmp_path, lambda: partial(tmp_path / "out"))
+        (on_disk / "out").mkdir(exist_ok=True)
+        code, stderr = interrupted(line, on_disk, lambda: partial(on_disk / "out"))
         if code:
             break
     assert_interrupted(code, stderr, "Nothing half-written")
-    for path in (tmp_path / "out").iterdir():
+    for path in (on_disk / "out").iterdir():
         assert path.suffix == ".mcap"
         with Log(path) as log:
             assert log.topics["/imu0"].count == 6001
-    assert digests(tmp_path / "src") == before
+    assert digests(on_disk / "src") == before
 
 
-def test_ctrl_c_in_the_middle_of_debias_leaves_nothing(here: Path, command: str) -> None:
-    before = digests(here)
+def test_ctrl_c_in_the_middle_of_debias_leaves_nothing(on_disk: Path, logs: Path, command: str) -> None:
+    shutil.copy(logs / "flight_2.mcap", on_disk)
+    before = digests(on_disk)
     for _ in range(TRIES):
-        code, stderr = interrupted([command, "debias", "flight_2.mcap", "out.mcap", "-q"], here, lambda: partial(here))
+        code, stderr = interrupted([command, "debias", "flight_2.mcap", "out.mcap", "-q"], on_disk, lambda: partial(on_disk))
         if code:
             break
-        (here / "out.mcap").unlink()
+        (on_disk / "out.mcap").unlink()
     assert_interrupted(code, stderr, "Nothing half-written")
-    assert digests(here) == before
+    assert digests(on_disk) == before
 
 
 def test_ctrl_c_in_the_middle_of_training_leaves_a_checkpoint_that_resume_takes_up(

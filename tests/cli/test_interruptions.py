@@ -39,6 +39,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 CONFIG, LOST, INTERRUPTED, TERMINATED, KILLED = 3, 3, 130, 143, -signal.SIGKILL
 WAIT_S, POLL_S, TRIES = 60.0, 0.002, 10
+STILL_S = 0.05  # every process of a session has stood still by then
 SOON_S, SLACK_S = 2.0, 3.0  # after SIGTERM, for a process and all its children; for a machine busy with other tests
 DISK_BYTES = 1500  # less than any output here
 BRIEF_S = 13.0  # of which three at rest
@@ -71,6 +72,11 @@ def made(tmp_path_factory: pytest.TempPathFactory, logs: Path) -> Path:
     write_asl(flight(3, duration_s=8.0), folder / "seq")
     shutil.copy(logs / "flight_1.mcap", folder / "in.mcap")
     return folder
+
+
+@pytest.fixture
+def tmp_path(on_disk: Path) -> Path:
+    return on_disk
 
 
 @pytest.fixture
@@ -113,15 +119,18 @@ def started(words: Sequence[str], cwd: Path) -> Forked:
 def stopped(process: Forked | subprocess.Popen[str], folder: Path, number: signal.Signals) -> tuple[int | None, str, float]:
     """Exit code, stderr and time to the end of a command that a signal hits while its partial file is there.
 
-    The process stands still while this is looked at. Code 0: the moment passed between two looks, and it ended.
+    The process stands still while this is looked at again. Code 0: the moment passed between two looks, and it ended.
     """
-    deadline = time.monotonic() + WAIT_S
-    while process.poll() is None and not partials(folder) and time.monotonic() < deadline:
+    deadline, hit = time.monotonic() + WAIT_S, False
+    while process.poll() is None and not hit and time.monotonic() < deadline:
+        if partials(folder):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGSTOP)
+                time.sleep(STILL_S)
+                if hit := bool(partials(folder)):
+                    os.kill(process.pid, number)
+                os.killpg(process.pid, signal.SIGCONT)
         time.sleep(POLL_S)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGSTOP)
-        os.kill(process.pid, number)
-        os.killpg(process.pid, signal.SIGCONT)
     began = time.monotonic()
     _, stderr = process.communicate(timeout=WAIT_S)
     return process.returncode, stderr, time.monotonic() - began
