@@ -20,7 +20,7 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature_drift import split_drift
+from imutool.bias.temperature_drift import rows_without_drift, with_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
@@ -45,6 +45,7 @@ from imutool.recording import seconds
 
 SUFFIX = "/debiased"
 CLEAN_RECORD = "imutool_clean"
+
 logger = logging.getLogger(__name__)
 
 
@@ -119,10 +120,8 @@ class Debiaser:
         if self._start_ns < 0 and len(t_ns):
             self._start_ns = int(t_ns[0])
         t_s = seconds(t_ns, self._start_ns)
-        drift, gyro, accel = split_drift(self._model, batch.stamp_ns, batch.gyro, batch.accel)
-        bias, covariance = self._estimator(t_s, gyro, accel)
-        if drift is not None and self._model.log_drift is not None:
-            bias, covariance = bias + drift, covariance + self._model.log_drift.covariance(batch.stamp_ns)
+        gyro, accel = rows_without_drift(self._model, batch.stamp_ns, batch.gyro, batch.accel)
+        bias, covariance = with_drift(self._model, batch.stamp_ns, *self._estimator(t_s, gyro, accel))
         if not (np.isfinite(bias).all() and np.isfinite(covariance).all()):
             raise ModelError("the model gives a bias that is not finite", where=self.source_topic, fix="Choose another `model`")
         total = covariance + self._white

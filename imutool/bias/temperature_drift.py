@@ -18,7 +18,8 @@ from imutool.sensor.signals import TEMPERATURE_TERMS
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
 MOST_BEYOND_K = 1.0  # beyond the trained range, before it counts as another one
 Rows3 = Float64[np.ndarray, "n 3"]
-Drift = Float64[np.ndarray, "n 6"] | None
+Rows6 = Float64[np.ndarray, "n 6"]
+Stamps = Int64[np.ndarray, " n"]
 
 
 class TemperatureDrift:
@@ -152,15 +153,22 @@ def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
     return bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
 
 
-def split_drift(model: BiasModel, t_ns: Int64[np.ndarray, " n"], gyro: Rows3, accel: Rows3) -> tuple[Drift, Rows3, Rows3]:
-    """Drift that a model follows in its log, None for most models, and samples without it."""
+def rows_without_drift(model: BiasModel, t_ns: Stamps, gyro: Rows3, accel: Rows3) -> tuple[Rows3, Rows3]:
+    """Gyro and accel without the drift that a model follows in their log."""
     if model.log_drift is None:
-        return None, gyro, accel
+        return gyro, accel
     drift = model.log_drift(t_ns)
-    return drift, gyro - drift[:, :3], accel - drift[:, 3:]
+    return gyro - drift[:, :3], accel - drift[:, 3:]
 
 
 def without_drift(model: BiasModel, imu: Imu) -> Imu:
     """Samples without the drift that a model follows in their log."""
-    _, gyro, accel = split_drift(model, imu.t_ns, imu.gyro, imu.accel)
+    gyro, accel = rows_without_drift(model, imu.t_ns, imu.gyro, imu.accel)
     return imu if model.log_drift is None else Imu(imu.t_ns, gyro, accel)
+
+
+def with_drift(model: BiasModel, t_ns: Stamps, bias: Rows6, covariance: Covariances) -> tuple[Rows6, Covariances]:
+    """Bias and covariance of samples without the drift, with that of the drift added."""
+    if model.log_drift is None:
+        return bias, covariance
+    return bias + model.log_drift(t_ns), covariance + model.log_drift.covariance(t_ns)

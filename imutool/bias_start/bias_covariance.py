@@ -25,7 +25,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS, BiasEstimate, BiasModel, Covariances
-from imutool.bias.temperature_drift import split_drift
+from imutool.bias.temperature_drift import with_drift, without_drift
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.geometry.quaternion import unit
 from imutool.inertial.error_growth import BiasCovariance, Grown, Motion, grown, pose_errors
@@ -106,12 +106,11 @@ class Judged:
         self, model: BiasModel, start: InitialBias, imu: Imu, truth: Poses, pose_std: Float64[np.ndarray, "6"] | None = None
     ) -> None:
         t_s, u = seconds(imu.t_ns, int(imu.t_ns[0])), np.concatenate([imu.gyro, imu.accel], axis=1)
-        drift, gyro, accel = split_drift(model, imu.t_ns, imu.gyro, imu.accel)
+        steady = without_drift(model, imu)
         poses, trusted = with_velocity(truth).at(imu.t_ns)
         assert poses.v_w is not None
-        self.bias, rest, self.roots = BiasEstimator(model, start).parts(t_s, gyro, accel)
-        if drift is not None and model.log_drift is not None:
-            self.bias, rest = self.bias + drift, rest + model.log_drift.covariance(imu.t_ns)
+        self.bias, rest, self.roots = BiasEstimator(model, start).parts(t_s, steady.gyro, steady.accel)
+        self.bias, rest = with_drift(model, imu.t_ns, self.bias, rest)
         self.motion = Motion(t_s, u - self.bias, unit(poses.q_wb_wxyz), poses.v_w, trusted)
         self.stated = BiasCovariance(rest, _stacked(self.roots, len(t_s)))
         self._noise = np.where(model.noise_std > 0, model.noise_std, start.noise)

@@ -16,7 +16,7 @@ from imutool.array_types import Float64, Int64
 from imutool.bias import static
 from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature_drift import bound, split_drift, without_drift
+from imutool.bias.temperature_drift import bound, rows_without_drift, without_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
@@ -214,7 +214,7 @@ class _Batches:
         for batch, t_ns in _imu_batches(self.log, self.topic, self.survey):
             if len(t_ns):
                 start_ns = int(t_ns[0]) if start_ns is None else start_ns
-                _, gyro, accel = split_drift(self.model, batch.stamp_ns, batch.gyro, batch.accel)
+                gyro, accel = rows_without_drift(self.model, batch.stamp_ns, batch.gyro, batch.accel)
                 yield seconds(t_ns, start_ns), gyro, accel
 
 

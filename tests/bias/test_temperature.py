@@ -16,6 +16,7 @@ import torch
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.writer import Writer as Ros2Writer
+from support.robot_cases.log import DEFINITIONS
 
 import imutool
 from imutool.bias.io import load, save
@@ -43,17 +44,7 @@ CENTRE, HALF = 30.0, 10.0
 CHANNEL = "/imu0/temperature"
 SAME = 1e-12  # rounding of sums
 STORED = 1e-6  # a model file holds float32
-TEMPERATURE = """std_msgs/Header header
-float64 temperature
-float64 variance
-===
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-===
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec""".replace("===", 80 * "=")
+TEMPERATURE = DEFINITIONS["sensor_msgs/msg/Temperature"].replace("===", 80 * "=")
 SIZE = 0.01  # rad/s from the centre to the end of the range
 
 

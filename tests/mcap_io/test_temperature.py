@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer
+from support.robot_cases.log import DEFINITIONS
 
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
@@ -15,18 +16,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording, Scalars
 
 START_NS, RATE_HZ = 1_700_000_000_000_000_000, 10
-HEADER = "std_msgs/Header header\n"
-TEMPERATURE = """std_msgs/Header header
-float64 temperature
-float64 variance
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec"""
+TEMPERATURE = DEFINITIONS["sensor_msgs/msg/Temperature"]
 
 
 def ros_log(path: Path, celsius: np.ndarray, late_ns: int = 40_000_000) -> None:

@@ -37,7 +37,7 @@ def temperature_scale(recordings: Sequence[Recording], channel: str = "", *, wan
     known = [each for each in found if each is not None and channel in ("", each[0])]
     missing = ", ".join(recording.name for recording, each in zip(recordings, found, strict=True) if each not in known)
     if missing and (channel or wanted):
-        fix = f"They have {', '.join(recordings[0].scalars) or 'no scalar channel'}"
+        fix = f"Name a channel that all logs have; {recordings[0].name} has {', '.join(recordings[0].scalars) or 'none'}"
         raise ConfigError(f"{channel or 'a temperature'} is not in {missing}", where="model.temperature", fix=fix)
     if missing:
         several = [name for name in recordings[0].scalars if is_temperature(name)]
