@@ -4,7 +4,9 @@ DIAGNOSIS is the folder of `imutool diagnose` on other recordings of the sensor;
 of each LOG an IMU is simulated as a twin (physics.toml and noise.toml of the diagnosis), with the physics and a data sheet's
 noise, and ideal with a data sheet's noise. Windows of a second are told from the recorded ones by gradient boosted trees on
 their mean, size, differences, tails and spectrum, by axis, trained on other blocks of ten seconds. AUC 0.5 is a guess, 1 a
-certainty. Needs scikit-learn, which is no dependency of the project.
+certainty. `--drawn` names the recordings of the diagnosis: what they leave of the physics is drawn again, in pieces of 2 s of
+a similar motion, in place of the twin's noise. No model of that noise can be expected to do better along these poses.
+Needs scikit-learn, which is no dependency of the project.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from imutool.recording import Imu
 from imutool.sensor.simulate import simulate
 
 WINDOW_S, BLOCK_S, FOLDS = 1.0, 10.0, 5
+PIECE_S, NEAREST = 2.0, 10  # of the noise that is drawn again, and among how many of the most similar motion
 EDGES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.01)  # of the spectrum's bands, over Nyquist
 
 
@@ -64,24 +67,74 @@ def windows(real: Imu, made: Imu) -> Float64[np.ndarray, " w"]:
     return begins[whole].astype(float)
 
 
+Pieces = list[tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "n 6"]]]  # motion of each, and its noise
+
+
+def pieces(real: Imu, made: Imu) -> Pieces:
+    """What a recording leaves of its noise-free simulation, by motion, in overlapping pieces without a gap."""
+    t_ns, expected = made.t_ns, np.concatenate([made.gyro, made.accel], axis=1)
+    recorded = np.concatenate([real.gyro, real.accel], axis=1)
+    nearest = np.clip(np.searchsorted(real.t_ns, t_ns - int(real.period_s * 5e8)), 0, len(real) - 1)
+    at_ns = real.t_ns[nearest].astype(float)
+    left = recorded[nearest] - np.stack([np.interp(at_ns, t_ns, column) for column in expected.T], axis=1)
+    count, found = round(PIECE_S / made.period_s), []
+    for first in range(0, len(left) - count, count // 4):
+        rows = slice(first, first + count)
+        apart_ns = np.abs(at_ns[rows] - t_ns[rows]).max()
+        if t_ns[rows][-1] - t_ns[rows][0] < 1.02e9 * PIECE_S and apart_ns < 1e9 * real.period_s:
+            found.append((motion(expected[rows], made.period_s), left[rows]))
+    return found
+
+
+def motion(expected: Float64[np.ndarray, "n 6"], period_s: float) -> Float64[np.ndarray, "2"]:
+    """Logarithm of the rms rate of change of gyro and accelerometer."""
+    rates = (np.diff(expected, axis=0) / period_s).reshape(-1, 2, 3)
+    return np.asarray(0.5 * np.log((rates**2).sum(axis=2).mean(axis=0)))
+
+
+def drawn(made: Imu, library: Pieces) -> Imu:
+    """Noise-free simulation with noise of pieces of a similar motion, faded into each other at constant power."""
+    rng, expected = np.random.default_rng(0), np.concatenate([made.gyro, made.accel], axis=1)
+    motions, out = np.array([of for of, _ in library]), expected.copy()
+    count = len(library[0][1])
+    fade = np.sin(np.pi * (np.arange(count) + 0.5) / count)[:, None]
+    for first in range(-count // 2, len(out) - 2, count // 2):
+        rows = np.arange(max(first, 0), min(first + count, len(out)))
+        near = np.argsort(((motions - motion(expected[rows], made.period_s)) ** 2).sum(axis=1))[:NEAREST]
+        out[rows] += (fade * library[rng.choice(near)][1])[rows - first]
+    return Imu(made.t_ns, out[:, :3], out[:, 3:])
+
+
 def main() -> None:
     """A line for each log."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
     parser.add_argument("diagnosis", type=Path)
     parser.add_argument("logs", type=Path, nargs="+")
     parser.add_argument("--sheet", default="adis16448")
+    parser.add_argument("--drawn", type=Path, nargs="+", default=[])
     options = parser.parse_args()
     physics, noise = options.diagnosis / "physics.toml", options.diagnosis / "noise.toml"
+    library = [piece for log in options.drawn for piece in pieces(read(log).imu, simulated(log, physics, "none"))]
     for log in options.logs:
-        real, told = read(log).imu, []
-        with tempfile.TemporaryDirectory() as folder:
-            for k, (with_physics, with_noise) in enumerate(((physics, noise), (physics, options.sheet), (None, options.sheet))):
-                made = simulate(log, Path(folder) / f"{k}.mcap", physics=with_physics, noise=with_noise, seed=1).recording.imu
-                begins = windows(real, made)
-                told.append(auc(features(real, begins), features(made, begins)))
-        twin, half, sheet = told
-        print(f"{log.stem}: {len(begins)} windows; AUC of the twin {twin:.2f}, physics with {options.sheet} {half:.2f}, "
-              f"{options.sheet} alone {sheet:.2f}", flush=True)  # fmt: skip
+        real = read(log).imu
+        makes = {
+            "the twin": simulated(log, physics, noise),
+            f"physics with {options.sheet}": simulated(log, physics, options.sheet),
+            f"{options.sheet} alone": simulated(log, None, options.sheet),
+        }
+        if library:
+            makes["physics with noise drawn again"] = drawn(simulated(log, physics, "none"), library)
+        told = []
+        for name, made in makes.items():
+            begins = windows(real, made)
+            told.append(f"{name} {auc(features(real, begins), features(made, begins)):.2f}")
+        print(f"{log.stem}: {len(begins)} windows; AUC of {', '.join(told)}", flush=True)
+
+
+def simulated(log: Path, physics: Path | None, noise: str | Path) -> Imu:
+    """IMU along the poses of a log."""
+    with tempfile.TemporaryDirectory() as folder:
+        return simulate(log, Path(folder) / "made.mcap", physics=physics, noise=noise, seed=1).recording.imu
 
 
 if __name__ == "__main__":
