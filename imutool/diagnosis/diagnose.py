@@ -53,6 +53,7 @@ from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
+from imutool.sensor.effects import clock_wander
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 Tell = Callable[[int, int, str], None]
@@ -206,9 +207,12 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     def thinkable(effect: Effect) -> bool:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in effect.needs)
 
-    effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in SHOWN_BY_SAMPLES]
-    biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
+    left_out = {*SHOWN_BY_SAMPLES, *([clock_wander.EFFECT.name] if exact else ())}  # one clock cannot wander against itself
+    effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
+    end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
+    effects = [clock_wander.until(end_s) if effect.name == clock_wander.EFFECT.name else effect for effect in effects]
+    biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     return (*effects, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))
 
 

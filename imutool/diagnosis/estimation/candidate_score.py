@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,9 @@ RIDGE = 1e-9
 FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
-CLOCK = "clock_skew", "clock_jump"
+CLOCK = SKEW, JUMP = "clock_skew", "clock_jump"
+WANDER = "clock_wander"
+PART_OF = {WANDER: ("clock_offset", SKEW)}  # what an effect has within it
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
@@ -151,10 +154,10 @@ class CandidateScore:
 
 
 def _exclude(a: Effect, b: Effect) -> bool:
-    """Whether two effects never act together: variants of one catalogue effect on one sensor."""
+    """Whether two effects never act together: variants of one catalogue effect on one sensor, or one is part of the other."""
     one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
     variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
-    return a.key == b.key or variants
+    return a.key == b.key or variants or a.name in PART_OF.get(b.name, ()) or b.name in PART_OF.get(a.name, ())
 
 
 class Scored(NamedTuple):
@@ -231,13 +234,26 @@ class Candidates:
         """
         clock = {effect.name: effect for effect in named if effect.name in CLOCK}
         first = best.chosen[-1][0].name
-        if len(clock) < len(CLOCK) or first not in CLOCK or any(effect.name in CLOCK for effect, _ in now.chosen):
+        if len(clock) < len(CLOCK) or first not in CLOCK or any(effect.name in (*CLOCK, WANDER) for effect, _ in now.chosen):
             return best
         skew, jump = (clock[name] for name in CLOCK)
         both = (skew, skew.null_value.astype(float)), (jump, self.starts[jump.key][-1])
         trial = fit(self.logs, (*now.chosen, *both), near=now)
         second = jump if first == skew.name else skew
         return trial if self.log_p(second, best.objective - trial.objective) < threshold else best
+
+    def steadier_clock(self, now: Fit, named: Sequence[Effect]) -> Fit:
+        """The fit with two of offset, skew and jump in place of a clock that wanders, where they do as well."""
+        others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
+        if len(others) == len(now.chosen):
+            return now
+        steady = [effect for effect in named if effect.name in ("clock_offset", *CLOCK) and effect.key not in now.keys]
+        fits = [now]
+        for pair in combinations(steady, 2):
+            on_trend = any(effect.name == SKEW for effect in pair)
+            starts = [self.starts[e.key][-1 if on_trend else 0] if e.name == JUMP else e.null_value.astype(float) for e in pair]
+            fits.append(fit(self.logs, (*others, *zip(pair, starts, strict=True)), near=now))
+        return min(fits, key=bic)
 
     def _derived(self, now: Fit) -> dict[str, list[_Linear]]:
         """Candidates derived beside fits with the same filters; those of the last few such sets are kept."""

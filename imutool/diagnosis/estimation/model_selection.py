@@ -191,7 +191,7 @@ class _Search:
         for key in [effect.key for effect, _ in now.chosen if effect.kind == "unknown"]:
             rivals = self._rivals(now.keys.index(key), now).values()  # a name that leaves no more says more
             now = next((trial for trial in rivals if trial.objective < now.objective), now)
-        return self._without_arms(self._without_low_pass(now))
+        return self._without_arms(self._without_low_pass(self.candidates.steadier_clock(now, self.named)))
 
     def _without_low_pass(self, now: Fit) -> Fit:
         """Fit with a clock offset instead of a low pass beyond the poses' band, which only its delay shows."""

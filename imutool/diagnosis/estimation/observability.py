@@ -17,7 +17,7 @@ from imutool.sensor.effect import Effect, Theta
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_jump", "low_pass", "mount_resonance")}
 """What delays, rings or jumps needs the motion that shows a delay."""
-CLOCKS = ("clock_offset", "clock_skew", "clock_jump")
+CLOCKS = ("clock_offset", "clock_skew", "clock_jump", "clock_wander")
 FILTERS = ("low_pass", "mount_resonance")
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 

@@ -64,7 +64,7 @@ class Quantity:
 def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
     """Quantities of parameters, those of one vector or matrix together.
 
-    `x`, `y`, `z` (or `tilt_x`, `tilt_y`; `xy`, `yx`) of a unit are one quantity.
+    `x`, `y`, `z` (or `tilt_x`, `tilt_y`; `xy`, `yx`; `at_0`, `at_30`) of a unit are one quantity.
 
     What is infinite is left out: a limit or a cut-off that is never reached.
     """
@@ -72,7 +72,7 @@ def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
     for key, estimate in estimates.items():
         if math.isinf(estimate.value):
             continue
-        match = re.fullmatch(r"(?P<stem>.*?)[._]?(?:[xyz][._]?[xyz]|[xyz])", key)
+        match = re.fullmatch(r"(?P<stem>.*?)[._]?(?:[xyz][._]?[xyz]|[xyz]|(?<=^at_)\d+)", key)
         taken.setdefault((match["stem"] if match else key, estimate.unit), []).append(key)
     out = []
     for (stem, _), keys in taken.items():
