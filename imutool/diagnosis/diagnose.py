@@ -210,10 +210,15 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     left_out = {*SHOWN_BY_SAMPLES, *([clock_wander.EFFECT.name] if exact else ())}  # one clock cannot wander against itself
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
-    end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
-    effects = [clock_wander.until(end_s) if effect.name == clock_wander.EFFECT.name else effect for effect in effects]
+    effects = _until_the_end(effects, pairs)
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     return (*effects, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))
+
+
+def _until_the_end(effects: Sequence[Effect], pairs: Sequence[Pair]) -> list[Effect]:
+    """Effects with the knots that the longest log has."""
+    end_s, wander = max(float(pair.stamp_s[-1]) for pair in pairs), clock_wander.EFFECT.name
+    return [clock_wander.until(end_s) if effect.name == wander else effect for effect in effects]
 
 
 def unnamed_candidates(pairs: Sequence[Pair]) -> list[tuple[Effect, ...]]:
@@ -265,7 +270,7 @@ def effect_sizes(
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]
-    wanted = catalogue.diagnosed(effects)
+    wanted = _until_the_end(catalogue.diagnosed(effects), pairs)
     hidden = set(unobservable(logs, wanted, settings.search))
     observable = []
     for effect in wanted:

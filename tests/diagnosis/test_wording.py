@@ -23,9 +23,9 @@ from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
     "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
-    "clock_offset", "clock_skew", "clock_jump", "low_pass", "saturation", "quantization", "gravity", "earth_rotation",
-    "vibration", "mount_resonance", "temperature", "dropped_samples", "timestamp_jitter", "reference_error", "driven",
-    "unknown", "gain", "offset", "delay", "dead_band", "drift", "friction",
+    "clock_offset", "clock_skew", "clock_jump", "clock_wander", "low_pass", "saturation", "quantization", "gravity",
+    "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples", "timestamp_jitter",
+    "reference_error", "driven", "unknown", "gain", "offset", "delay", "dead_band", "drift", "friction",
 ]  # fmt: skip
 # An uncertainty keeps one digit between 1.95 and 9.5, else two: a number moves by at most this share of it.
 ROUNDED = 0.26
@@ -277,6 +277,17 @@ def test_a_jump_says_when_and_how_far() -> None:
     jump = {"t_jump": Estimate(31.02, 0.05, "s"), "step": Estimate(0.02, 0.0004, "s")}
     assert named_sentence(diagnoses.ARM, finding("clock_jump", jump)) == (
         "the clock of the recording jumps by 20.0 ± 0.4 ms at 31.02 ± 0.05 s (clock_jump)"
+    )
+
+
+def test_a_clock_that_wanders_says_from_where_to_where() -> None:
+    offsets = {
+        "at_0": Estimate(2.73e-3, 1.1e-4, "s"),
+        "at_30": Estimate(6.8e-4, 6e-5, "s"),
+        "at_60": Estimate(-5.5e-4, 6e-5, "s"),
+    }
+    assert named_sentence(diagnoses.ARM, finding("clock_wander", offsets)) == (
+        "the clock of the recording wanders, by -0.55 ± 0.06 ms to 2.73 ± 0.11 ms (clock_wander)"
     )
 
 

@@ -15,6 +15,7 @@ from imutool import registry
 from imutool.errors import ConfigError, DataError
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Stage, distort
+from imutool.sensor.effects import clock_wander
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import SLOW_S
 
@@ -166,7 +167,16 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
     sensor = ("scale", "misalignment", "quadratic", "bias_drift")
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
-    expected |= {"clock_offset", "clock_skew", "clock_jump", "saturation", "quantization", "earth_rotation", "vibration"}
+    expected |= {
+        "clock_offset",
+        "clock_skew",
+        "clock_jump",
+        "clock_wander",
+        "saturation",
+        "quantization",
+        "earth_rotation",
+        "vibration",
+    }
     expected |= {"temperature", "vibration_rectification"}
     assert {one.name for one in catalogue.diagnosed()} == expected
     assert {one.name for one in catalogue.effects()} == expected | {
@@ -365,6 +375,23 @@ def test_a_clock_jumps_once() -> None:
     late = stamp_s >= 6.0 - 1e-9  # of the log, whatever part of it is looked at
     assert np.count_nonzero(~late) == 1000
     close(out.gyro[:, 2], np.sin(4.0 * np.pi * (stamp_s + step * late)), SPLINE)
+
+
+def test_a_clock_wanders_straight_from_knot_to_knot() -> None:
+    felt = sine(2.0)
+    stamp_s = felt.t_s[200:-200]
+    offsets_s = np.zeros(len(clock_wander.KNOTS_S))
+    offsets_s[:2] = 0.004, 0.010
+    out = simulate_samples(felt, stamp_s, [(only("clock_wander"), offsets_s)])
+    close(out.gyro[:, 2], np.sin(4.0 * np.pi * (stamp_s + 0.004 + 0.006 * stamp_s / 30.0)), SPLINE)
+
+
+def test_a_clock_that_wanders_has_knots_for_the_length_of_a_log_and_holds_its_last_offset() -> None:
+    effect = clock_wander.until(61.0)
+    assert [parameter.name for parameter in effect.parameters] == ["at_0", "at_30", "at_60", "at_90"]
+    taken_s = effect.forward(np.array([45.0, 90.0, 120.0]), np.array([0.0, 0.0, 0.002, -0.001]))
+    assert taken_s == pytest.approx([45.001, 89.999, 119.999])
+    assert clock_wander.until(1e6).parameters == clock_wander.EFFECT.parameters
 
 
 def test_a_jump_is_found_where_it_is() -> None:

@@ -77,8 +77,9 @@ def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
 
 
 def catalogue() -> tuple[Effect, ...]:
-    """All that a fit can find without another channel of the log."""
-    return tuple(one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in SHOWN_BY_SAMPLES)
+    """All that a fit can find beside a simulation, without another channel of the log."""
+    others = {*SHOWN_BY_SAMPLES, "clock_wander"}
+    return tuple(one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in others)
 
 
 def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:

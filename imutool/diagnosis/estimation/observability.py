@@ -15,8 +15,10 @@ from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
-NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {"clock_offset": ("clock_skew", "clock_jump", "low_pass", "mount_resonance")}
-"""What delays, rings or jumps needs the motion that shows a delay."""
+NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {
+    "clock_offset": ("clock_skew", "clock_jump", "clock_wander", "low_pass", "mount_resonance")
+}
+"""What delays, rings, jumps or wanders needs the motion that shows a delay."""
 CLOCKS = ("clock_offset", "clock_skew", "clock_jump", "clock_wander")
 FILTERS = ("low_pass", "mount_resonance")
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
@@ -36,7 +38,7 @@ def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], sett
     out: list[str] = []
     names = {effect.name for effect in candidates}
     for effect in candidates:
-        if not _proportional(effect):
+        if not _proportional(effect) or effect.name == "clock_wander":  # its knots where nothing moves are no news
             continue
         gains = zip(effect.parameters, _gains(logs, effect), strict=True)
         hidden = [parameter.name for parameter, gain in gains if gain < settings.observable_squares]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from imutool.diagnosis.result import Diagnosis, Finding
-from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped, value
+from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,6 @@ def _clock_jump(w: Words) -> str:
     """When, and by how much."""
     how_far = f" by {w.rest[0]}" if w.rest else ""
     return f"the clock of the recording jumps{how_far} at {w.main}"
-
-
-def _clock_wander(w: Words) -> str:
-    """Between which offsets."""
-    least, most = (value(f(w.main.estimates, key=lambda e: e.value)) for f in (min, max))
-    return f"the clock of the recording wanders between {least} and {most}"
 
 
 def _driven(w: Words) -> str:
@@ -103,7 +97,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "clock_offset": _clock_offset,
     "clock_skew": _clock_skew,
     "clock_jump": _clock_jump,
-    "clock_wander": _clock_wander,
+    "clock_wander": "the clock of the recording wanders, by {w.main}",
     "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",

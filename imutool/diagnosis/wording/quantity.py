@@ -27,16 +27,19 @@ PLAIN_FROM, PLAIN_BELOW = 1e-2, 1e5  # outside, a power of ten is taken out in f
 
 @dataclass(frozen=True)
 class Quantity:
-    """Parameters of one vector or matrix: label, axes and estimates."""
+    """Parameters of one vector, matrix or course in time: label, axes (or seconds) and estimates."""
 
     label: str
     axes: tuple[str, ...]
     estimates: tuple[Estimate, ...]
 
     def __str__(self) -> str:
-        """`12.4 ± 0.3 ms`, `(0.213, -0.051, 0.120) ± 0.004 m`, or the clearest three of many."""
+        """`12.4 ± 0.3 ms`, `(0.213, -0.051, 0.120) ± 0.004 m`, the clearest three of many, or the ends of a course."""
         if len(self.estimates) == 1:
             return value(self.estimates[0])
+        if self.axes[0].isdigit():
+            least, most = (value(extreme(self.estimates, key=lambda e: e.value)) for extreme in (min, max))
+            return f"{least} to {most}"
         if self.axes == AXES:
             return vector(self.estimates)
         clearest = sorted(range(len(self.axes)), key=lambda k: -_clearness(self.estimates[k]))[:SHOWN]
@@ -80,7 +83,7 @@ def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
             out.append(Quantity(keys[0], (keys[0],), (estimates[keys[0]],)))
         else:
             axes = tuple(key[len(stem) :].lstrip("._") for key in keys)
-            out.append(Quantity(stem, axes, tuple(estimates[key] for key in keys)))
+            out.append(Quantity("" if axes[0].isdigit() else stem, axes, tuple(estimates[key] for key in keys)))
     return out
 
 

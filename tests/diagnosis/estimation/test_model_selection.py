@@ -19,6 +19,7 @@ from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.settings import SearchSettings
+from imutool.sensor.effects import clock_wander
 
 SURE = 4.0
 DURATION_S = 20.0
@@ -272,6 +273,31 @@ def test_a_clock_that_runs_fast_and_jumps_shows_both(seed: int, eps: float, t_ju
     assert sorted(names(found)) == ["clock_jump", "clock_skew"]
     assert sure(found, "clock_skew", [eps])
     assert sure(found, "clock_jump", [t_jump, step])
+
+
+OFFSETS_S = [0.003, 0.001, -0.002, 0.002, *[0.002] * (len(clock_wander.KNOTS_S) - 4)]
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        {"clock_wander": OFFSETS_S},
+        {"clock_offset": [2e-3], "clock_skew": [3e-5]},
+        {"clock_offset": [-2e-3], "clock_jump": [40.3, 4e-3]},
+        {"clock_jump": [40.3, 4e-3]},
+        {"clock_skew": [5e-5]},
+    ],
+    ids="+".join,
+)
+def test_a_clock_wanders_beside_poses_only_where_offset_skew_and_jump_do_not_say_it(truth: dict[str, list[float]]) -> None:
+    duration_s = 90.0
+    pair = planted.pair(planted.shaken(2, duration_s), {**truth, "gyro_scale": [0.02, -0.03, 0.01]}, 4)
+    candidates = (*planted.catalogue(), clock_wander.until(duration_s))
+    found = select_effects([planted.weighed(replace(pair, against="true poses", band_hz=7.0))], candidates)
+    assert sorted(names(found)) == sorted([*truth, "gyro_scale"])
+    for name, theta in truth.items():
+        knots = len(clock_wander.until(duration_s).parameters)
+        assert sure(found, name, theta[:knots] if name == "clock_wander" else theta)
 
 
 def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
