@@ -38,7 +38,7 @@ from imutool.diagnosis.reference_coverage import (
     with_unique_names,
     without_unusable,
 )
-from imutool.diagnosis.reference_errors import reference_caveat, reference_errors, turned_reference
+from imutool.diagnosis.reference_errors import SMOOTHED, reference_caveat, reference_errors, turned_reference
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import with_signals
@@ -212,7 +212,8 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
     effects = _until_the_end(effects, pairs)
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
-    return (*effects, *(timestamps.jitter(pairs) if exact else ()), *timestamps.soft_limits(pairs, biases))
+    of_reference = timestamps.jitter(pairs) if exact else (SMOOTHED,)
+    return (*effects, *of_reference, *timestamps.soft_limits(pairs, biases))
 
 
 def _until_the_end(effects: Sequence[Effect], pairs: Sequence[Pair]) -> list[Effect]:

@@ -1,4 +1,4 @@
-"""Errors of a reference: short wrong intervals, and an attitude that is turned throughout.
+"""Errors of a reference: short wrong intervals, smoothed poses, and an attitude that is turned throughout.
 
 Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
 and leaves no trace, so where all the rest is noise, the reference is wrong.
@@ -6,11 +6,15 @@ and leaves no trace, so where all the rest is noise, the reference is wrong.
 Poses that were estimated with the gyro follow it from one second to the next, and their own sensor over many. If that sensor
 is misaligned, R_ref = R_wb Exp(turned): means of the gyro over seconds are turned by Exp(turned), fast motion is not. No
 mount does that, which turns slow and fast motion alike.
+
+Poses that were smoothed turn and move less than the body where that is fast. To first order a symmetric filter of variance s²
+takes s²/2 times the second derivative; without it, a gyro beside such poses seems to have a scale.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -23,6 +27,8 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import ReferenceSettings
 from imutool.recording import Recording
 from imutool.sensor import catalogue
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.samples import IdealMotion
 from imutool.units import ASCII_UNITS, AXES, SENSORS
 
 CLEAR = 3.0  # deviations from which a component of the rotation counts
@@ -110,6 +116,27 @@ def reference_caveat(recordings: Sequence[Recording]) -> str:
     if any("and IMU measurements" in text for text in texts):
         return "its poses were estimated with this IMU, and hide errors of the gyro"
     return next((recording.truth_caveat for recording in recordings if recording.truth_caveat), "")
+
+
+# ── smoothed poses ──
+
+
+def _sharpened(motion: IdealMotion, theta: Theta) -> IdealMotion:
+    columns = np.concatenate([motion.gyro, motion.accel], axis=1)
+    second = np.zeros_like(columns)
+    second[1:-1] = (columns[2:] - 2.0 * columns[1:-1] + columns[:-2]) * motion.rate_hz**2
+    return replace(motion, gyro=motion.gyro - theta[0] * second[:, :3], accel=motion.accel - theta[1] * second[:, 3:])
+
+
+SMOOTHED = Effect(
+    "reference_smoothing",
+    Stage.MOTION,
+    ("gyro", "accel"),
+    "omega -= turn d²omega/dt², f -= move d²f/dt²",
+    (Parameter("turn", "s^2", 1e-4), Parameter("move", "s^2", 1e-4)),
+    "it moves fast",
+    _sharpened,
+)
 
 
 # ── an attitude that is turned throughout ──

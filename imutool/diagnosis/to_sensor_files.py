@@ -19,7 +19,7 @@ from imutool.noise.datasheet import Noise
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
-NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error"})
+NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error", "reference_smoothing"})
 
 
 def to_physics_file(d: Diagnosis) -> PhysicsFile:

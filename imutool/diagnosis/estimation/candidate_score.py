@@ -22,7 +22,7 @@ UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wr
 UNLIKELY = -3.0  # log p-value above which they need not be right
 CLOCK = SKEW, JUMP = "clock_skew", "clock_jump"
 WANDER = "clock_wander"
-PART_OF = {WANDER: ("clock_offset", SKEW)}  # what an effect has within it
+PART_OF = {WANDER: ("clock_offset", SKEW), "reference_smoothing": ("low_pass",)}  # what an effect has within it
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
 

@@ -19,6 +19,7 @@ NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {
     "clock_offset": ("clock_skew", "clock_jump", "clock_wander", "low_pass", "mount_resonance")
 }
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
+NO_NEWS = ("clock_wander", "reference_smoothing")  # where they do not show: a clock's knots, and an error of no sensor
 CLOCKS = ("clock_offset", "clock_skew", "clock_jump", "clock_wander")
 FILTERS = ("low_pass", "mount_resonance")
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
@@ -38,7 +39,7 @@ def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], sett
     out: list[str] = []
     names = {effect.name for effect in candidates}
     for effect in candidates:
-        if not _proportional(effect) or effect.name == "clock_wander":  # its knots where nothing moves are no news
+        if not _proportional(effect) or effect.name in NO_NEWS:
             continue
         gains = zip(effect.parameters, _gains(logs, effect), strict=True)
         hidden = [parameter.name for parameter, gain in gains if gain < settings.observable_squares]

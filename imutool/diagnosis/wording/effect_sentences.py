@@ -109,6 +109,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "dropped_samples": "samples are missing, {w.main.labelled}",
     "timestamp_jitter": "samples are late by turns, {w.main.labelled}",
     "reference_error": _reference_error,
+    "reference_smoothing": "{w.other} are smoothed, and slower than the body, by {w.main.labelled}",
     "gain": "its gain is off by {w.main}",
     "offset": "{w.it} reads a constant {w.main} too much",
     "delay": _delay,
