@@ -261,7 +261,8 @@ def effect_sizes(
 ) -> EffectSizes:
     """Fit effects of the catalogue to a recording, significant or not.
 
-    Unobservable parameters are left out, for example the scale of a gyro axis that never turns.
+    Unobservable parameters are left out, for example the scale of a gyro axis that never turns. Beside poses their smoothing is
+    fitted too: it looks like a scale.
 
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
@@ -271,7 +272,7 @@ def effect_sizes(
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     candidates = candidates_for(pairs)
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]
-    wanted = _until_the_end(catalogue.diagnosed(effects), pairs)
+    wanted = [*_until_the_end(catalogue.diagnosed(effects), pairs), *(() if sim is not None else (SMOOTHED,))]
     hidden = set(unobservable(logs, wanted, settings.search))
     observable = []
     for effect in wanted:

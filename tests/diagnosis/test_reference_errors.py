@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,9 +11,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 from support import planted
 
+from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.reference_coverage import align
-from imutool.diagnosis.reference_errors import turned_reference
+from imutool.diagnosis.reference_errors import SMOOTHED, turned_reference
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.recording import Poses
@@ -43,6 +45,30 @@ def found(slow: float, fast: float) -> list[Finding]:
     mount = catalogue.diagnosed(["mount_rotation"])
     logs = [whitened(pair, mount, SETTINGS.band) for pair in align(log, None, None, SETTINGS)]
     return turned_reference(logs, (), SETTINGS.reference)
+
+
+SMOOTHED_S = 0.015
+
+
+@pytest.mark.parametrize("scale", [{}, {"gyro_scale": [0.01, -0.02, 0.015]}], ids=["alone", "beside a scale"])
+def test_smoothed_poses_are_told_from_a_scale_by_the_frequency(scale: dict[str, list[float]]) -> None:
+    felt = planted.shaken(2, DURATION_S)
+    pair = planted.pair(felt, scale, 1)
+    spread = SMOOTHED_S * felt.rate_hz
+    gyro, accel = (gaussian_filter1d(column, spread, axis=0) for column in (felt.gyro, felt.accel))
+    beside = replace(pair, against="true poses", band_hz=7.0, ideal=replace(felt, gyro=gyro, accel=accel))
+    found = select_effects([planted.weighed(beside)], (*planted.catalogue(), SMOOTHED)).selected
+    assert {one.effect.name for one in found} == {"reference_smoothing", *scale}
+    told = {one.effect.name: one for one in found}
+    smoothing = told["reference_smoothing"].theta
+    assert smoothing == pytest.approx([0.5 * SMOOTHED_S**2] * 2, rel=0.05)  # the rest is the fourth derivative
+    if scale:
+        assert told["gyro_scale"].theta == pytest.approx(scale["gyro_scale"], abs=5e-4)
+
+
+def test_poses_as_they_are_have_no_smoothing() -> None:
+    pair = replace(planted.pair(planted.shaken(2, DURATION_S), {}, 1), against="true poses", band_hz=7.0)
+    assert select_effects([planted.weighed(pair)], (*planted.catalogue(), SMOOTHED)).selected == ()
 
 
 def test_poses_that_are_turned_against_slow_motion_alone_are_wrong_by_that_rotation() -> None:
