@@ -60,8 +60,9 @@ def test_smoothed_poses_are_told_from_a_scale_by_the_frequency(scale: dict[str, 
     found = select_effects([planted.weighed(beside)], (*planted.catalogue(), SMOOTHED)).selected
     assert {one.effect.name for one in found} == {"reference_smoothing", *scale}
     told = {one.effect.name: one for one in found}
-    smoothing = told["reference_smoothing"].theta
-    assert smoothing == pytest.approx([0.5 * SMOOTHED_S**2] * 2, rel=0.05)  # the rest is the fourth derivative
+    smoothing, expected = told["reference_smoothing"], 0.5 * SMOOTHED_S**2
+    assert np.all(smoothing.std < 0.1 * expected)
+    assert np.all(np.abs(smoothing.theta - expected) < 4.0 * smoothing.std + 0.02 * expected)  # the rest: higher derivatives
     if scale:
         assert told["gyro_scale"].theta == pytest.approx(scale["gyro_scale"], abs=5e-4)
 
