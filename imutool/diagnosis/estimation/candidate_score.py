@@ -21,7 +21,7 @@ FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
 CLOCK = SKEW, JUMP = "clock_skew", "clock_jump"
-WANDER = "clock_wander"
+WANDER, STEADY = "clock_wander", ("clock_offset", *CLOCK)
 PART_OF = {WANDER: ("clock_offset", SKEW), "reference_smoothing": ("low_pass",)}  # what an effect has within it
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
@@ -247,7 +247,7 @@ class Candidates:
         others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
         if len(others) == len(now.chosen):
             return now
-        steady = [effect for effect in named if effect.name in ("clock_offset", *CLOCK) and effect.key not in now.keys]
+        steady = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys]
         fits = [now]
         for pair in combinations(steady, 2):
             on_trend = any(effect.name == SKEW for effect in pair)
@@ -276,6 +276,11 @@ class Candidates:
         gains = [(score.gain(effect, each), each.start) for each in linear]
         gain, start = max(gains, key=lambda pair: pair[0])
         return Scored(self.log_p(effect, gain), effect, start, gain)
+
+
+def worth_trying(ranked: Sequence[Scored], least: float) -> list[Scored]:
+    """Candidates without a clock that wanders by less than `least` squares: errors of poses last for seconds, as it does."""
+    return [scored for scored in ranked if scored.effect.name != WANDER or scored.gain > least]
 
 
 def unnamed_count(found: Fit) -> int:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, bic, unnamed_count
+from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, bic, unnamed_count, worth_trying
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
@@ -128,7 +128,8 @@ class _Search:
             self.trials_of, self.trials = now, {}
         allowed = self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
         best: tuple[float, Fit] | None = None
-        for promised, effect, start, _ in self.candidates.ranked(now, allowed, count)[:count]:
+        enough = self.settings.unnamed_share * (self.before - now.numbers)
+        for promised, effect, start, _ in worth_trying(self.candidates.ranked(now, allowed, count), enough)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
                 continue  # the score of a linear effect is its gain
             if effect.key not in self.trials:
@@ -142,7 +143,6 @@ class _Search:
             best = (log_p, trial) if best is None or log_p < best[0] else best
         if best is None or best[0] > self.threshold:
             return None
-        enough = self.settings.unnamed_share * (self.before - now.numbers)
         if unnamed_count(best[1]) and now.objective - best[1].objective < enough:
             return None  # the rim of something that has no name: a name for it would be wrong
         return self.candidates.jump_on_trend(now, best[1], self.named, self.threshold)
