@@ -131,6 +131,7 @@ def png(picture: Picture, heading: str) -> bytes:
             alone = part.subfigures(1, 1 if row[0].wide else columns, squeeze=False)[0]
             for place, panel in zip(alone, row, strict=False):
                 panel.draw(place)
+        _lay_out(figure)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
