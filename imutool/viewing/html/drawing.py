@@ -220,14 +220,13 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
 def _lay_out(figure: Any) -> None:
     """Place the axes once; `savefig` would draw everything an extra time to do so.
 
-    matplotlib asks everything again and again: which ticks an axis has, where their labels end, and in a second pass how far
-    labels reach beyond axes that have moved a little. It copies the style of the first tick, which the others have anyway.
+    matplotlib asks again and again which ticks an axis has, where labels end, and how far they reach beyond moved axes.
     """
     import matplotlib
 
-    plain = all(axes.get_aspect() == "auto" and axes.get_label() != "<colorbar>" for axes in figure.get_axes())
-    measured = figure.get_axes() if plain else []
-    for axes in figure.get_axes():
+    every = figure.get_axes()
+    measured = every if all(axes.get_aspect() == "auto" and axes.get_label() != "<colorbar>" for axes in every) else []
+    for axes in every:
         for axis in (axes.xaxis, axes.yaxis):
             axis._get_tick, axis._copy_tick_props = _copied(axis._get_tick), lambda *_: None
             axis._update_ticks = _remembered(axis, axis._update_ticks)
