@@ -134,7 +134,9 @@ class Trajectory:
 
 
 def fit_trajectory(poses: Poses) -> Trajectory:
-    """Trajectory through every true pose, with time from the first; noise of the poses counts 1/dt² in its second derivative.
+    """Spline trajectory through every true pose, with time from the first pose.
+
+    The noise of the second derivative is that of the poses times 1/dt².
 
     Raises:
         DataError: too few poses.

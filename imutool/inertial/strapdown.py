@@ -194,7 +194,7 @@ def with_velocity(poses: Poses) -> Poses:
 
 
 def truth_velocity(poses: Poses) -> Vectors:
-    """World velocity (m/s) at every pose: a Savitzky-Golay derivative of positions on the poses' stamps.
+    """World velocity (m/s) at every pose: Savitzky-Golay derivative of the positions.
 
     Around each pose, a polynomial of degree `VELOCITY_ORDER` in time is fitted to the poses of `VELOCITY_WINDOW_S` (an odd
     number m, by the median period, over the degree) by least squares on the true stamps; the velocity is its slope. On an even
