@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float, Float64, Int64
-from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, parameters_of, priors
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
+from imutool.diagnosis.estimation.observability import WANDER, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor.effect import Effect, Stage, Theta
@@ -20,9 +21,8 @@ RIDGE = 1e-9
 FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
-CLOCK = SKEW, JUMP = "clock_skew", "clock_jump"
-WANDER, STEADY = "clock_wander", ("clock_offset", *CLOCK)
-PART_OF = {WANDER: ("clock_offset", SKEW), "reference_smoothing": ("low_pass",)}  # what an effect has within it
+CLOCK = "clock_skew", "clock_jump"
+PART_OF = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # what an effect has within it
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
@@ -190,6 +190,12 @@ class Candidates:
                 starts = self.starts[effect.key] = pair.starts(effect)
                 self.log_choices[effect.key] = float(np.log(max(1.0, pair.alternatives(effect) / len(starts))))
 
+    def copy(self) -> Candidates:
+        """Candidates with what is derived so far; neither sees what the other derives."""
+        other = copy(self)
+        other.scores, other.linear = dict(self.scores), {filters: dict(known) for filters, known in self.linear.items()}
+        return other
+
     def count(self, effects: Sequence[Effect]) -> int:
         """Number of starts of some candidates: the hypotheses of the Bonferroni correction."""
         return sum(len(self.starts[effect.key]) for effect in effects)
@@ -242,19 +248,6 @@ class Candidates:
         second = jump if first == skew.name else skew
         return trial if self.log_p(second, best.objective - trial.objective) < threshold else best
 
-    def steadier_clock(self, now: Fit, named: Sequence[Effect]) -> Fit:
-        """The fit with two of offset, skew and jump in place of a clock that wanders, where they do as well."""
-        others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
-        if len(others) == len(now.chosen):
-            return now
-        steady = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys]
-        fits = [now]
-        for pair in combinations(steady, 2):
-            on_trend = any(effect.name == SKEW for effect in pair)
-            starts = [self.starts[e.key][-1 if on_trend else 0] if e.name == JUMP else e.null_value.astype(float) for e in pair]
-            fits.append(fit(self.logs, (*others, *zip(pair, starts, strict=True)), near=now))
-        return min(fits, key=bic)
-
     def _derived(self, now: Fit) -> dict[str, list[_Linear]]:
         """Candidates derived beside fits with the same filters; those of the last few such sets are kept."""
         filters = frozenset(effect.key for effect, _ in now.chosen if effect.stage in FILTERS and not effect.linear)
@@ -278,20 +271,30 @@ class Candidates:
         return Scored(self.log_p(effect, gain), effect, start, gain)
 
 
-def worth_trying(ranked: Sequence[Scored], least: float) -> list[Scored]:
-    """Candidates without a clock that wanders by less than `least` squares: errors of poses last for seconds, as it does."""
-    return [scored for scored in ranked if scored.effect.name != WANDER or scored.gain > least]
+class Portable(NamedTuple):
+    """Description of a fit for `restored` in another process, and the number of effects without a name that were tried."""
+
+    chosen: list[tuple[str, list[str], Theta]]
+    numbers: dict[str, Any]
+    unnamed: int
 
 
-def unnamed_count(found: Fit) -> int:
-    """Number of effects that are not of the catalogue."""
-    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
+def portable(search: Any, found: Fit) -> Portable:
+    """Description of a fit and of the search that found it."""
+    chosen = [(effect.key, [parameter.name for parameter in effect.parameters], theta) for effect, theta in found.chosen]
+    return Portable(
+        chosen, {name: getattr(found, name) for name in ("bias", "objective", "residuals", "prior")}, len(search.unnamed)
+    )
 
 
-def bic(found: Fit) -> float:
-    """Bayesian information criterion (BIC): squares left and the cost of the parameters.
-
-    An effect outside the catalogue costs more.
-    """
-    count, penalty = len(parameters_of(found.chosen)), found.logs[0].pair.settings.search.unnamed_penalty
-    return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)
+def restored(described: Portable, like: Fit, effects: Sequence[Effect], finer: Callable[[Effect], Effect | None]) -> Fit:
+    """Fit as another process described it; `finer` makes curves that are not in `effects`."""
+    by_key, chosen = {effect.key: effect for effect in effects}, list[tuple[Effect, Theta]]()
+    for key, names, theta in described.chosen:
+        whole = by_key[key]
+        free = [k for k, parameter in enumerate(whole.parameters) if parameter.name in names]
+        effect = with_free(whole, free) if len(free) == len(names) else finer(whole)
+        assert effect is not None, f"{key} was made from the same samples"
+        chosen.append((effect, theta))
+    passes = tuple(ForwardPass(log.pair, tuple(chosen)) for log in like.logs)
+    return replace(like, chosen=tuple(chosen), passes=passes, **described.numbers)

@@ -15,29 +15,35 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from imutool.conversion.forked import Forked
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, bic, unnamed_count, worth_trying
+from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
+    WANDER,
     below_model_error,
     beyond_the_band,
     has_no_size,
     plausible_part,
     unidentified,
     values_of,
-    with_free,
+    with_common_arm,
+    with_steady_clock,
     without_implausible,
+    without_unseen_low_pass,
 )
 from imutool.diagnosis.estimation.significance import (
     Scatter,
+    bic,
     estimate_onsets,
     gain_for,
     held_out_gains,
     held_out_p_value,
     prediction_p_value,
     scatter,
+    unnamed_count,
     with_onsets_of,
 )
 from imutool.diagnosis.estimation.unnamed_effects import Curve, SplineCurve, finer, like
@@ -65,20 +71,29 @@ def select_effects(
     known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
-    unnamed_first = best_unnamed > best_named + settings.clearly_better
-    search, now = _grown(first, start, unnamed, []) if unnamed_first else _grown(first, start, (), list(later))
+    ways = ((), later), (unnamed, ())
+    way, other_way = reversed(ways) if best_unnamed > best_named + settings.clearly_better else ways
+    apart = replace(first, candidates=known.copy(), progress=lambda text: None)
+    other = Forked(lambda: portable(*_grown(apart, start, *other_way))) if unnamed else None
+    answers = [_grown(first, start, *way)]
+    now = answers[0][1]
     doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
-    if unnamed and doubtful and now.objective > settings.explained_chi_square * now.numbers:
+    if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
-        other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
-        if bic(other[1]) < bic(now) - settings.clearly_better:
-            search, now = other
-    return search.tested(search.simplified(now))
+        described = other.result()
+        alone = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed), first.finer)
+        better = bic(alone) < bic(now) - settings.clearly_better
+        answers.insert(0 if better else 1, (replace(apart, unnamed=unnamed[: described.unnamed], progress=report), alone))
+    elif other is not None:
+        other.end()
+    selections = (search.tested(search.simplified(found)) for search, found in answers)
+    first_one = next(selections)  # an answer that unseen time refutes altogether is none
+    return first_one if first_one.selected else next(selections, first_one)
 
 
-def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[Sequence[Effect]]) -> tuple[_Search, Fit]:
+def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
-    search, settings = replace(first, unnamed=unnamed), first.settings
+    search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
@@ -128,10 +143,11 @@ class _Search:
             self.trials_of, self.trials = now, {}
         allowed = self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
         best: tuple[float, Fit] | None = None
-        enough = self.settings.unnamed_share * (self.before - now.numbers)
-        for promised, effect, start, _ in worth_trying(self.candidates.ranked(now, allowed, count), enough)[:count]:
+        for promised, effect, start, gain in self.candidates.ranked(now, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
                 continue  # the score of a linear effect is its gain
+            if effect.name == WANDER and gain < self.settings.unnamed_share * (now.objective - now.numbers):
+                continue  # errors of poses last for seconds, as it does
             if effect.key not in self.trials:
                 limit = now.objective - (0.0 if best is None else share * (now.objective - best[1].objective))
                 self.trials[effect.key] = self.tried_with(now.chosen, effect, start, now, limit)
@@ -143,6 +159,7 @@ class _Search:
             best = (log_p, trial) if best is None or log_p < best[0] else best
         if best is None or best[0] > self.threshold:
             return None
+        enough = self.settings.unnamed_share * (self.before - now.numbers)
         if unnamed_count(best[1]) and now.objective - best[1].objective < enough:
             return None  # the rim of something that has no name: a name for it would be wrong
         return self.candidates.jump_on_trend(now, best[1], self.named, self.threshold)
@@ -160,11 +177,15 @@ class _Search:
         others, (effect, _) = now.chosen[:-1], now.chosen[-1]
         if not isinstance(effect.forward, Curve):
             return now
-        fine = finer(effect, like([log.pair for log in self.logs if isinstance(log.pair, Pair)]))
+        fine = self.finer(effect)
         if fine is None:
             return now
         trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
         return trial if bic(trial) < bic(now) - self.settings.clearly_better else now
+
+    def finer(self, curve: Effect) -> Effect | None:
+        """A curve with more knots."""
+        return finer(curve, like([log.pair for log in self.logs if isinstance(log.pair, Pair)]))
 
     def exchanged(self, now: Fit) -> Fit:
         """Fit with an effect replaced by another of the catalogue that explains more."""
@@ -191,31 +212,12 @@ class _Search:
         for key in [effect.key for effect, _ in now.chosen if effect.kind == "unknown"]:
             rivals = self._rivals(now.keys.index(key), now).values()  # a name that leaves no more says more
             now = next((trial for trial in rivals if trial.objective < now.objective), now)
-        return self._without_arms(self._without_low_pass(self.candidates.steadier_clock(now, self.named)))
-
-    def _without_low_pass(self, now: Fit) -> Fit:
-        """Fit with a clock offset instead of a low pass beyond the poses' band, which only its delay shows."""
-        offset = next((e for e in self.named if e.name == "clock_offset" and e.key not in now.keys), None)
-        for k, (effect, theta) in enumerate(now.chosen):
-            if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, self.logs, self.settings):
-                delayed = offset, -1.0 / (2.0 * np.pi * theta)  # a first order far below its cut-off
-                return fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
-        return now
-
-    def _without_arms(self, now: Fit) -> Fit:
-        """Fit with a lever arm instead of a size effect of three equal arms, and the rest if it is significant."""
-        arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
-        lever = [effect for effect in self.named if effect.name == "lever_arm" and effect.key not in now.keys]
-        if not arms or not lever:
-            return now
-        others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
-        without = fit(self.logs, others, near=now)
-        simple = fit(self.logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
-        if without.objective - simple.objective < self.settings.common_arm_share * (without.objective - now.objective):
-            return now
-        rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
-        both = fit(self.logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
-        return both if self.candidates.log_p(rest, simple.objective - both.objective) < self.threshold else simple
+        now = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
+        now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
+        log_p = self.candidates.log_p
+        return with_common_arm(
+            self.logs, now, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < self.threshold
+        )
 
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""
@@ -293,6 +295,5 @@ class _Search:
             if verdicts[-1].false_discovery_rate == 1.0 and not FOLLOWING & {one.effect.key for one in verdicts[:-1]}:
                 return verdicts  # a later one could show a model error only of those that follow the motion
         gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
-        denoised = any(log.pair.denoised for log in self.logs)
-        hidden = below_model_error(gains, self.settings, denoised=denoised, poses=not exact)
+        hidden = below_model_error(gains, self.settings, denoised=any(log.pair.denoised for log in self.logs), poses=not exact)
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in hidden else verdict for verdict in verdicts]
