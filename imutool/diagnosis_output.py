@@ -10,11 +10,13 @@ import contextlib
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from imutool.conversion.forked import Forked
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
@@ -83,7 +85,9 @@ def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
     """Write findings.json with the closed loop, and a page with figures of both simulations."""
     (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
     if find_spec("matplotlib") is not None:
-        _page(again, folder / CLOSED, d)
+        from imutool.viewing.html.diagnosis_page import write as write_page
+
+        write_page(again, folder / CLOSED, logs=LOG if (folder / LOG).exists() else None, first=d)
 
 
 def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
@@ -92,28 +96,32 @@ def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | No
     noise = to_noise_file(d)
     if noise is not None:
         datasheet.write(noise, folder / NOISE)
-    drawn: dict[str, Callable[[Path], None]] = {REPORT: lambda path: _page(d, path), VIEW: lambda path: _recording(d, path)}
-    if logs is not None:  # before the report, which says where it is
-        drawn = {LOG: lambda path: _logs(logs(folder), path)} | drawn
-    remarks = []
-    for name, draw in drawn.items():
+    remarks: list[str] = []
+    seen: list[RunData] = []
+    missing = {name for name, (library, _) in NEEDS.items() if find_spec(library) is None}
+    if logs is not None and LOG not in missing:
+        try:
+            seen = logs(folder)
+        except ImutoolError as error:
+            remarks.append(f"{LOG} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
+    report = Forked(partial(_report, d, LOG if seen else None))
+    if seen:
+        _logs(seen, folder / LOG)
+    if VIEW not in missing:
+        _recording(d, folder / VIEW)
+    if REPORT not in missing:
+        (folder / REPORT).write_text(report.result(), encoding="utf-8")
+    for name in (LOG, REPORT, VIEW):
         library, extra = NEEDS[name]
-        if find_spec(library) is None:
+        if name in missing and not (name == LOG and logs is None):
             remarks.append(f"{name} is left out: {library} is not installed (pip install 'imutool[{extra}]')")
-        else:
-            try:
-                draw(folder / name)
-            except ImutoolError as error:
-                if name != LOG:
-                    raise
-                remarks.append(f"{name} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
     return remarks
 
 
-def _page(d: Diagnosis, path: Path, first: Diagnosis | None = None) -> None:
-    from imutool.viewing.html.diagnosis_page import write as write_page
+def _report(d: Diagnosis, logs: str | None) -> str:
+    from imutool.viewing.html.diagnosis_page import html
 
-    write_page(d, path, logs=LOG if (path.parent / LOG).exists() else None, first=first)
+    return html(d, logs=logs)
 
 
 def _logs(logs: list[RunData], path: Path) -> None:

@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -62,9 +63,14 @@ def on_disk() -> Iterator[Path]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Lets workers collect one after the other: what the first compiles, the others read."""
-    with FileLock(Path(__file__).with_name("__pycache__") / "collecting.lock"):
-        return (yield)
+    """Lets one worker collect ahead of the others: what it compiles, they read."""
+    run, compiled = os.environ.get("PYTEST_XDIST_TESTRUNUID", ""), Path(__file__).with_name("__pycache__") / "compiled_by"
+    with FileLock(f"{compiled}.lock"):
+        if not compiled.exists() or compiled.read_text() != run:
+            collected = yield
+            compiled.write_text(run)
+            return collected
+    return (yield)
 
 
 def pytest_collection_finish() -> None:
@@ -138,6 +144,21 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             make(folder)
             (folder / ".made").touch()
     return folder
+
+
+@pytest.fixture(scope="session")
+def torch_import_s(tmp_path_factory: pytest.TempPathFactory) -> float:
+    """What a fresh Python takes to import torch, the shorter of two times."""
+
+    def seconds() -> float:
+        began = time.perf_counter()
+        subprocess.run([sys.executable, "-c", "import torch"], check=True)
+        return time.perf_counter() - began
+
+    def make(folder: Path) -> None:
+        (folder / "seconds").write_text(str(min(seconds(), seconds())))
+
+    return float((made_once(tmp_path_factory, "torch_import", make) / "seconds").read_text())
 
 
 @pytest.fixture(scope="session")

@@ -41,7 +41,7 @@ LOST = 3  # something of a log is
 DISK_BYTES = 200_000  # less than any log here, more than any message
 WAIT_S = 120.0  # for the middle of a run, on a machine busy with other things
 TRIES = 20  # the middle may pass between two looks
-QUICK_SETTINGS = ("steps=120", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
+QUICK_SETTINGS = ("steps=40", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
 QUICK = ["--method", "neural_ode", *(word for setting in QUICK_SETTINGS for word in ("--set", setting))]
 
 
@@ -528,7 +528,7 @@ def test_ctrl_c_in_the_middle_of_training_leaves_a_checkpoint_that_resume_takes_
     assert kept.name in told(other, other.stderr, CONFIG)
     done = imutool(*words, "--resume", "-v", "--json", "-", cwd=here)
     assert done.returncode == 0, done.stderr
-    steps = [int(step) for step in re.findall(r"gyro (\d+)/120", done.stderr)]
+    steps = [int(step) for step in re.findall(r"gyro (\d+)/40", done.stderr)]
     assert steps[0] >= 10  # it did not begin anew
     assert json.loads(done.stdout)["method"] == "neural_ode"
     assert set(digests(here)) == {*before, "m.safetensors"}

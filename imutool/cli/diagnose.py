@@ -74,6 +74,7 @@ def diagnose(
     """
     from imutool import diagnosis_output
     from imutool.config import load as load_settings
+    from imutool.conversion.forked import forking
     from imutool.diagnosis.diagnose import diagnose as run
     from imutool.diagnosis.settings import DiagnoseSettings
     from imutool.viewing.model.load_view import load
@@ -86,7 +87,7 @@ def diagnose(
     settings = load_settings(DiagnoseSettings, config, set_ or ())
     if folder is not None:
         diagnosis_output.refuse(folder, overwrite=overwrite)
-    with progress("Diagnosing", verbose, quiet) as tell:
+    with forking(), progress("Diagnosing", verbose, quiet) as tell:
         diagnosis = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
         if folder is not None:
             tell(0, 1, "writing")
@@ -95,9 +96,8 @@ def diagnose(
             if close:
                 settled = partial(run, reals, imu=imu, truth=truth, settings=settings)
                 diagnosis = _closed(diagnosis, settled, sim, folder, metric, overwrite)
-    if write_json(diagnosis.report, json_to, overwrite=overwrite):
-        return
-    _say(diagnosis, folder)
+    if not write_json(diagnosis.report, json_to, overwrite=overwrite):
+        _say(diagnosis, folder)
 
 
 def _closed(

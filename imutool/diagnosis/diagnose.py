@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias_start.stretches import longest_stretch, measured_recording
+from imutool.conversion.forked import Forked
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
@@ -132,11 +134,14 @@ def _beside_reference(
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
+    by_itself = None if simulated is None else Forked(partial(simulator_remarks, simulated))
     hidden = unobservable(logs, candidates, settings.search)
     diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), sim_findings, hidden, settings)
-    if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
-        report(3, 4, "simulating again")
-        diagnosis = _resimulated(diagnosis, logs, selection, simulated)
+    if simulated is not None and by_itself is not None:
+        if any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
+            report(3, 4, "simulating again")
+            diagnosis = _resimulated(diagnosis, logs, selection, simulated, by_itself)
+        by_itself.end()
     caveat = reference_caveat(recordings) if simulated is None else ""
     remarks = (*another, *left_out, *diagnosis.remarks, *dict.fromkeys(told))
     diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, caveat)
@@ -164,7 +169,9 @@ def read_log(log: Location, *, imu: str | None = None, truth: str | None = None)
     return measured_recording(longest_stretch(read(log, imu=imu, truth=truth)), free_fall=True)
 
 
-def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:
+def _resimulated(
+    diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording, by_itself: Forked[list[str]]
+) -> Diagnosis:
     """Adds the gain of a second simulation, or the reason why there is none."""
     if any(finding.effect == summarize.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
         return diagnosis
@@ -172,7 +179,7 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis))
     except ImutoolError as error:
         why = f"How much closer it comes is computed, not simulated again: {error}"
-        return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
+        return replace(diagnosis, remarks=(*diagnosis.remarks, why, *by_itself.result()))
     return replace(diagnosis, closer=closer)
 
 

@@ -1,18 +1,20 @@
-"""The command line run in the process of the tests: the same `main`, without a second for each start and its imports."""
+"""The command line and scripts in the process of the tests: the same code, without a second for each start and its imports."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Literal
 
 
 @contextlib.contextmanager
@@ -38,17 +40,29 @@ def _restored() -> Iterator[None]:
 
 
 def run_command(words: list[str], cwd: Path, env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
-    """What a process of its own would have printed, and its exit code; a bug is a traceback and 1."""
+    """What `imutool` in a process of its own would have printed, and its exit code; a bug is a traceback and 1."""
     from imutool.cli import main
 
+    return _run(main, ["imutool", *words], cwd, env, "default")
+
+
+def run_script(line: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """As `run_command`, of a Python file with its words; a warning is an error."""
+    return _run(lambda: runpy.run_path(line[0], run_name="__main__"), line, cwd, os.environ, "error")
+
+
+def _run(
+    main: Callable[[], object], line: list[str], cwd: Path, env: Mapping[str, str], on_warning: Literal["default", "error"]
+) -> subprocess.CompletedProcess[str]:
     code: int | str | None = 0
     with tempfile.TemporaryFile("w+", encoding="utf-8") as out, tempfile.TemporaryFile("w+", encoding="utf-8") as err:
         with _restored(), warnings.catch_warnings(), Path(os.devnull).open() as nothing:
-            warnings.simplefilter("default")
+            warnings.simplefilter(on_warning)
+            changed = dict(env)
             os.chdir(cwd)
             os.environ.clear()
-            os.environ.update(env)
-            sys.stdin, sys.stdout, sys.stderr, sys.argv = nothing, out, err, ["imutool", *words]
+            os.environ.update(changed)
+            sys.stdin, sys.stdout, sys.stderr, sys.argv = nothing, out, err, line
             try:
                 main()
             except SystemExit as end:
@@ -61,4 +75,4 @@ def run_command(words: list[str], cwd: Path, env: Mapping[str, str]) -> subproce
                 code = 1
         for stream in (out, err):
             stream.seek(0)
-        return subprocess.CompletedProcess(["imutool", *words], code or 0, out.read(), err.read())
+        return subprocess.CompletedProcess(line, code or 0, out.read(), err.read())

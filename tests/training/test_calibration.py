@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -59,8 +60,20 @@ def planted_theta(effects: Sequence[LinearForm]) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def flights(perfect: MakeRecording) -> list[Recording]:
-    return [perfect(seed, **FLIGHT) for seed in (1, 2, 3)]
+def three(perfect: MakeRecording) -> Callable[[int], list[Recording]]:
+    """Three flights from a first seed on."""
+    return functools.cache(lambda first: [perfect(first + k, **FLIGHT) for k in range(3)])
+
+
+@pytest.fixture(scope="module")
+def flights(three: Callable[[int], list[Recording]]) -> list[Recording]:
+    return three(1)
+
+
+@pytest.fixture(scope="module")
+def without_effects(three: Callable[[int], list[Recording]]) -> Callable[[int, Sensor], Calibration]:
+    """The calibration of three flights with a rest bias alone, from a first seed on."""
+    return functools.cache(lambda first, sensor: found(three(first), sensor, ()))
 
 
 def found(
@@ -97,10 +110,10 @@ def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recordin
 
 
 @pytest.mark.parametrize("first", OTHERS[1:3])
-def test_a_clock_that_all_flights_share_is_found(perfect: MakeRecording, first: int) -> None:
+def test_a_clock_that_all_flights_share_is_found(three: Callable[[int], list[Recording]], first: int) -> None:
     """3 ms: logs that agree share it, though each may have a clock of its own."""
     effects = catalogue.trained("gyro", ["clock_offset"])
-    calibration = found([perfect(first + k, **FLIGHT) for k in range(3)], "gyro", effects)
+    calibration = found(three(first), "gyro", effects)
     assert next(iter(calibration.gains)) == "clock_offset"
     assert set(calibration.effects) == {"clock_offset", *LINEAR["gyro"]}
     assert float(calibration.theta[0]) == pytest.approx(planted_theta(effects)[0], rel=0.05)
@@ -109,9 +122,9 @@ def test_a_clock_that_all_flights_share_is_found(perfect: MakeRecording, first: 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 @pytest.mark.parametrize("first", OTHERS)
 def test_where_nothing_is_planted_scale_and_misalignment_are_near_zero_and_nothing_else_is_found(
-    perfect: MakeRecording, sensor: Sensor, first: int
+    without_effects: Callable[[int, Sensor], Calibration], sensor: Sensor, first: int
 ) -> None:
-    calibration = found([perfect(first + k, **FLIGHT) for k in range(3)], sensor, ())
+    calibration = without_effects(first, sensor)
     assert calibration.effects == LINEAR[sensor]
     assert max(calibration.gains.values()) < 0.06
     prior = np.concatenate([prior_std(form) for form in catalogue.trained(sensor, LINEAR[sensor])])
@@ -138,8 +151,8 @@ def test_a_curve_that_no_name_describes_is_found_as_a_curve(flights: list[Record
     assert next(iter(calibration.gains)) == "rate_curve"
 
 
-def test_a_rest_bias_of_its_own_is_found_for_every_log(flights: list[Recording]) -> None:
-    calibration = found(flights, "gyro", ())
+def test_a_rest_bias_of_its_own_is_found_for_every_log(without_effects: Callable[[int, Sensor], Calibration]) -> None:
+    calibration = without_effects(1, "gyro")
     for seed, rest in enumerate(calibration.rest.numpy()):
         planted = REST["gyro"] * np.random.default_rng(seed).normal(size=3)
         np.testing.assert_allclose(

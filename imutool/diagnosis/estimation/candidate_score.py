@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float, Float64, Int64
-from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, parameters_of, priors
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
+from imutool.diagnosis.estimation.observability import with_free
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor.effect import Effect, Stage, Theta
@@ -187,6 +189,12 @@ class Candidates:
                 starts = self.starts[effect.key] = pair.starts(effect)
                 self.log_choices[effect.key] = float(np.log(max(1.0, pair.alternatives(effect) / len(starts))))
 
+    def copy(self) -> Candidates:
+        """Candidates with what is derived so far; neither sees what the other derives."""
+        other = copy(self)
+        other.scores, other.linear = dict(self.scores), {filters: dict(known) for filters, known in self.linear.items()}
+        return other
+
     def count(self, effects: Sequence[Effect]) -> int:
         """Number of starts of some candidates: the hypotheses of the Bonferroni correction."""
         return sum(len(self.starts[effect.key]) for effect in effects)
@@ -262,15 +270,23 @@ class Candidates:
         return Scored(self.log_p(effect, gain), effect, start, gain)
 
 
-def unnamed_count(found: Fit) -> int:
-    """Number of effects that are not of the catalogue."""
-    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
+Portable = tuple[list[tuple[str, list[str], Theta]], dict[str, Any]]
 
 
-def bic(found: Fit) -> float:
-    """Bayesian information criterion (BIC): squares left and the cost of the parameters.
+def portable(found: Fit) -> Portable:
+    """Description of a fit, from which `restored` makes it again in another process."""
+    chosen = [(effect.key, [parameter.name for parameter in effect.parameters], theta) for effect, theta in found.chosen]
+    return chosen, {name: getattr(found, name) for name in ("bias", "objective", "residuals", "prior")}
 
-    An effect outside the catalogue costs more.
-    """
-    count, penalty = len(parameters_of(found.chosen)), found.logs[0].pair.settings.search.unnamed_penalty
-    return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)
+
+def restored(described: Portable, like: Fit, effects: Sequence[Effect], finer: Callable[[Effect], Effect | None]) -> Fit:
+    """Fit as another process described it; `finer` makes curves that are not in `effects`."""
+    by_key, chosen = {effect.key: effect for effect in effects}, list[tuple[Effect, Theta]]()
+    for key, names, theta in described[0]:
+        whole = by_key[key]
+        free = [k for k, parameter in enumerate(whole.parameters) if parameter.name in names]
+        effect = with_free(whole, free) if len(free) == len(names) else finer(whole)
+        assert effect is not None, f"{key} was made from the same samples"
+        chosen.append((effect, theta))
+    passes = tuple(ForwardPass(log.pair, tuple(chosen)) for log in like.logs)
+    return replace(like, chosen=tuple(chosen), passes=passes, **described[1])

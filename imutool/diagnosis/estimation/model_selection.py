@@ -12,11 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from imutool.conversion.forked import Forked
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, bic, unnamed_count
+from imutool.diagnosis.estimation.candidate_score import Candidates, Portable, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
@@ -27,17 +30,20 @@ from imutool.diagnosis.estimation.observability import (
     plausible_part,
     unidentified,
     values_of,
-    with_free,
+    with_common_arm,
     without_implausible,
+    without_unseen_low_pass,
 )
 from imutool.diagnosis.estimation.significance import (
     Scatter,
+    bic,
     estimate_onsets,
     gain_for,
     held_out_gains,
     held_out_p_value,
     prediction_p_value,
     scatter,
+    unnamed_count,
     with_onsets_of,
 )
 from imutool.diagnosis.estimation.unnamed_effects import Curve, SplineCurve, finer, like
@@ -65,20 +71,26 @@ def select_effects(
     known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
-    unnamed_first = best_unnamed > best_named + settings.clearly_better
-    search, now = _grown(first, start, unnamed, []) if unnamed_first else _grown(first, start, (), list(later))
+    ways = ((), later), (unnamed, ())
+    way, other_way = reversed(ways) if best_unnamed > best_named + settings.clearly_better else ways
+    apart = replace(first, candidates=known.copy(), progress=lambda text: None)
+    other = Forked(partial(_described, apart, start, *other_way)) if unnamed else None
+    search, now = _grown(first, start, *way)
     doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
-    if unnamed and doubtful and now.objective > settings.explained_chi_square * now.numbers:
+    if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
-        other = _grown(first, start, (), list(later)) if unnamed_first else _grown(first, start, unnamed, [])
-        if bic(other[1]) < bic(now) - settings.clearly_better:
-            search, now = other
+        described, count = other.result()
+        alone = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed), first.finer)
+        if bic(alone) < bic(now) - settings.clearly_better:
+            search, now = replace(apart, unnamed=unnamed[:count], progress=report), alone
+    elif other is not None:
+        other.end()
     return search.tested(search.simplified(now))
 
 
-def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[Sequence[Effect]]) -> tuple[_Search, Fit]:
+def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
-    search, settings = replace(first, unnamed=unnamed), first.settings
+    search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
@@ -91,6 +103,11 @@ def _grown(first: _Search, now: Fit, unnamed: tuple[Effect, ...], waiting: list[
         else:
             break
     return search, now
+
+
+def _described(*given: Any) -> tuple[Portable, int]:
+    search, now = _grown(*given)
+    return portable(now), len(search.unnamed)
 
 
 @dataclass(eq=False)
@@ -160,11 +177,15 @@ class _Search:
         others, (effect, _) = now.chosen[:-1], now.chosen[-1]
         if not isinstance(effect.forward, Curve):
             return now
-        fine = finer(effect, like([log.pair for log in self.logs if isinstance(log.pair, Pair)]))
+        fine = self.finer(effect)
         if fine is None:
             return now
         trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
         return trial if bic(trial) < bic(now) - self.settings.clearly_better else now
+
+    def finer(self, curve: Effect) -> Effect | None:
+        """A curve with more knots."""
+        return finer(curve, like([log.pair for log in self.logs if isinstance(log.pair, Pair)]))
 
     def exchanged(self, now: Fit) -> Fit:
         """Fit with an effect replaced by another of the catalogue that explains more."""
@@ -191,31 +212,12 @@ class _Search:
         for key in [effect.key for effect, _ in now.chosen if effect.kind == "unknown"]:
             rivals = self._rivals(now.keys.index(key), now).values()  # a name that leaves no more says more
             now = next((trial for trial in rivals if trial.objective < now.objective), now)
-        return self._without_arms(self._without_low_pass(now))
+        now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
+        return with_common_arm(self.logs, now, self.named, self.settings, self.is_significant)
 
-    def _without_low_pass(self, now: Fit) -> Fit:
-        """Fit with a clock offset instead of a low pass beyond the poses' band, which only its delay shows."""
-        offset = next((e for e in self.named if e.name == "clock_offset" and e.key not in now.keys), None)
-        for k, (effect, theta) in enumerate(now.chosen):
-            if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, self.logs, self.settings):
-                delayed = offset, -1.0 / (2.0 * np.pi * theta)  # a first order far below its cut-off
-                return fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
-        return now
-
-    def _without_arms(self, now: Fit) -> Fit:
-        """Fit with a lever arm instead of a size effect of three equal arms, and the rest if it is significant."""
-        arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
-        lever = [effect for effect in self.named if effect.name == "lever_arm" and effect.key not in now.keys]
-        if not arms or not lever:
-            return now
-        others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
-        without = fit(self.logs, others, near=now)
-        simple = fit(self.logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
-        if without.objective - simple.objective < self.settings.common_arm_share * (without.objective - now.objective):
-            return now
-        rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
-        both = fit(self.logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
-        return both if self.candidates.log_p(rest, simple.objective - both.objective) < self.threshold else simple
+    def is_significant(self, effect: Effect, gain: float) -> bool:
+        """Whether a gain in squares is more than chance."""
+        return self.candidates.log_p(effect, gain) < self.threshold
 
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""

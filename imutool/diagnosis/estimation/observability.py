@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
@@ -93,6 +94,41 @@ def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
     if not effect.linear or effect.kind != "catalogue":
         return effect
     return with_free(effect, [k for k, n in enumerate(effect.parameters) if abs(theta[k]) <= factor * n.plausible])
+
+
+def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], settings: SearchSettings) -> Fit:
+    """Fit with a clock offset for a low pass beyond the poses' band, which its delay shows."""
+    offset = next((e for e in named if e.name == "clock_offset" and e.key not in now.keys), None)
+    for k, (effect, theta) in enumerate(now.chosen):
+        if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, logs, settings):
+            delayed = offset, -1.0 / (2.0 * np.pi * theta)  # a first order far below its cut-off
+            return fit(logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
+    return now
+
+
+def with_common_arm(
+    logs: Sequence[WhitenedLog],
+    now: Fit,
+    named: Sequence[Effect],
+    settings: SearchSettings,
+    is_significant: Callable[[Effect, float], bool],
+) -> Fit:
+    """Fit with a lever arm instead of a size effect of three equal arms.
+
+    The rest of the size effect stays if it is significant.
+    """
+    arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
+    lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in now.keys]
+    if not arms or not lever:
+        return now
+    others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
+    without = fit(logs, others, near=now)
+    simple = fit(logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
+    if without.objective - simple.objective < settings.common_arm_share * (without.objective - now.objective):
+        return now
+    rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
+    both = fit(logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
+    return both if is_significant(rest, simple.objective - both.objective) else simple
 
 
 def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:

@@ -45,6 +45,20 @@ def gain_for(log_p: float, parameters: int) -> float:
     return float(2.0 * gammainccinv(0.5 * parameters, np.exp(max(log_p, -TAIL))))
 
 
+def unnamed_count(found: Fit) -> int:
+    """Number of effects that are not of the catalogue."""
+    return sum(effect.kind != "catalogue" for effect, _ in found.chosen)
+
+
+def bic(found: Fit) -> float:
+    """Bayesian information criterion (BIC): squares left and the cost of the parameters.
+
+    An effect outside the catalogue costs more.
+    """
+    count, penalty = len(parameters_of(found.chosen)), found.logs[0].pair.settings.search.unnamed_penalty
+    return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)
+
+
 def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
     """p-value of the held-out improvement under H0, by Student's t or by ranks.
 

@@ -17,16 +17,9 @@ from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.result import Curve, Diagnosis, Located, SignalTraces, Traces
 from imutool.diagnosis.wording.effect_sentences import signals
 from imutool.units import AXES, UNITS
-from imutool.viewing.html.drawing import (
-    DecimatedLine,
-    Line,
-    average_log_bins,
-    decimate_extremes,
-    plain_tick_labels,
-    svg,
-    true_intervals,
-)
+from imutool.viewing.html.drawing import plain_tick_labels, svg
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, TITLES
+from imutool.viewing.model.decimation import DecimatedLine, Line, average_log_bins, decimate_extremes, true_intervals
 
 SIGNALS = {"gyro": slice(0, 3), "accel": slice(3, 6)}
 

@@ -8,15 +8,14 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64
 from imutool.errors import not_installed
-from imutool.recording.columns import true_ranges
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
 WIDTH_INCH = 11.5  # on a page of 1150 pixels, letters of 9 points are 12 pixels high
@@ -24,21 +23,16 @@ HALF_INCH = 5.6  # two side by side, or one on a phone, where letters are 9 pixe
 DOTS_PER_INCH = 200  # sharp in print
 SVG_DOTS_PER_INCH = 72  # of matplotlib's SVG
 HEADING_INCH = 0.45
-PER_DECADE = 40  # points of a spectrum
 LEGEND_LETTERS, HANDLE_LETTERS = 76, 8  # in a row of a legend at half width
 MAX_LETTERS = 48  # of a name in a legend
 EMPTY_DECADES = 0.1, 10.0
 MAX_DECADES = 5  # labels of a logarithmic axis
-LARGEST = 1e300  # of a drawn value: beyond, the limits of an axis overflow
-BUCKETS = 400  # of a line at half width; each draws its lowest and its highest sample
 
 # placeholder colour for each of the page's colours in an SVG; none is one of matplotlib's own
 VARIABLES = {f"#{3 * k + 1:02x}{3 * k + 2:02x}{3 * k + 3:02x}": name for k, name in enumerate(LIGHT)}
 PLACEHOLDER_COLORS = {f"imutool:{name}": color for color, name in VARIABLES.items()}
 LIGHT_COLORS = {f"imutool:{name}": color for name, color in LIGHT.items()}
 
-Line = Float64[np.ndarray, " n"]
-DecimatedLine = Float64[np.ndarray, " m"]  # shorter than the line it comes from
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -137,6 +131,7 @@ def png(picture: Picture, heading: str) -> bytes:
             alone = part.subfigures(1, 1 if row[0].wide else columns, squeeze=False)[0]
             for place, panel in zip(alone, row, strict=False):
                 panel.draw(place)
+        _lay_out(figure)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
@@ -160,38 +155,6 @@ def legend_name(name: str) -> str:
     name = printable(name).strip() or "?"
     name = name if len(name) <= MAX_LETTERS else f"{name[: MAX_LETTERS - 1]}…"
     return f"\u200a{name}" if name.startswith("_") else name
-
-
-def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
-    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps."""
-    y = np.clip(y, -LARGEST, LARGEST)
-    if len(t) <= 2 * buckets:
-        return t, y
-    edges = np.linspace(0, len(t), buckets + 1).astype(int)
-    values = y[np.minimum(edges[:-1, None] + np.arange(np.diff(edges).max()), edges[1:, None] - 1)]
-    known = ~np.isnan(values)
-    lowest, highest = np.where(known, values, np.inf).argmin(axis=1), np.where(known, values, -np.inf).argmax(axis=1)
-    keep = np.unique(np.where(known.any(axis=1), [lowest, highest], 0) + edges[:-1])
-    return t[keep], y[keep]
-
-
-def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
-    """Intervals of time in which a mask is true."""
-    return [(float(t[first]), float(t[end - 1])) for first, end in true_ranges(mask)]
-
-
-def average_log_bins(
-    frequency_hz: Line, power: Float64[np.ndarray, " n *k"], lowest_hz: float
-) -> tuple[DecimatedLine, Float64[np.ndarray, " m *k"]]:
-    """Average a spectrum in forty bins a decade above `lowest_hz`.
-
-    Without it, noise at high frequencies would draw a band instead of a line.
-    """
-    decade = np.round(PER_DECADE * np.log10(frequency_hz / lowest_hz)).astype(int)
-    starts = np.flatnonzero(np.diff(decade, prepend=decade[0] - 1))
-    count = np.diff(np.append(starts, len(decade)))
-    sums = np.add.reduceat(power, starts, axis=0)
-    return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))
 
 
 def at_least_three_ticks(axes: Any) -> None:
@@ -255,21 +218,60 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
 
 
 def _lay_out(figure: Any) -> None:
-    """Place the axes once; `savefig` would draw everything an extra time to do so."""
+    """Place the axes once; `savefig` would draw everything an extra time to do so.
+
+    matplotlib asks again and again which ticks an axis has, where labels end, and how far they reach beyond moved axes.
+    """
     import matplotlib
 
-    for axes in figure.get_axes():
+    every = figure.get_axes()
+    measured = every if all(axes.get_aspect() == "auto" and axes.get_label() != "<colorbar>" for axes in every) else []
+    for axes in every:
         for axis in (axes.xaxis, axes.yaxis):
-            axis._update_ticks = _remembered_ticks(axis)
+            axis._get_tick, axis._copy_tick_props = _copied(axis._get_tick), lambda *_: None
+            axis._update_ticks = _remembered(axis, axis._update_ticks)
+            axis._get_ticklabel_bboxes = _remembered(axis, axis._get_ticklabel_bboxes)
+    for axes in measured:
+        axes.get_tightbbox = _measured_once(axes, axes.get_tightbbox)
     figure.get_layout_engine().execute(figure)
+    for axes in measured:
+        del axes.get_tightbbox
     with matplotlib.rc_context({"figure.constrained_layout.use": False}):
         figure.set_layout_engine(None)
 
 
-def _remembered_ticks(axis: Any) -> Callable[[], Any]:
-    """Ticks of an axis, updated where its limits or its place changed: matplotlib asks 17 times, a fifth of a page's time."""
-    remembered = lru_cache(1)(lambda *_, update=axis._update_ticks: update())
-    return lambda: remembered(*axis.get_view_interval(), *axis.axes.bbox.bounds)
+def _copied(make: Callable[[bool], Any]) -> Callable[[bool], Any]:
+    """Ticks of an axis, copied from the first: to make one takes six times as long."""
+    first = lru_cache(make)
+
+    def tick(major: bool) -> Any:
+        out = copy(first(major))
+        for part in ("label1", "label2", "tick1line", "tick2line", "gridline"):
+            setattr(out, part, copy(getattr(out, part)))
+        return out
+
+    return tick
+
+
+def _remembered(axis: Any, ask: Callable[..., Any]) -> Callable[..., Any]:
+    """Last answer of an axis, asked anew where its limits or its place changed."""
+    known: list[Any] = []
+
+    def answer(*asked: Any) -> Any:
+        state = *axis.get_view_interval(), *axis.axes.bbox.bounds
+        if not known or known[0] != state:
+            known[:] = state, ask(*asked)
+        return known[1]
+
+    return answer
+
+
+def _measured_once(axes: Any, measure: Callable[..., Any]) -> Callable[..., Any]:
+    """Box around axes and their labels, which reach as far beyond the axes as when they were first measured."""
+    from matplotlib.transforms import Bbox
+
+    beyond = lru_cache(lambda *asked, **how: measure(*asked, **how).get_points() - axes.bbox.get_points())
+    return lambda *asked, **how: Bbox(axes.bbox.get_points() + beyond(*asked, **how))
 
 
 def _curves(figure: Any) -> dict[str, str]:

@@ -9,18 +9,11 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.viewing.html.drawing import (
-    DecimatedLine,
-    Panel,
-    Picture,
-    at_least_three_ticks,
-    decimate_extremes,
-    legend,
-    plain_tick_labels,
-)
+from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, legend, plain_tick_labels
 from imutool.viewing.html.page import AFTER, BEFORE, HELD, INK, MARK, text
 from imutool.viewing.html.report_paths import color_of
 from imutool.viewing.html.report_wording import alignment_text, format_number, format_quantity
+from imutool.viewing.model.decimation import DecimatedLine, decimate_extremes
 from imutool.viewing.model.events import KINDS, Event
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift

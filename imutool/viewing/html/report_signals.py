@@ -15,19 +15,11 @@ from imutool.noise import allan
 from imutool.noise.allan import Curve
 from imutool.recording import Imu
 from imutool.units import AXES, SENSORS, UNITS, Sensor
-from imutool.viewing.html.drawing import (
-    Panel,
-    Picture,
-    at_least_three_ticks,
-    average_log_bins,
-    decades,
-    decimate_extremes,
-    legend,
-    plain_tick_labels,
-)
+from imutool.viewing.html.drawing import Panel, Picture, at_least_three_ticks, decades, legend, plain_tick_labels
 from imutool.viewing.html.page import AXIS_COLORS, INK, SOFT, TITLES
 from imutool.viewing.html.report_paths import color_of
 from imutool.viewing.html.report_wording import best_run, format_number, run_name, worst_orientation_error
+from imutool.viewing.model.decimation import average_log_bins, decimate_extremes
 from imutool.viewing.model.run_data import Run, RunData, Spectrum, Trace, round_up_125, spectra
 
 HEIGHT_INCH, SAMPLES_INCH = 4.2, 5.2

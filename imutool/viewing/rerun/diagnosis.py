@@ -16,7 +16,7 @@ from imutool.mcap_io.storage.target import Target
 from imutool.recording import Times
 from imutool.units import AXES, UNITS
 from imutool.viewing.html.diagnosis_figures import intervals_in_log
-from imutool.viewing.html.drawing import true_intervals
+from imutool.viewing.model.decimation import true_intervals
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.signals import KINDS
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color

@@ -23,6 +23,7 @@ from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths, drawing
 from imutool.viewing.html.diagnosis_page import html, write
 from imutool.viewing.html.page import text
+from imutool.viewing.model import decimation
 
 Page, svgs = markup.Page, markup.svgs
 MOST_BYTES = 3_000_000
@@ -299,7 +300,7 @@ def test_beside_poses_a_misfit_is_drawn_as_far_as_they_know_the_motion() -> None
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=400), st.integers(1, 50))
 def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bounds(values: list[float], buckets: int) -> None:
     t, y = np.arange(len(values), dtype=float), np.array(values)
-    thin_t, thin_y = drawing.decimate_extremes(t, y, buckets)
+    thin_t, thin_y = decimation.decimate_extremes(t, y, buckets)
     assert len(thin_t) <= 2 * buckets
     assert (np.diff(thin_t) > 0).all()
     assert thin_y.min() == y.min()
@@ -309,8 +310,9 @@ def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bou
 
 def test_a_mask_becomes_stretches_of_time() -> None:
     t = np.arange(6) / 2.0
-    assert drawing.true_intervals(t, np.array([True, True, False, True, False, True])) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
-    assert drawing.true_intervals(t, np.zeros(6, dtype=bool)) == []
+    mask = np.array([True, True, False, True, False, True])
+    assert decimation.true_intervals(t, mask) == [(0.0, 0.5), (1.5, 1.5), (2.5, 2.5)]
+    assert decimation.true_intervals(t, np.zeros(6, dtype=bool)) == []
 
 
 def test_white_noise_has_the_density_of_the_dashed_line() -> None:

@@ -24,6 +24,7 @@ from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.html import drawing, report, report_errors, report_paths, report_signals, report_wording
 from imutool.viewing.html.page import DARK, LEVELS, LIGHT, PAPER, is_imutool_page
+from imutool.viewing.model import decimation
 from imutool.viewing.model.events import Event
 from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData, Trace
@@ -222,15 +223,17 @@ def test_signals_are_the_samples_of_all_runs_on_one_scale_one_below_the_other(se
         steps = [k * step_of(drawn, values, suffix) for k in range(len(values))]
         assert steps[1] > extent
         lines = [(f"{name}{suffix}", y - step) for (name, y), step in zip(values, steps, strict=True)]
-        same_scale([(drawn[name], *drawing.decimate_extremes(t, y)) for name, y in lines])
+        same_scale([(drawn[name], *decimation.decimate_extremes(t, y)) for name, y in lines])
 
 
 def step_of(drawn: dict[str, np.ndarray], values: list[tuple[str, np.ndarray]], suffix: str) -> float:
     """How much lower the second run is drawn than its samples, on the scale of the first."""
     (first, y), (second, other) = values[:2]
     t = np.arange(len(y), dtype=float)
-    across = np.polyfit(drawing.decimate_extremes(t, y)[1], drawn[f"{first}{suffix}"][:, 1], 1)
-    return float(np.median(drawing.decimate_extremes(t, other)[1] - (drawn[f"{second}{suffix}"][:, 1] - across[1]) / across[0]))
+    across = np.polyfit(decimation.decimate_extremes(t, y)[1], drawn[f"{first}{suffix}"][:, 1], 1)
+    return float(
+        np.median(decimation.decimate_extremes(t, other)[1] - (drawn[f"{second}{suffix}"][:, 1] - across[1]) / across[0])
+    )
 
 
 def same_scale(lines: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
@@ -246,10 +249,10 @@ def same_scale(lines: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
 def test_biases_are_what_was_taken_off_with_the_truth_on_the_same_scale(seen: RunData) -> None:
     drawn = curves(panel(seen, report_signals.biases))
     true = seen.true_bias["gyro"]
-    lines = [(drawn["true, z"], *drawing.decimate_extremes(seen.elapsed_s(true.t_ns), true.values[:, 2]))]
+    lines = [(drawn["true, z"], *decimation.decimate_extremes(seen.elapsed_s(true.t_ns), true.values[:, 2]))]
     for trace in seen.models():
         t = seen.elapsed_s(trace.run.imu.t_ns)
-        lines.append((drawn[f"{trace.name}, z"], *drawing.decimate_extremes(t, trace.run.gyro_bias[:, 2])))
+        lines.append((drawn[f"{trace.name}, z"], *decimation.decimate_extremes(t, trace.run.gyro_bias[:, 2])))
     same_scale(lines)
 
 
@@ -260,11 +263,11 @@ def test_errors_are_on_one_scale_and_logarithmic_where_they_are_far_apart(seen: 
     near = replace(seen, traces=(raw, half))
     drawn = curves(panel(near, report_errors.error_curves))
     t = seen.elapsed_s(raw.errors.t_ns)
-    same_scale([(drawn[one.name], *drawing.decimate_extremes(t, of(one).orientation_total_deg)) for one in near.traces])
+    same_scale([(drawn[one.name], *decimation.decimate_extremes(t, of(one).orientation_total_deg)) for one in near.traces])
     tiny = replace(half, errors=scaled(half.errors, 1e-4))
     drawn = curves(panel(replace(seen, traces=(raw, tiny)), report_errors.error_curves))
     heights = drawn["raw"][200:, 1] - drawn["half"][200:, 1]  # upwards, numbers get smaller
-    ratio = drawing.decimate_extremes(t, of(raw).orientation_total_deg / of(tiny).orientation_total_deg)
+    ratio = decimation.decimate_extremes(t, of(raw).orientation_total_deg / of(tiny).orientation_total_deg)
     assert heights.max() < 0.0
     assert np.log10(ratio[1][1:]).min() > 3.0
 
@@ -345,11 +348,11 @@ def test_the_seconds_of_the_largest_error_are_shown_whole(seen: RunData) -> None
 @given(st.floats(0.1, 10.0), st.integers(50, 2000))
 def test_averaging_a_spectrum_keeps_a_level_and_its_order(level: float, count: int) -> None:
     frequency = np.arange(1.0, count + 1.0)
-    at, power = drawing.average_log_bins(frequency, np.full((count, 3), level), 1.0)
+    at, power = decimation.average_log_bins(frequency, np.full((count, 3), level), 1.0)
     np.testing.assert_allclose(power, level, rtol=1e-12)
     assert (np.diff(at) > 0.0).all()
     assert at[0] == 1.0
-    assert len(at) <= 1 + drawing.PER_DECADE * np.log10(count) + 1
+    assert len(at) <= 1 + decimation.PER_DECADE * np.log10(count) + 1
 
 
 # ── what is not there is left out ──

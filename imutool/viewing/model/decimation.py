@@ -1,0 +1,47 @@
+"""Lines and spectra with as many points as a drawing shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imutool.array_types import Bool, Float64
+from imutool.recording.columns import true_ranges
+
+PER_DECADE = 40  # points of a spectrum
+LARGEST = 1e300  # of a drawn value: beyond, the limits of an axis overflow
+BUCKETS = 400  # of a line at half width; each draws its lowest and its highest sample
+
+Line = Float64[np.ndarray, " n"]
+DecimatedLine = Float64[np.ndarray, " m"]  # shorter than the line it comes from
+
+
+def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
+    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps."""
+    y = np.clip(y, -LARGEST, LARGEST)
+    if len(t) <= 2 * buckets:
+        return t, y
+    edges = np.linspace(0, len(t), buckets + 1).astype(int)
+    values = y[np.minimum(edges[:-1, None] + np.arange(np.diff(edges).max()), edges[1:, None] - 1)]
+    known = ~np.isnan(values)
+    lowest, highest = np.where(known, values, np.inf).argmin(axis=1), np.where(known, values, -np.inf).argmax(axis=1)
+    keep = np.unique(np.where(known.any(axis=1), [lowest, highest], 0) + edges[:-1])
+    return t[keep], y[keep]
+
+
+def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:
+    """Intervals of time in which a mask is true."""
+    return [(float(t[first]), float(t[end - 1])) for first, end in true_ranges(mask)]
+
+
+def average_log_bins(
+    frequency_hz: Line, power: Float64[np.ndarray, " n *k"], lowest_hz: float
+) -> tuple[DecimatedLine, Float64[np.ndarray, " m *k"]]:
+    """Average a spectrum in forty bins a decade above `lowest_hz`.
+
+    Without it, noise at high frequencies would draw a band instead of a line.
+    """
+    decade = np.round(PER_DECADE * np.log10(frequency_hz / lowest_hz)).astype(int)
+    starts = np.flatnonzero(np.diff(decade, prepend=decade[0] - 1))
+    count = np.diff(np.append(starts, len(decade)))
+    sums = np.add.reduceat(power, starts, axis=0)
+    return np.add.reduceat(frequency_hz, starts) / count, sums / count.reshape(-1, *[1] * (power.ndim - 1))

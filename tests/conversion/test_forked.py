@@ -1,0 +1,103 @@
+"""Forked processes: results and log lines come back, nothing is left, one processor gives the same."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+
+import pytest
+
+from imutool.conversion import forked
+from imutool.conversion.forked import Forked, forking
+from imutool.errors import DataError
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="the system cannot fork")
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processors, however many there are."""
+    monkeypatch.setattr(forked, "processors", lambda: 2)
+
+
+def none_left() -> bool:
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+    return True
+
+
+@pytest.mark.usefixtures("two")
+def test_a_function_runs_beside_this_process_and_its_result_comes_back() -> None:
+    large = b"x" * 10_000_000
+    with forking():
+        first, second = Forked(lambda: (os.getpid(), large)), Forked(os.getpid)
+        assert second.result() == os.getpid()  # the other processor is taken
+        process, content = first.result()
+        assert process != os.getpid()
+        assert content == large
+        assert first.result() == (process, large)
+        assert Forked(os.getpid).result() != os.getpid()
+    assert none_left()
+
+
+@pytest.mark.usefixtures("two")
+def test_outside_a_command_nothing_is_forked() -> None:
+    assert Forked(os.getpid).result() == os.getpid()
+
+
+def test_on_one_processor_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forked, "processors", lambda: 1)
+    with forking():
+        assert Forked(os.getpid).result() == os.getpid()
+
+
+@pytest.mark.usefixtures("two")
+def test_its_log_lines_come_with_the_result(caplog: pytest.LogCaptureFixture) -> None:
+    def warn() -> int:
+        logging.getLogger("imutool.test").warning("%s of it", "half")
+        return 1
+
+    with forking():
+        beside = Forked(warn)
+        assert caplog.messages == []
+        assert beside.result() == 1
+    assert caplog.messages == ["half of it"]
+
+
+@pytest.mark.usefixtures("two")
+def test_a_function_that_raises_raises_here_and_one_whose_process_dies_runs_here() -> None:
+    def refuse() -> int:
+        raise DataError("too little")
+
+    here = os.getpid()
+
+    def die_elsewhere() -> str:
+        if os.getpid() != here:
+            os._exit(9)
+        return "done"
+
+    with forking():
+        beside = Forked(refuse)
+        with pytest.raises(DataError, match="too little"):
+            beside.result()
+        assert Forked(die_elsewhere).result() == "done"
+    assert none_left()
+
+
+@pytest.mark.usefixtures("two")
+def test_whatever_ends_a_command_ends_its_processes() -> None:
+    def interrupted() -> None:
+        with forking():
+            Forked(lambda: time.sleep(60.0))
+            raise KeyboardInterrupt
+
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert none_left()
+    with forking():
+        slow = Forked(lambda: time.sleep(60.0))
+        slow.end()
+        assert none_left()
+    assert time.monotonic() - began < 30.0
