@@ -133,34 +133,20 @@ class Trajectory:
                 )
 
 
-def fit_trajectory(poses: Poses, knot_spacing_s: float | None = None, degree: int = DEGREE) -> Trajectory:
-    """Smooth trajectory through true poses, with time from the first pose.
+def fit_trajectory(poses: Poses) -> Trajectory:
+    """Spline trajectory through every true pose, with time from the first pose.
 
-    Without `knot_spacing_s` the splines pass through every pose, and the noise of the second derivative is that of the poses
-    times 1/dt². With it they are least-squares splines on knots of this spacing, which smooths the poses.
+    The noise of the second derivative is that of the poses times 1/dt².
 
     Raises:
-        DataError: too few poses, or a gap with knots but without poses.
+        DataError: too few poses.
     """
-    from scipy.interpolate import make_interp_spline, make_lsq_spline
+    from scipy.interpolate import make_interp_spline
 
-    if len(poses) <= degree:
-        raise DataError(f"{len(poses)} true poses", expected=f"more than {degree} for a spline of degree {degree}")
+    if len(poses) <= DEGREE:
+        raise DataError(f"{len(poses)} true poses", expected=f"more than {DEGREE} for a spline of degree {DEGREE}")
     t = seconds(poses.t_ns, int(poses.t_ns[0]))
-    columns = (poses.p_wb, continuous(poses.q_wb_wxyz))
-    if knot_spacing_s is None:
-        position, quaternion = (make_interp_spline(t, y, k=degree) for y in columns)
-        return Trajectory(int(poses.t_ns[0]), position, quaternion)
-    inner = np.linspace(t[0], t[-1], max(int(np.ceil((t[-1] - t[0]) / knot_spacing_s)), 1) + 1)
-    knots = np.concatenate([np.full(degree, t[0]), inner, np.full(degree, t[-1])])
-    try:
-        position, quaternion = (make_lsq_spline(t, y, knots, k=degree) for y in columns)
-    except (ValueError, np.linalg.LinAlgError) as error:
-        raise DataError(
-            f"true poses leave some of {len(inner)} knots without support ({error})",
-            expected="several poses between knots",
-            fix="Use a larger knot spacing, or a stretch of truth without gaps",
-        ) from error
+    position, quaternion = (make_interp_spline(t, y, k=DEGREE) for y in (poses.p_wb, continuous(poses.q_wb_wxyz)))
     return Trajectory(int(poses.t_ns[0]), position, quaternion)
 
 

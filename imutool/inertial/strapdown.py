@@ -193,22 +193,15 @@ def with_velocity(poses: Poses) -> Poses:
     return poses if poses.v_w is not None else replace(poses, v_w=truth_velocity(poses))
 
 
-def truth_velocity(
-    poses: Poses,
-    window_s: float = VELOCITY_WINDOW_S,
-    order: int = VELOCITY_ORDER,
-    max_gap_s: float | None = None,
-) -> Vectors:
-    """World velocity (m/s) at every pose.
+def truth_velocity(poses: Poses) -> Vectors:
+    """World velocity (m/s) at every pose: Savitzky-Golay derivative of the positions.
 
-    a Savitzky-Golay derivative of positions on the poses' stamps.
-
-    Around each pose, a polynomial of degree `order` in time is fitted to the poses of `window_s` (an odd number m, by the
-    median period, over `order`) by least squares on the true stamps; the velocity is its slope. On an even clock this is
-    `scipy.signal.savgol_filter(p, m, order, deriv=1, delta=period, mode="interp")`; jitter does no harm. Windows never cross a
-    gap longer than `max_gap_s` (default as in `Poses.at`: four median periods, at least 80 ms). Near the ends of a stretch they
-    stay inside, with the slope off their centre. A stretch shorter than the window lowers the order to keep three poses per
-    coefficient, at least 1; a single pose between two gaps gets the slope between its neighbours.
+    Around each pose, a polynomial of degree `VELOCITY_ORDER` in time is fitted to the poses of `VELOCITY_WINDOW_S` (an odd
+    number m, by the median period, over the degree) by least squares on the true stamps; the velocity is its slope. On an even
+    clock this is `scipy.signal.savgol_filter(p, m, 3, deriv=1, delta=period, mode="interp")`; jitter does no harm. Windows
+    never cross a gap, as in `Poses.at`: four median periods, at least 80 ms. Near the ends of a stretch they stay inside, with
+    the slope off their centre. A stretch shorter than the window lowers the order to keep three poses per coefficient, at
+    least 1; a single pose between two gaps gets the slope between its neighbours.
 
     0.2 s and order 3 agree best with the accelerometer over a quarter second on TUM-VI (median 10 mm/s on room2 against
     15 for 0.1 s and order 5) and FETCH; on EuRoC, which has its own velocity, they are within 6-8 mm/s of that.
@@ -217,10 +210,9 @@ def truth_velocity(
         DataError: fewer than two poses.
     """
     period_s = poses.period_s
-    gap_s = max(GAP_FACTOR * period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
     t = seconds(poses.t_ns, int(poses.t_ns[0]))
-    window = max(2 * round(window_s / period_s / 2) + 1, order + 1 + order % 2)
-    breaks = np.flatnonzero(np.diff(t) > gap_s) + 1
+    window = max(2 * round(VELOCITY_WINDOW_S / period_s / 2) + 1, VELOCITY_ORDER + 1 + VELOCITY_ORDER % 2)
+    breaks = np.flatnonzero(np.diff(t) > max(GAP_FACTOR * period_s, MIN_GAP_S)) + 1
     v_w = np.empty_like(poses.p_wb)
     for rows in np.split(np.arange(len(t)), breaks):
         first, after = int(rows[0]), int(rows[-1]) + 1
@@ -228,7 +220,7 @@ def truth_velocity(
             around = slice(max(first - 1, 0), min(first + 2, len(t)))
             v_w[rows] = (poses.p_wb[around][-1] - poses.p_wb[around][0]) / (t[around][-1] - t[around][0])
         else:
-            v_w[first:after] = _slopes(t[first:after], poses.p_wb[first:after], window, order)
+            v_w[first:after] = _slopes(t[first:after], poses.p_wb[first:after], window, VELOCITY_ORDER)
     return v_w
 
 

@@ -14,9 +14,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import median_filter, percentile_filter
 
-from imutool.array_types import Bool, Float, Float64, Int64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import ConfigError, DataError
-from imutool.inertial.kinematics import G_W, Trajectory, continuous
+from imutool.inertial.kinematics import Trajectory, continuous
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.smoothing import Penalised, Samples
@@ -110,7 +110,7 @@ class SmoothMotion:
         t_s = seconds(t_ns, self.start_ns)
         return np.asarray(np.any([(t_s >= stretch.start_s) & (t_s <= stretch.end_s) for stretch in self.stretches], axis=0))
 
-    def ideal_motions(self, rate_hz: float, g_w: Float[np.ndarray, "3"] = G_W) -> list[IdealMotion]:
+    def ideal_motions(self, rate_hz: float) -> list[IdealMotion]:
         """Ideal IMU signals of the tracked point in each stretch, at k / rate from `start_ns`.
 
         A stretch too short for four samples of that clock is left out.
@@ -124,15 +124,15 @@ class SmoothMotion:
         for stretch in self.stretches:
             first, last = int(np.ceil(stretch.start_s * rate_hz)), int(np.floor(stretch.end_s * rate_hz))
             if last - first >= 3:
-                found.append(self._ideal(stretch, np.arange(first, last + 1) / rate_hz, g_w))
+                found.append(self._ideal(stretch, np.arange(first, last + 1) / rate_hz))
         return found
 
-    def _ideal(self, stretch: Stretch, t_s: Times, g_w: Float[np.ndarray, "3"]) -> IdealMotion:
+    def _ideal(self, stretch: Stretch, t_s: Times) -> IdealMotion:
         from scipy.spatial.transform import Rotation
 
         motion = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
         R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
-        return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=g_w), motion.alpha_b, np.ascontiguousarray(R_wb))
+        return IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, np.ascontiguousarray(R_wb))
 
 
 def smooth_motion(poses: Poses) -> SmoothMotion:

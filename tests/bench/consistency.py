@@ -8,7 +8,7 @@ The bias: every `TRUTH_S` of a log the gyro's rest bias is measured from the tru
 integration misses), and the difference to the bias in use is weighed by its covariance plus that of the measurement. Attitude
 and velocity: the debiased samples are integrated from a true pose for `WINDOWS_S`, and the errors at the end are weighed by the
 stated covariance of the bias, carried over the window, the white noise of the samples and the poses' own errors
-(`imutool.inertial.error_growth`). Each has three degrees of freedom: honest covariances give a mean of 3; the bounds are
+(`tests/support/error_growth.py`). Each has three degrees of freedom: honest covariances give a mean of 3; the bounds are
 chi-square's. The coverage is the share of windows within the ellipsoids that should hold 68, 95 and 99.7 % of them. With
 `--left-out` each log is judged by the closed form of all others. `--made-up` draws sensors, each with its own size of errors
 and noise, learns each from `TRAINING` logs of one switching-on, and judges it by the exact poses of `TESTS` logs of others:
@@ -42,17 +42,16 @@ from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from support.error_growth import Judged, Motion
 from support.nees import consistency
 from support.switchings_on import Switchings, log
 
 from imutool.bias.io import load
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_covariance import Judged
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
-from imutool.inertial.error_growth import Motion
 from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
 from imutool.recording import Poses, Recording

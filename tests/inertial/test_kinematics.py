@@ -147,18 +147,13 @@ def test_the_spline_passes_through_its_poses_whatever_their_signs() -> None:
     assert np.abs(np.abs(np.sum(back.q_wb_wxyz * poses.q_wb_wxyz, axis=1)) - 1.0).max() < EXACT
 
 
-def test_wider_knots_smooth_the_noise_of_the_poses_away() -> None:
+def test_the_noise_of_the_poses_is_in_the_acceleration() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 6.0, 0.01)
     p = np.stack([np.sin(t), np.cos(t), t], axis=1)
     noisy = Poses(ns(t), p + 1e-3 * rng.normal(size=p.shape), np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)))
-    truth = np.stack([-np.sin(t), -np.cos(t), 0 * t], axis=1)
-
-    def rms(trajectory: Trajectory) -> float:
-        return float(np.sqrt(np.mean((trajectory.at(noisy.t_ns).a_w - truth)[50:-50] ** 2)))
-
-    assert rms(fit_trajectory(noisy)) > 10.0  # 1 mm over (10 ms)²: the reason smoothing exists
-    assert rms(fit_trajectory(noisy, knot_spacing_s=0.5)) < 0.05
+    error = fit_trajectory(noisy).at(noisy.t_ns).a_w - np.stack([-np.sin(t), -np.cos(t), 0 * t], axis=1)
+    assert np.sqrt(np.mean(error[50:-50] ** 2)) > 10.0  # 1 mm over (10 ms)²: the reason smoothing exists
 
 
 def test_an_instant_outside_the_trajectory_is_refused() -> None:
@@ -175,13 +170,10 @@ def test_a_quaternion_spline_through_zero_is_refused() -> None:
         trajectory.at(ns(np.array([0.5])))
 
 
-def test_too_few_poses_and_knots_without_poses_are_refused() -> None:
-    t = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 5.0, 5.1, 5.2, 5.3])
-    poses = Poses(ns(t), still(t), np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)))
+def test_too_few_poses_are_refused() -> None:
+    t = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
     with pytest.raises(DataError, match="more than 5"):
-        fit_trajectory(poses.rows(slice(0, 5)))
-    with pytest.raises(DataError, match="knots without support"):
-        fit_trajectory(poses, knot_spacing_s=0.1)
+        fit_trajectory(Poses(ns(t), still(t), np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))))
 
 
 def test_standard_gravity_points_down_and_cannot_be_changed_by_accident() -> None:

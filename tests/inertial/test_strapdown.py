@@ -191,7 +191,7 @@ def cubic(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def test_on_an_even_clock_the_velocity_is_scipys_savitzky_golay_derivative() -> None:
     p = np.cumsum(np.random.default_rng(1).normal(size=(500, 3)), axis=0)
-    got = truth_velocity(poses_at(np.arange(500) * RATE_NS, p), window_s=0.2, order=3)
+    got = truth_velocity(poses_at(np.arange(500) * RATE_NS, p))
     assert np.abs(got - savgol_filter(p, 41, 3, deriv=1, delta=0.005, axis=0, mode="interp")).max() < 1e-7
 
 

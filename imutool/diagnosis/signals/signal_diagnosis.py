@@ -29,7 +29,7 @@ from imutool.diagnosis.signals.noise import lsb_of, rich_residual, whitened
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
-from imutool.sensor.robot_effects import joint_effort, joint_transmission, magnetometer, position_sensors, wheel
+from imutool.sensor.robot_effects import joint_effort, joint_transmission, wheel, world_sensors
 
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
@@ -48,9 +48,9 @@ CATALOGUE = {
     ),
     "positions": (joint_transmission.position_effects,),
     "wheels": (wheel.effects,),
-    "magnetic": (magnetometer.effects,),
-    "pressure": (position_sensors.barometer_effects,),
-    "gnss": (position_sensors.gnss_effects,),
+    "magnetic": (world_sensors.magnetometer_effects,),
+    "pressure": (world_sensors.barometer_effects,),
+    "gnss": (world_sensors.gnss_effects,),
 }
 """Effects by the kind of a signal; a single column has those of any signal too."""
 CONSTANTS = {

@@ -61,6 +61,16 @@ def _numbers_of(rows: UInt8[np.ndarray, "n L"], layout: Layout, which: int = 0) 
     return rows[:, at : at + 8 * count].view("<f8")
 
 
+def _stamped(
+    kind: str, stamp_ns: Int64[np.ndarray, " n"], frame_id: str
+) -> tuple[UInt8[np.ndarray, "n L"], Float64[np.ndarray, "n k"]]:
+    """Messages of one frame with their stamps, and their numbers as a view."""
+    layout = layout_of(kind, "cdr", texts=[frame_id])
+    rows = _blank(len(stamp_ns), layout)
+    _put_stamp(rows, layout, stamp_ns)
+    return rows, _numbers_of(rows, layout)
+
+
 def encode_imu(
     stamp_ns: Int64[np.ndarray, " n"],
     gyro: Float64[np.ndarray, "n 3"],
@@ -77,10 +87,7 @@ def encode_imu(
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
     """
-    layout = layout_of(IMU, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
+    rows, numbers = _stamped(IMU, stamp_ns, frame_id)
     numbers[:, ORIENTATION.stop - 1] = 1.0
     numbers[:, ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
     numbers[:, GYRO], numbers[:, ACCEL] = gyro, accel
@@ -102,10 +109,7 @@ def encode_pose(
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
     """
-    layout = layout_of(POSE, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
+    rows, numbers = _stamped(POSE, stamp_ns, frame_id)
     numbers[:, POSITION], numbers[:, XYZW] = p_wb, q_wb_wxyz[:, _XYZW_FROM_WXYZ]
     return rows
 
@@ -153,10 +157,8 @@ def encode_vector3(
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
     """
-    layout = layout_of(VECTOR3, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    _numbers_of(rows, layout)[:] = vector
+    rows, numbers = _stamped(VECTOR3, stamp_ns, frame_id)
+    numbers[:] = vector
     return rows
 
 
@@ -174,10 +176,7 @@ def encode_twist(
     Raises:
         DataError: a stamp beyond the 32-bit seconds of ROS 2.
     """
-    layout = layout_of(TWIST, "cdr", texts=[frame_id])
-    rows = _blank(len(stamp_ns), layout)
-    _put_stamp(rows, layout, stamp_ns)
-    numbers = _numbers_of(rows, layout)
+    rows, numbers = _stamped(TWIST, stamp_ns, frame_id)
     numbers[:, :3], numbers[:, 3:6] = linear, angular
     halves, swapped = numbers[:, 6:].reshape(-1, 2, 3, 2, 3), covariance.reshape(-1, 2, 3, 2, 3)
     for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):

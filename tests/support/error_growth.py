@@ -16,9 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Bool, Float64
+from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.temperature_drift import with_drift, without_drift
+from imutool.bias_start.bias_covariance import BiasEstimator, Roots
+from imutool.bias_start.initial_bias import InitialBias
 from imutool.geometry import quaternion
 from imutool.inertial.preintegration import EYE, hat
-from imutool.inertial.strapdown import GRAVITY_W
+from imutool.inertial.strapdown import GRAVITY_W, with_velocity
+from imutool.recording import Imu, Poses, seconds
+from imutool.units import SENSORS
 
 Vector6 = Float64[np.ndarray, "6"]
 LEAST_TRUSTED = 0.5  # share of a window's samples with truth
@@ -149,3 +155,40 @@ def pose_errors(motion: Motion, noise: Vector6) -> Vector6:
     leaned = 2.0 * attitude * float(np.mean([(known[k].by_pose[3:, :3] ** 2).sum(axis=1) for k in follows]))
     velocity = max(float(square[3:].mean()) - leaned, 0.0) / 6.0
     return np.repeat(np.sqrt([attitude, velocity]), 3)
+
+
+class Judged:
+    """Debiased samples of a log with their stated covariance, to be judged by true poses.
+
+    `pose_std` is that of the poses (rad, m/s) if it is known; else the log shows it, and where it is too short it is NaN.
+    """
+
+    def __init__(
+        self, model: BiasModel, start: InitialBias, imu: Imu, truth: Poses, pose_std: Float64[np.ndarray, "6"] | None = None
+    ) -> None:
+        t_s, u = seconds(imu.t_ns, int(imu.t_ns[0])), np.concatenate([imu.gyro, imu.accel], axis=1)
+        steady = without_drift(model, imu)
+        poses, trusted = with_velocity(truth).at(imu.t_ns)
+        assert poses.v_w is not None
+        self.bias, rest, self.roots = BiasEstimator(model, start).parts(t_s, steady.gyro, steady.accel)
+        self.bias, rest = with_drift(model, imu.t_ns, self.bias, rest)
+        self.motion = Motion(t_s, u - self.bias, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted)
+        self.stated = BiasCovariance(rest, _stacked(self.roots, len(t_s)))
+        self._noise = np.where(model.noise_std > 0, model.noise_std, start.noise)
+        self._pose_std = pose_errors(self.motion, self._noise) if pose_std is None else pose_std
+
+    def errors(self, window_s: float, from_s: float = 0.0) -> Grown:
+        """Errors of integration over windows one after another, and their covariance; none where the poses are unknown."""
+        windows = self.motion.windows(window_s, from_s) if np.isfinite(self._pose_std).all() else []
+        return grown(self.motion, windows, self.stated, self._noise, self._pose_std)
+
+
+def _stacked(roots: Roots, n: int) -> Float64[np.ndarray, "n 6 p"]:
+    """Roots of both sensors, whose unknowns are independent."""
+    parts = {sensor: roots.get(sensor, np.zeros((n, 3, 0))) for sensor in SENSORS}
+    out = np.zeros((n, 6, sum(part.shape[2] for part in parts.values())))
+    first = 0
+    for sensor, part in parts.items():
+        out[:, COLUMNS[sensor], first : first + part.shape[2]] = part
+        first += part.shape[2]
+    return out

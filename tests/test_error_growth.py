@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.error_growth import BiasCovariance, Grown, Motion, grown, pose_errors
 from support.nees import consistency
 
-from imutool.inertial.error_growth import BiasCovariance, Grown, Motion, grown, pose_errors
 from imutool.sensor.made_up_flight import FlightSettings, trajectory
 
 LENGTH_S, RATE_HZ = 60.0, 100.0

@@ -1,12 +1,20 @@
-"""Magnetometer: soft iron, misalignment and declination; a constant is hard iron.
+"""Sensors of the world: magnetometer, barometer, GNSS.
 
-m = S R m_0 + h with S symmetric (Gebre-Egziabher and others, Calibration of strapdown magnetometers in the magnetic field
-domain, J. Aerospace Eng. 19, 2006); the declination turns the field about the vertical of the world.
+Magnetometer: soft iron, misalignment and declination; a constant is hard iron. m = S R m_0 + h with S symmetric
+(Gebre-Egziabher and others, Calibration of strapdown magnetometers in the magnetic field domain, J. Aerospace Eng. 19, 2006);
+the declination turns the field about the vertical of the world.
+
+Barometer: dynamic pressure and temperature. p = p_static + C rho v² / 2 (Bolanakis, MEMS barometers toward vertical position
+detection, 2017, section 4), and a share of the temperature. Its lag is the `low_pass` of any signal.
+
+GNSS antenna: lever arm and latency. A position is p = p_body + R_wb r (Groves, Principles of GNSS, Inertial, and Multisensor
+Integrated Navigation Systems, section 14.3), sampled `delay` before its stamp.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +25,7 @@ from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
 from imutool.units import AXES
 
+AIR_KG_M3 = 1.225
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -32,18 +41,18 @@ def _misaligned(s: SignalSamples, theta: Theta) -> SignalSamples:
     return s.but(s.y @ Rotation.from_rotvec(theta).as_matrix())
 
 
-def attitude(s: SignalSamples) -> Float64[np.ndarray, "n 3 3"]:
+def _attitude(s: SignalSamples) -> Float64[np.ndarray, "n 3 3"]:
     """R_wb at the samples, from the state."""
     return np.asarray(np.stack([s.state[f"R{i}{j}"] for i in range(3) for j in range(3)], axis=1).reshape(-1, 3, 3))
 
 
 def _declined(s: SignalSamples, theta: Theta) -> SignalSamples:
-    R = attitude(s)
+    R = _attitude(s)
     field = np.einsum("nij,nj->ni", R, s.y) @ Rotation.from_rotvec([0.0, 0.0, theta[0]]).as_matrix().T
     return s.but(np.einsum("nji,nj->ni", R, field))
 
 
-def effects(scale: Scale) -> Iterator[Effect]:
+def magnetometer_effects(scale: Scale) -> Iterator[Effect]:
     """Soft iron, misalignment, and with an attitude the declination."""
     entries = tuple(Parameter(AXES[i] + AXES[j], "-", 0.1) for i, j in PAIRS)
     yield scale.effect(
@@ -74,10 +83,49 @@ def effects(scale: Scale) -> Iterator[Effect]:
             "it rolls or pitches as well as it turns",
             starts=[np.zeros(1)],
         )
-    yield delay(scale, "delay")
+    yield _delay(scale, "delay")
 
 
-def delay(scale: Scale, name: str) -> Effect:
+@dataclass(frozen=True)
+class _Temperature:
+    name: str
+
+    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        values = s.channel(self.name)
+        return s.with_added(0, theta[0] * (values - values.mean()))
+
+
+def _dynamic(s: SignalSamples, theta: Theta) -> SignalSamples:
+    return s.with_added(0, theta[0] * 0.5 * AIR_KG_M3 * s.state["speed"] ** 2)
+
+
+def barometer_effects(scale: Scale) -> Iterator[Effect]:
+    """Dynamic pressure where the log has a speed, temperature where it has one."""
+    if scale.state.get("speed", 0.0) > 0.0:
+        number = (Parameter("coefficient", "-", 1.0),)
+        text = "pressure += coefficient rho speed^2 / 2, rho = 1.225 kg/m³"
+        yield scale.effect("dynamic_pressure", (0,), text, number, _dynamic, "the speed varies")
+    for name in scale.state:
+        if "temperature" in name.lower():
+            number = (Parameter("slope", f"{scale.units[0]}/K", 50.0),)
+            text = f"pressure += slope ({name} - mean)"
+            forward = _Temperature(name)
+            yield scale.effect("pressure_temperature", (0,), text, number, forward, "the temperature varies", variable=name)
+
+
+def _arm(s: SignalSamples, theta: Theta) -> SignalSamples:
+    return s.but(s.y + np.einsum("nij,j->ni", _attitude(s), theta))
+
+
+def gnss_effects(scale: Scale) -> Iterator[Effect]:
+    """Lever arm where the log has an attitude, and latency."""
+    if "R00" in scale.state:
+        numbers = tuple(Parameter(axis, "m", 1.0) for axis in AXES)
+        yield scale.effect("gnss_lever_arm", scale.columns, "position += R_wb r", numbers, _arm, "it turns")
+    yield _delay(scale, "latency")
+
+
+def _delay(scale: Scale, name: str) -> Effect:
     """A delay of all columns together."""
     step = 0.005 * min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))
     starts = [np.zeros(1)] if abs(scale.lag_s) < 1e-9 else [np.zeros(1), np.array([scale.lag_s])]
