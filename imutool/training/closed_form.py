@@ -18,6 +18,7 @@ from torch import Tensor
 from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.threads import of_each
 from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
@@ -111,28 +112,31 @@ def solve(
     own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
     prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
     fixed: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
+
+    def equations(of_length: tuple[Int[Tensor, " k"], int]) -> tuple[Float[Tensor, "u u"], Float[Tensor, " u"]]:
+        first, n = of_length
+        windows = pool.windows(first, n, rest[pool.log[first]])
+        if n not in fixed:
+            carried = carried_attitudes(model, windows) if sensor == "accel" else None
+            fixed[n] = carried, model.motion_bias(sensor, windows.segment)
+        e, A = sensor_residual(model, sensor, windows, W if matrix else None, *fixed[n])
+        rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
+        by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
+        apart = own.clone()
+        apart[:, turns] -= own[:, turns].mean(0)  # what the rotations of all logs share is the matrix's
+        e = e + (by_nuisance @ apart[windows.log, 3:, None])[..., 0]
+        J = _by_log(torch.cat([A.sum(1), by_nuisance], dim=2), windows.log, len(own), turns)
+        if matrix:
+            u, _ = windows.segment.of(sensor)
+            J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
+        weight = _weight(e, windows.log, pool.least(sensor))
+        return torch.einsum("m,mij,mik->jk", weight, J, J), torch.einsum("m,mij,mi->j", weight, J, e)
+
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
         own[:, :3] = rest[:, columns]
-        now = torch.cat([W.flatten()[:known], own.flatten()])
-        H, g = torch.diag(prior), prior * now
-        for first, n in sets:
-            windows = pool.windows(first, n, rest[pool.log[first]])
-            if n not in fixed:
-                carried = carried_attitudes(model, windows) if sensor == "accel" else None
-                fixed[n] = carried, model.motion_bias(sensor, windows.segment)
-            e, A = sensor_residual(model, sensor, windows, W if matrix else None, *fixed[n])
-            rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
-            by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
-            apart = own.clone()
-            apart[:, turns] -= own[:, turns].mean(0)  # what the rotations of all logs share is the matrix's
-            e = e + (by_nuisance @ apart[windows.log, 3:, None])[..., 0]
-            J = _by_log(torch.cat([A.sum(1), by_nuisance], dim=2), windows.log, len(own), turns)
-            if matrix:
-                u, _ = windows.segment.of(sensor)
-                J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
-            weight = _weight(e, windows.log, pool.least(sensor))
-            H += torch.einsum("m,mij,mik->jk", weight, J, J)
-            g += torch.einsum("m,mij,mi->j", weight, J, e)
+        H, g = torch.diag(prior), prior * torch.cat([W.flatten()[:known], own.flatten()])
+        for by_H, by_g in of_each(equations, sets):
+            H, g = H + by_H, g + by_g
         step = -torch.linalg.solve(H, g)
         if matrix:
             W = W + step[:9].reshape(3, 3)

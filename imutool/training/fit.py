@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -23,12 +23,13 @@ from imutool import registry
 from imutool.array_types import Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.threads import of_each
 from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.training import closed_form, statistics
 from imutool.training.increments import IncrementObjective
-from imutool.training.objective import Objective, RestBiases, WindowEndObjective, error
+from imutool.training.objective import BATCH_SAMPLES, Objective, RestBiases, WindowEndObjective, error
 from imutool.training.segments import Pool, corrected, sensors_up_to
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
@@ -122,8 +123,11 @@ class Training:
         self.stage: Stage | None = None
         self.turn_on: statistics.TurnOn | None = None
 
-    def epochs(self) -> Iterator[Epoch]:
-        """Train and yield progress; a caller may stop and resume between two yields."""
+    def epochs(self, *, statistics: bool = True) -> Iterator[Epoch]:
+        """Train and yield progress; a caller may stop and resume between two yields.
+
+        Without `statistics` they are left to `store_statistics`, for a model that may not be kept.
+        """
         for sensor in SENSORS:
             if sensor in self.done:
                 continue
@@ -135,6 +139,11 @@ class Training:
             self.model.load_state_dict(self.stage.mean.module.state_dict() if better else self.stage.closed_form)
             self.stage.objective.settle()
             self.done[sensor], self.stage = min(last, self.stage.before), None
+        if statistics:
+            self.store_statistics()
+
+    def store_statistics(self) -> None:
+        """Store priors, spreads and noise in the model, which is final then."""
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
         self.turn_on = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
@@ -153,8 +162,8 @@ class Training:
         solved = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, part="held_out", nuisances=False)
         rest[:, columns] = solved.rest
         with torch.no_grad():
-            parts = torch.split(first, 64)
-            errors = torch.cat([error(scored, sensor, pool.windows(f, n, rest[pool.log[f]])) for f in parts])
+            parts = torch.split(first, max(1, BATCH_SAMPLES // n))
+            errors = torch.cat(of_each(lambda some: error(scored, sensor, pool.windows(some, n, rest[pool.log[some]])), parts))
         kept = errors.sort().values[: max(1, int(TRIM * len(errors)))]
         return float(kept.mean())
 
@@ -228,22 +237,34 @@ class Training:
         for group in stage.optimizer.param_groups:
             group["lr"] = rate
         self._set_training(stage)
-        # the losses are means over windows; a second of data counts once against the walk
-        total = self.tracks.wandering(stage.sensor) / (len(self.pool.t) / self.pool.rate_hz)
-        for term in stage.objective.terms(self.generator):
-            total = total + term
-        stage.optimizer.zero_grad()
-        total.backward()  # type: ignore[no-untyped-call]
-        if not bool(torch.isfinite(total)):
+        total = self._descent_direction(stage)
+        if not math.isfinite(total):
             raise NumericsError(
-                f"the loss is {float(total.detach())} at step {stage.step} of the {stage.sensor} stage",
+                f"the loss is {total} at step {stage.step} of the {stage.sensor} stage",
                 expected="a finite loss",
                 fix=f"Lower the setting {stage.sensor}_rate",
             )
         stage.optimizer.step()
         stage.mean.update_parameters(self.model)
         stage.step += 1
-        return float(total.detach())
+        return total
+
+    def _descent_direction(self, stage: Stage) -> float:
+        """Put the gradient of a step's loss at the weights; the loss."""
+        free = [tensor for group in stage.optimizer.param_groups for tensor in group["params"]]
+
+        def derived(term: Callable[[], Tensor]) -> tuple[float, tuple[Tensor | None, ...]]:
+            loss = term()
+            return float(loss.detach()), torch.autograd.grad(loss, free, allow_unused=True)
+
+        def wandering() -> Tensor:  # the losses are means over windows; a second of data counts once against the walk
+            return self.tracks.wandering(stage.sensor) / (len(self.pool.t) / self.pool.rate_hz)
+
+        losses, gradients = zip(*of_each(derived, [*stage.objective.terms(self.generator), wandering]), strict=True)
+        for tensor, *parts in zip(free, *gradients, strict=True):
+            there = [part for part in parts if part is not None]
+            tensor.grad = torch.stack(there).sum(0) if there else None
+        return math.fsum(losses)
 
     def _set_training(self, stage: Stage) -> None:
         """Puts the parts of the stage's sensor, and no others, where batch norm and dropout do what they do in training.

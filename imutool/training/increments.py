@@ -10,7 +10,7 @@ samples there is nothing an integrated attitude would know better.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -94,13 +94,16 @@ class IncrementObjective(Objective):
         joined = {n: [torch.cat(column) for column in zip(*(part[n] for part in parts), strict=True)] for n in self.lengths}
         return {n: median_per_log(size, log, least) for n, (size, log) in joined.items()}
 
-    def terms(self, generator: torch.Generator) -> Iterator[Float[Tensor, ""]]:
-        """One term a length, the mean over all increments of a few stretches, drawn from all logs alike."""
+    def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
+        """One function for the sum of all lengths, each the mean over a few stretches, drawn from all logs alike."""
         count = max(1, self.settings.samples // self.stretch)
         chosen = torch.randint(len(self.first), (count,), generator=generator).to(self.first.device)
-        for n, (size, log) in self.errors(self.first[chosen]).items():
-            if len(size):
-                yield self.loss(size, log, n)
+
+        def term() -> Float[Tensor, ""]:
+            found = [self.loss(size, log, n) for n, (size, log) in self.errors(self.first[chosen]).items() if len(size)]
+            return torch.stack(found).sum() if found else self.tracks.knots.sum() * 0.0
+
+        return [term]
 
     def settle(self) -> None:
         """Solves for the rest biases over long windows: short increments hardly show them, and the model kept is older."""

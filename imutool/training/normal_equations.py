@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from imutool.array_types import Float, Float64, Int
+from imutool.bias.networks.threads import of_each
 from imutool.errors import DataError
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
@@ -235,8 +236,8 @@ def _equations(
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
     """Normal equations of the windows of one length, and their usual residual; `shorter` is that of shorter windows."""
     pool, n = seen.pool, windows.n
-    residuals, slopes = [], []
-    for some in torch.split(windows.first, max(1, CHUNK // n)):
+
+    def derived(some: Int[Tensor, " m"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 k"]]:
         index = some[:, None] + torch.arange(n + 1, device=some.device)
         cut = pool.windows(some, n, pool.t.new_zeros(len(some), 6))
         u = pool.gyro if seen.sensor == "gyro" else pool.accel
@@ -246,8 +247,9 @@ def _equations(
         each = 0.5 * (each[:, :-1] + each[:, 1:]) if seen.sensor == "gyro" else each  # rates hold between samples
         S = A.permute(0, 2, 3, 1).flatten(1, 2) @ each
         by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
-        residuals.append(e)
-        slopes.append(torch.cat([by_theta, A.sum(1), by_nuisance], dim=2))
+        return e, torch.cat([by_theta, A.sum(1), by_nuisance], dim=2)
+
+    residuals, slopes = zip(*of_each(derived, torch.split(windows.first, max(1, CHUNK // n))), strict=True)
     equations, usual = _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], shorter)
     return equations.times(1.0 / design_effect(pool)), usual
 
@@ -280,11 +282,13 @@ def _summed(
     usual = median_per_log(size, log, shorter)
     delta = HUBER_MEDIANS * usual[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / REPEATED
-    parts = [log == i for i in range(logs)]
-    H = torch.stack([torch.einsum("m,mij,mik->jk", weight[m], J[m], J[m]) for m in parts])
-    g = torch.stack([torch.einsum("m,mij,mi->j", weight[m], J[m], e[m]) for m in parts])
-    c = torch.stack([(weight[m] * e[m].square().sum(1)).sum() for m in parts])
-    return Equations(H, g, c), usual
+
+    def of_log(i: int) -> tuple[Float[Tensor, "k k"], Float[Tensor, " k"], Float[Tensor, ""]]:
+        w, J_i, e_i = (x[log == i] for x in (weight, J, e))
+        H, g = torch.einsum("m,mij,mik->jk", w, J_i, J_i), torch.einsum("m,mij,mi->j", w, J_i, e_i)
+        return H, g, (w * e_i.square().sum(1)).sum()
+
+    return Equations(*(torch.stack(parts) for parts in zip(*of_each(of_log, range(logs)), strict=True))), usual
 
 
 def _terms(signals: Signals, effects: Sequence[LinearForm]) -> Float64[np.ndarray, "n q"]:

@@ -12,7 +12,8 @@ a turn-on bias or its drift is not attributed to the motion.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.threads import of_each
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
@@ -133,7 +135,7 @@ def length(v: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch"]:
 
 
 USUAL_SAMPLES = 200_000  # enough for a median
-BATCH = 64  # windows at a time where no gradient is kept
+BATCH_SAMPLES = 40_000  # at a time where no gradient is kept
 
 
 class Objective(ABC):
@@ -158,8 +160,8 @@ class Objective(ABC):
         """The median error of each log, for each length in samples."""
 
     @abstractmethod
-    def terms(self, generator: torch.Generator) -> Iterator[Float[Tensor, ""]]:
-        """The parts of one step's loss, on a batch drawn with the generator."""
+    def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
+        """Functions for the parts of one step's loss, on a batch drawn with the generator; the longest first."""
 
     @abstractmethod
     def settle(self) -> None:
@@ -186,17 +188,21 @@ class WindowEndObjective(Objective):
         usual = {}
         for n, first in self.pools:
             some = first[:: max(1, -(-len(first) * n // USUAL_SAMPLES))]
-            size = torch.cat([self.errors(part, n) for part in torch.split(some, BATCH)])
+            size = torch.cat(of_each(partial(self.errors, n=n), torch.split(some, max(1, BATCH_SAMPLES // n))))
             usual[n] = median_per_log(size, self.pool.log[some], self.pool.least(self.sensor))
         return usual
 
-    def terms(self, generator: torch.Generator) -> Iterator[Float[Tensor, ""]]:
+    def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
         """One term a length, over windows drawn from all logs alike."""
+        terms = []
         for n, first in self.pools:
             count = max(4, self.settings.samples // n)
             chosen = torch.randint(len(first), (count,), generator=generator).to(first.device)
-            size = self.errors(first[chosen], n)
-            yield self.loss(size, self.pool.log[first[chosen]], n)
+            terms.append(partial(self._term, first[chosen], n))
+        return terms[::-1]
+
+    def _term(self, first: Int[Tensor, " m"], n: int) -> Float[Tensor, ""]:
+        return self.loss(self.errors(first, n), self.pool.log[first], n)
 
     def settle(self) -> None:
         """Nothing: windows of many seconds have shown the rest biases as well as anything can."""

@@ -6,6 +6,7 @@ import json
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from imutool.bias import hybrid, io, linear, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode as neural_ode_network
 from imutool.bias.networks.network import BiasNetwork
+from imutool.bias.networks.threads import side_by_side
 from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
 from imutool.errors import ConfigError
@@ -88,15 +90,9 @@ def train(
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
     descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
-    if method == hybrid.Model.method:
-        model, about = _physics_first(recordings, chosen, descent)
-    elif method == linear.Model.method:
-        model, about = _linear(recordings, chosen, descent)
-    elif method == neural_ode.Model.method:
-        model, about = _drift_first(recordings, chosen, descent)
-    else:
-        training = descent(recordings, method, chosen)
-        model, about = training.model, {"held_out": _held_out(training), **_turn_on(training)}
+    way: Way = WAYS[method] if method in WAYS else partial(_network_alone, method)
+    with side_by_side():
+        model, about = way(recordings, chosen, descent)
     model.card = _card(method, chosen, parts) | about | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
     io.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
@@ -113,7 +109,13 @@ class _Descent:
     say: Callable[[Epoch], None]
 
     def __call__(
-        self, recordings: Sequence[Recording], method: str, settings: TrainSettings, constant: Collection[Sensor] = ()
+        self,
+        recordings: Sequence[Recording],
+        method: str,
+        settings: TrainSettings,
+        constant: Collection[Sensor] = (),
+        *,
+        statistics: bool = True,
     ) -> Training:
         training = Training(recordings, method, settings, self.device, constant)
         if training.model.iterative:
@@ -122,7 +124,7 @@ class _Descent:
             else:
                 self.kept.unlink(missing_ok=True)
         try:
-            for epoch in training.epochs():
+            for epoch in training.epochs(statistics=statistics):
                 self.say(epoch)
                 if training.model.iterative and epoch.step:
                     checkpoint.save(training, self.kept)
@@ -152,13 +154,15 @@ def _physics_first(
         if simpler := simpler_effects(physics.fits, comparison.kept):
             named = msgspec.structs.replace(settings, model=settings.model | simpler)
             physics = PhysicsFirst.of(recordings, named, descent.device, descent.say)
-            without = descent(physics.recordings, static.Model.method, alone)
+            without = descent(physics.recordings, static.Model.method, alone, statistics=False)
     held_out: dict[str, Any] = {"effects": _held_out(without)}
     kept = without
     if physics.model.config.remainder:
         ode = descent(physics.recordings, neural_ode.Model.method, physics.ode_settings(settings))
         held_out["effects and neural_ode"] = _held_out(ode)
         kept = ode if helps(without.done, ode.done) else without
+    if kept.turn_on is None:
+        kept.store_statistics()
     model = physics.finish(kept.model)
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
@@ -236,6 +240,18 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
         constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
     training = descent(recordings, linear.Model.method, settings, constant)
     return training.model, {"held_out": _held_out(training), **_turn_on(training)} | compared
+
+
+def _network_alone(
+    method: str, recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent
+) -> tuple[BiasNetwork, dict[str, Any]]:
+    """Network without effects; the card's entries."""
+    training = descent(recordings, method, settings)
+    return training.model, {"held_out": _held_out(training), **_turn_on(training)}
+
+
+Way = Callable[[Sequence[Recording], TrainSettings, _Descent], tuple[BiasNetwork, dict[str, Any]]]
+WAYS: dict[str, Way] = {"hybrid": _physics_first, "linear": _linear, "neural_ode": _drift_first}
 
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from imutool.array_types import Float, Float64
 from imutool.bias.model import COLUMNS, Vector6
 from imutool.bias.networks.network import BiasNetwork, Segment
+from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
@@ -174,21 +175,25 @@ def _walk(
 @torch.no_grad()
 def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
     """How far a rest bias from `TRUTH_S` of truth lies from its log's, as a robust standard deviation."""
-    n, off = pool.samples(TRUTH_S), []
-    for log in range(len(pool.names)):
-        rows = torch.nonzero(pool.log == log)[:, 0]
-        for first in rows[:: max(1, n // 2)].tolist():
-            some = rows[(rows >= first) & (rows <= first + n)]
-            trusted = pool.trusted[some]
-            if len(some) <= n or not bool(trusted[0]) or float(trusted.double().mean()) < LEAST_TRUSTED:
-                continue
-            u = torch.cat([pool.gyro[some], pool.accel[some]], dim=1)
-            t = pool.t[some] - pool.t[some[0]]
-            segment = Segment(t[None], u[None, :, :3], u[None, :, 3:], rest[log][None])
-            left = (u - model(segment)[0]).cpu().double().numpy()
-            q_wb_wxyz = so3.quaternion_wxyz_from_matrix(pool.R_wb[some].double())
-            seconds, q, v_w = (x.cpu().double().numpy() for x in (t, q_wb_wxyz, pool.v_w[some]))
-            off.append(bias_from_truth(seconds, left, q, v_w, trusted.cpu().numpy()))
+    n = pool.samples(TRUTH_S)
+    rows_of = [torch.nonzero(pool.log == log)[:, 0] for log in range(len(pool.names))]
+
+    def missed(start: tuple[int, int]) -> Vector6 | None:
+        log, first = start
+        some = rows_of[log][(rows_of[log] >= first) & (rows_of[log] <= first + n)]
+        trusted = pool.trusted[some]
+        if len(some) <= n or not bool(trusted[0]) or float(trusted.double().mean()) < LEAST_TRUSTED:
+            return None
+        u = torch.cat([pool.gyro[some], pool.accel[some]], dim=1)
+        t = pool.t[some] - pool.t[some[0]]
+        segment = Segment(t[None], u[None, :, :3], u[None, :, 3:], rest[log][None])
+        left = (u - model(segment)[0]).cpu().double().numpy()
+        q_wb_wxyz = so3.quaternion_wxyz_from_matrix(pool.R_wb[some].double())
+        seconds, q, v_w = (x.cpu().double().numpy() for x in (t, q_wb_wxyz, pool.v_w[some]))
+        return bias_from_truth(seconds, left, q, v_w, trusted.cpu().numpy())
+
+    starts = [(log, first) for log, rows in enumerate(rows_of) for first in rows[:: max(1, n // 2)].tolist()]
+    off = [bias for bias in of_each(missed, starts) if bias is not None]
     if len(off) < FEWEST_STARTS:
         return torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
     floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)

@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 
 from imutool.bias import io
 from imutool.bias.io import load
+from imutool.bias.networks.threads import side_by_side
 from imutool.bias_start import initial_bias
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
@@ -90,6 +91,16 @@ def test_one_seed_gives_the_same_bits(recordings: list[Recording], uninterrupted
     epochs = finish(again)
     assert same(again, uninterrupted[0])
     assert [without_clock(epoch) for epoch in epochs] == [without_clock(epoch) for epoch in uninterrupted[1]]
+
+
+def test_more_threads_give_the_same_bits(recordings: list[Recording], uninterrupted: tuple[Training, list[Epoch]]) -> None:
+    torch.set_num_threads(3)
+    with side_by_side():
+        assert torch.get_num_threads() == 1
+        again = Training(recordings, "neural_ode", TINY)
+        finish(again)
+    assert torch.get_num_threads() == 3
+    assert same(again, uninterrupted[0])
 
 
 def test_another_seed_gives_another_model(recordings: list[Recording], uninterrupted: tuple[Training, list[Epoch]]) -> None:

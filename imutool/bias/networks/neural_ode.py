@@ -20,6 +20,7 @@ from imutool.bias.networks import joint_ode
 from imutool.bias.networks.joint_ode import JointField
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.ode import HermitePath
+from imutool.bias.networks.perceptron import asinh, by_rows, euler_steps, perceptron
 from imutool.bias.neural_ode import DRIFT_FILTER_S, HIDDEN, NEAR_ZERO, SLOW_S, Config, Model
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
@@ -46,8 +47,8 @@ class Curve(nn.Module):
     def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
         x, s = u / self.scale, slow / self.scale
-        inputs = torch.cat([x, torch.asinh(NEAR_ZERO * x), torch.asinh(NEAR_ZERO * s)], dim=-1)
-        bend: Tensor = self.net(inputs) - self.net(u.new_zeros(9))
+        inputs = torch.cat([x, asinh(NEAR_ZERO * torch.cat([x, s], dim=-1))], dim=-1)
+        bend = by_rows(self.net, inputs) - by_rows(self.net, u.new_zeros(9))
         return u @ self.W.mT + self.curve * bend
 
 
@@ -57,7 +58,7 @@ class Drift(nn.Module):
     def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
         super().__init__()
         self.rate = rate
-        self.block1, self.block2 = _perceptron(hidden[0]), _perceptron(hidden[1])
+        self.block1, self.block2 = perceptron(hidden[0]), perceptron(hidden[1])
         self.out = nn.Linear(9, 3)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
@@ -136,7 +137,7 @@ class Network(BiasNetwork):
             return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
         if sensor not in self.config.drift:
             return super().rest_bias(sensor, segment)
-        return self._rest_path(segment.t, *segment.of(sensor), self.drift[sensor])
+        return self._rest_path(segment.t, *segment.of(sensor), _part(self.drift, sensor, Drift))
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Set the linear part of the curve, or of the joint field."""
@@ -145,7 +146,7 @@ class Network(BiasNetwork):
             (_part(self.drift, sensor, JointField) if joint else _part(self.curve, sensor, Curve)).W.copy_(W)
 
     def _rest_path(
-        self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: nn.Module
+        self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: Drift
     ) -> Float[Tensor, "b n 3"]:
         """beta at each sample; the ODE's time is the index on a grid of `stride` samples."""
         n, stride = u.shape[1], self.stride
@@ -189,14 +190,13 @@ class _OnGrid(nn.Module):
 
 
 def _euler(
-    drift: nn.Module, knots: Float[Tensor, "b steps 3"], step_s: Float[Tensor, "b 1"], rest: Float[Tensor, "b 3"]
+    drift: Drift, knots: Float[Tensor, "b steps 3"], step_s: Float[Tensor, "b 1"], rest: Float[Tensor, "b 3"]
 ) -> Float[Tensor, "m b 3"]:
     """Euler's steps, which see the path at its knots alone: there it is the sample, and its slope that to the one before."""
     slopes = torch.diff(knots, dim=1, prepend=knots[:, :1]) / step_s[:, None]
-    beta = [rest]
-    for u, du in zip(knots.unbind(1), slopes.unbind(1), strict=True):
-        beta.append(beta[-1] + step_s * drift(beta[-1], u, du))
-    return torch.stack(beta)
+    motion = (torch.cat([knots, slopes], dim=2) / drift.units[3:]).transpose(0, 1)
+    blocks = (drift.block1, drift.block2)
+    return euler_steps(blocks, drift.out, motion, rest, drift.centre, drift.units[:3], drift.rate * step_s)
 
 
 def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:
@@ -212,11 +212,3 @@ def _part(parts: nn.Module, name: str, kind: type[P]) -> P:
     part = parts.get_submodule(name)
     assert isinstance(part, kind)
     return part
-
-
-def _perceptron(hidden: tuple[int, ...]) -> nn.Sequential:
-    """Perceptron 9 -> hidden -> 9: GELU between hidden layers, tanh before the last."""
-    layers: list[nn.Module] = []
-    for i, (before, width) in enumerate(zip((9, *hidden), hidden, strict=False)):
-        layers += [nn.Linear(before, width), nn.Tanh() if i == len(hidden) - 1 else nn.GELU()]
-    return nn.Sequential(*layers, nn.Linear(hidden[-1], 9))
