@@ -1,4 +1,4 @@
-"""Errors of a reference: short wrong intervals, smoothed poses, and an attitude that is turned throughout.
+"""Errors of a reference: wrong intervals, smoothed poses, a turned attitude.
 
 Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
 and leaves no trace, so where all the rest is noise, the reference is wrong.

@@ -218,13 +218,9 @@ class Candidates:
         derived = self._derived(now)
         allowed = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
         guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
-        best: list[Scored] = []
+        best, enough = list[Scored](), max(count or 0, 1)
         for guess, effect in sorted(guesses, key=lambda entry: entry[0]):
-            if (
-                count is not None
-                and len(best) >= max(count, 1)
-                and guess > min(UNSURE * best[max(count, 1) - 1].log_p, UNLIKELY)
-            ):
+            if count is not None and len(best) >= enough and guess > min(UNSURE * best[enough - 1].log_p, UNLIKELY):
                 break
             if effect.key not in self.scores:
                 linear = [self.score.linear(effect, start) for start in self.starts[effect.key]]
@@ -272,7 +268,10 @@ class Candidates:
 
 
 class Portable(NamedTuple):
-    """Description of a fit for `restored` in another process, and the number of effects without a name that were tried."""
+    """Description of a fit for another process.
+
+    `restored` makes it again; `unnamed` effects without a name were tried.
+    """
 
     chosen: list[tuple[str, list[str], Theta]]
     numbers: dict[str, Any]

@@ -115,7 +115,10 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
 def with_steady_clock(
     logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Mapping[str, Sequence[Theta]]
 ) -> Fit:
-    """Fit with two of offset, skew and jump for a clock that wanders, where they do as well; `starts` by effect."""
+    """Fit with two of offset, skew and jump instead of a clock that wanders.
+
+    If they do as well (BIC); `starts` by effect.
+    """
     others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
     if len(others) == len(now.chosen):
         return now

@@ -27,7 +27,7 @@ PLAIN_FROM, PLAIN_BELOW = 1e-2, 1e5  # outside, a power of ten is taken out in f
 
 @dataclass(frozen=True)
 class Quantity:
-    """Parameters of one vector, matrix or course in time: label, axes (or seconds) and estimates."""
+    """Parameters of one vector, matrix or course in time, with a label."""
 
     label: str
     axes: tuple[str, ...]

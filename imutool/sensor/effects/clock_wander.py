@@ -1,4 +1,4 @@
-"""A clock that wanders: its offset is straight between fixed times, and held beyond the last.
+"""A clock that wanders: its offset is straight between knots in time.
 
 Motion capture and sensor have a clock each, which are corrected now and then: their offset moves by milliseconds in a log.
 """
