@@ -14,12 +14,11 @@ import os
 import pickle
 import queue
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
-from imutool.mcap_io.storage.system import processors
+from imutool.mcap_io.storage.system import can_fork, fork, kill, processors
 
 T = TypeVar("T")
 SIGNALS = signal.SIGINT, signal.SIGTERM
@@ -33,7 +32,7 @@ class _Processes:
 @contextlib.contextmanager
 def forking() -> Iterator[None]:
     """Allow as many processes as processors; none is left at the end, however that comes."""
-    _Processes.allowed = processors() - 1 if sys.platform == "linux" else 0  # elsewhere a fork may harm libraries
+    _Processes.allowed = processors() - 1 if can_fork() else 0
     try:
         yield
     finally:
@@ -79,7 +78,7 @@ def _fork(function: Callable[[], object]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of the progress bar's thread, which the other never needs
-            process = os.fork()
+            process = fork()
         if not process:
             _serve(function, writing)
         os.close(writing)
@@ -110,6 +109,5 @@ def _serve(function: Callable[[], object], writing: int) -> NoReturn:
 
 def _end(process: int) -> None:
     os.close(_Processes.running.pop(process))
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGKILL)
+    kill(process)
     os.waitpid(process, 0)

@@ -268,8 +268,8 @@ def effect_sizes(
 ) -> EffectSizes:
     """Fit effects of the catalogue to a recording, significant or not.
 
-    Unobservable parameters are left out, for example the scale of a gyro axis that never turns. Beside poses their smoothing is
-    fitted too: it looks like a scale.
+    Unobservable parameters are left out, for example the scale of a gyro axis that never turns. `reference_smoothing` among the
+    effects keeps the smoothing of poses, which looks like a scale, out of the others; a short log says less of them then.
 
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
@@ -277,9 +277,11 @@ def effect_sizes(
     simulated, settings = None if sim is None else read_log(sim, imu=imu), DiagnoseSettings()
     aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
-    candidates = candidates_for(pairs)
+    of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)
+    candidates = [effect for effect in candidates_for(pairs) if effect.name not in of_poses]
     logs = [whitened(pair, candidates, settings.band) for pair in pairs]
-    wanted = [*_until_the_end(catalogue.diagnosed(effects), pairs), *(() if sim is not None else (SMOOTHED,))]
+    named = catalogue.diagnosed([name for name in effects if name != SMOOTHED.name])
+    wanted = [*_until_the_end(named, pairs), *((SMOOTHED,) if SMOOTHED.name in effects else ())]
     hidden = set(unobservable(logs, wanted, settings.search))
     observable = []
     for effect in wanted:

@@ -47,6 +47,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.held_out import gains, with_constant
 from imutool.diagnosis.reference_coverage import align, without_unusable
+from imutool.diagnosis.reference_errors import SMOOTHED
 from imutool.diagnosis.result import Closer
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.errors import ImutoolError
@@ -138,7 +139,7 @@ def diagnosed(logs: Sequence[Path], words: Sequence[str] = ()) -> dict[str, Any]
 
 def fixed(log: Path, effects: Sequence[str], truth: str | None = None) -> dict[str, Any]:
     """Effects fitted together to one sequence: parameters with deviations, and their information."""
-    found = effect_sizes(log, truth=truth, effects=effects)
+    found = effect_sizes(log, truth=truth, effects=(*effects, SMOOTHED.name))
     values = {
         f"{physics.name}.{number.name}": [float(value), float(s), number.unit, float(number.plausible)]
         for physics, theta in found.chosen

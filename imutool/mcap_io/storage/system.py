@@ -80,6 +80,24 @@ def processors() -> int:
         return os.cpu_count() or 1
 
 
+def can_fork() -> bool:
+    """Whether a process may copy itself; elsewhere than on Linux that may harm libraries."""
+    return sys.platform == "linux"
+
+
+def fork() -> int:
+    """Copy this process: 0 in the copy, its number here."""
+    if sys.platform == "win32":
+        raise NotImplementedError("a fork")
+    return os.fork()
+
+
+def kill(process: int) -> None:
+    """End a process at once; one that has ended stays so."""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process, -KILLED[0] if sys.platform != "win32" else signal.SIGTERM)
+
+
 def inherited(handle: int) -> dict[str, Any]:
     """Options of `Popen`: a process group of its own, and one end of a connection."""
     if sys.platform == "win32":
