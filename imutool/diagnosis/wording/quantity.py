@@ -37,7 +37,7 @@ class Quantity:
         """`12.4 ± 0.3 ms`, `(0.213, -0.051, 0.120) ± 0.004 m`, the clearest three of many, or the ends of a course."""
         if len(self.estimates) == 1:
             return value(self.estimates[0])
-        if self.axes[0].isdigit():
+        if self.axes[0].startswith("at "):
             least, most = (value(extreme(self.estimates, key=lambda e: e.value)) for extreme in (min, max))
             return f"{least} to {most}"
         if self.axes == AXES:
@@ -83,7 +83,9 @@ def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:
             out.append(Quantity(keys[0], (keys[0],), (estimates[keys[0]],)))
         else:
             axes = tuple(key[len(stem) :].lstrip("._") for key in keys)
-            out.append(Quantity("" if axes[0].isdigit() else stem, axes, tuple(estimates[key] for key in keys)))
+            times = axes[0].isdigit()
+            axes = tuple(f"at {axis} s:" for axis in axes) if times else axes
+            out.append(Quantity("" if times else stem, axes, tuple(estimates[key] for key in keys)))
     return out
 
 
