@@ -73,6 +73,7 @@ class Forked(Generic[T]):
 
 
 def _fork(function: Callable[[], object]) -> int:
+    """Number of the process that runs the function; 0 if the system has none to give."""
     reading, writing = os.pipe()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # or a Ctrl-C would run this process' clean-up in the other
     try:
@@ -81,6 +82,11 @@ def _fork(function: Callable[[], object]) -> int:
             process = fork()
         if not process:
             _serve(function, writing)
+    except OSError:  # no memory or no number is left for one more
+        os.close(reading)
+        os.close(writing)
+        return 0
+    else:
         os.close(writing)
         _Processes.running[process] = reading
     finally:

@@ -149,7 +149,7 @@ class SearchSettings(Settings, frozen=True):
     explained_chi_square: Positive = 1.03  # reduced: below, everything is explained
     hopeless_chi_square: Positive = 2.0  # reduced: above, with many effects, more of the same is no answer
     most_unnamed: Annotated[int, msgspec.Meta(ge=0)] = 2  # effects outside the catalogue
-    unnamed_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03  # of the misfit that each of those has to remove
+    unnamed_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03  # of the misfit: each removes more, a wander too
     beyond_band: Positive = 3.0  # over the poses' band: there their smoothing looks like a mount that rings
     beyond_band_low_pass: Positive = 6.0  # for a low pass: smoothing delays nothing
     slowest_hz: Positive = 0.5  # of a filter or a mount; a slower one is motion that the poses have lost

@@ -150,7 +150,8 @@ class LogIndex:
             raise LogError("the file is empty", expected="an MCAP log")
         start = source.at(0, min(len(MAGIC), source.size))
         if start != MAGIC[: len(start)]:
-            raise LogError(f"this is not an MCAP log: it starts with {start!r}", expected=repr(MAGIC))
+            what = f"this is not an MCAP log: it starts with {start!r}"
+            raise LogError(what, expected=repr(MAGIC), fix="`imutool convert` makes one of other recordings")
         at = source.size - len(MAGIC) - FOOTER_SIZE
         if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise cut_short(source)

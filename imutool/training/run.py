@@ -90,9 +90,9 @@ def train(
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     check_trainable(recordings, Pool.of(recordings))
     descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
-    way: Way = WAYS[method] if method in WAYS else partial(_network_alone, method)
+    trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():
-        model, about = way(recordings, chosen, descent)
+        model, about = trainer(recordings, chosen, descent)
     model.card = _card(method, chosen, parts) | about | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
     io.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
@@ -250,8 +250,8 @@ def _network_alone(
     return training.model, {"held_out": _held_out(training), **_turn_on(training)}
 
 
-Way = Callable[[Sequence[Recording], TrainSettings, _Descent], tuple[BiasNetwork, dict[str, Any]]]
-WAYS: dict[str, Way] = {"hybrid": _physics_first, "linear": _linear, "neural_ode": _drift_first}
+Trainer = Callable[[Sequence[Recording], TrainSettings, _Descent], tuple[BiasNetwork, dict[str, Any]]]
+TRAINERS: dict[str, Trainer] = {"hybrid": _physics_first, "linear": _linear, "neural_ode": _drift_first}
 
 
 def _shared(recordings: Sequence[Recording], key: str) -> str | None:

@@ -57,6 +57,18 @@ def test_on_one_processor_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.usefixtures("two")
+def test_where_the_system_has_no_process_to_give_the_function_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left() -> int:
+        raise BlockingIOError
+
+    monkeypatch.setattr(forked, "fork", none_left)
+    with forking():
+        before = list(Path("/proc/self/fd").iterdir())
+        assert Forked(os.getpid).result() == os.getpid()
+        assert len(list(Path("/proc/self/fd").iterdir())) == len(before)
+
+
+@pytest.mark.usefixtures("two")
 def test_its_log_lines_come_with_the_result(caplog: pytest.LogCaptureFixture) -> None:
     def warn() -> int:
         logging.getLogger("imutool.test").warning("%s of it", "half")

@@ -22,7 +22,7 @@ FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
 CLOCK = "clock_skew", "clock_jump"
-PART_OF = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # what an effect has within it
+REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
@@ -154,10 +154,10 @@ class CandidateScore:
 
 
 def _exclude(a: Effect, b: Effect) -> bool:
-    """Whether two effects never act together: variants of one catalogue effect on one sensor, or one is part of the other."""
+    """Whether two effects never act together: variants of one effect on one sensor, or one replaces the other."""
     one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
     variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
-    return a.key == b.key or variants or a.name in PART_OF.get(b.name, ()) or b.name in PART_OF.get(a.name, ())
+    return a.key == b.key or variants or a.name in REPLACES.get(b.name, ()) or b.name in REPLACES.get(a.name, ())
 
 
 class Scored(NamedTuple):
@@ -270,7 +270,7 @@ class Candidates:
 class Portable(NamedTuple):
     """Description of a fit for another process.
 
-    `restored` makes it again; `unnamed` effects without a name were tried.
+    `restored` makes the fit again from it. `unnamed` is how many effects without a name the search had tried.
     """
 
     chosen: list[tuple[str, list[str], Theta]]
@@ -281,9 +281,8 @@ class Portable(NamedTuple):
 def portable(search: Any, found: Fit) -> Portable:
     """Description of a fit and of the search that found it."""
     chosen = [(effect.key, [parameter.name for parameter in effect.parameters], theta) for effect, theta in found.chosen]
-    return Portable(
-        chosen, {name: getattr(found, name) for name in ("bias", "objective", "residuals", "prior")}, len(search.unnamed)
-    )
+    numbers = {name: getattr(found, name) for name in ("bias", "objective", "residuals", "prior")}
+    return Portable(chosen, numbers, len(search.unnamed))
 
 
 def restored(described: Portable, like: Fit, effects: Sequence[Effect], finer: Callable[[Effect], Effect | None]) -> Fit:

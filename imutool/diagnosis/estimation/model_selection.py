@@ -71,24 +71,24 @@ def select_effects(
     known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
-    ways = ((), later), (unnamed, ())
-    way, other_way = reversed(ways) if best_unnamed > best_named + settings.clearly_better else ways
-    apart = replace(first, candidates=known.copy(), progress=lambda text: None)
-    other = Forked(lambda: portable(*_grown(apart, start, *other_way))) if unnamed else None
-    answers = [_grown(first, start, *way)]
+    orders = ((), later), (unnamed, ())  # effects without a name after the others, or beside them
+    order, other_order = reversed(orders) if best_unnamed > best_named + settings.clearly_better else orders
+    second = replace(first, candidates=known.copy(), progress=lambda text: None)
+    other = Forked(lambda: portable(*_grown(second, start, *other_order))) if unnamed else None
+    answers = [_grown(first, start, *order)]
     now = answers[0][1]
     doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
     if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         described = other.result()
-        alone = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed), first.finer)
-        better = bic(alone) < bic(now) - settings.clearly_better
-        answers.insert(0 if better else 1, (replace(apart, unnamed=unnamed[: described.unnamed], progress=report), alone))
+        trial = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed), first.finer)
+        better = bic(trial) < bic(now) - settings.clearly_better
+        answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
         other.end()
     selections = (search.tested(search.simplified(found)) for search, found in answers)
-    first_one = next(selections)  # an answer that unseen time refutes altogether is none
-    return first_one if first_one.selected else next(selections, first_one)
+    best = next(selections)
+    return best if best.selected else next(selections, best)  # unseen time has refuted all of the best
 
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:

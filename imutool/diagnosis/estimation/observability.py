@@ -23,7 +23,7 @@ NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {
 }
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
 STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
-NO_NEWS = (WANDER, "reference_smoothing")  # where they do not show: a clock's knots, and an error of no sensor
+UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
 CLOCKS = (*STEADY, WANDER)
 FILTERS = ("low_pass", "mount_resonance")
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
@@ -43,7 +43,7 @@ def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], sett
     out: list[str] = []
     names = {effect.name for effect in candidates}
     for effect in candidates:
-        if not _proportional(effect) or effect.name in NO_NEWS:
+        if not _proportional(effect) or effect.name in UNLISTED:
             continue
         gains = zip(effect.parameters, _gains(logs, effect), strict=True)
         hidden = [parameter.name for parameter, gain in gains if gain < settings.observable_squares]

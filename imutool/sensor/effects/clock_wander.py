@@ -1,6 +1,6 @@
 """A clock that wanders: its offset is straight between knots in time.
 
-Motion capture and sensor have a clock each, which are corrected now and then: their offset moves by milliseconds in a log.
+A motion capture and a sensor have a clock each. Both are corrected now and then, so that their offset moves by milliseconds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ KNOTS_S = (*range(0, 300, 30), *range(300, 601, 60))
 
 
 def until(end_s: float) -> Effect:
-    """The effect with the knots up to the first beyond a log's end."""
+    """The effect with the knots of a log that ends then; its last offset holds from there on."""
     return _effect(KNOTS_S[: sum(t_s < end_s for t_s in KNOTS_S) + 1])
 
 
