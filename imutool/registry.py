@@ -29,7 +29,7 @@ NOT_PLUGINS = {
     "imutool.bias": frozenset(
         {"effects_stream", "io", "model", "networks", "neural_stream", "physics", "temperature", "temperature_drift"}
     ),
-    "imutool.networks": frozenset({"joint_ode", "network", "ode", "perceptron", "temperature", "threads"}),
+    "imutool.networks": frozenset({"network", "ode", "paper_ode", "perceptron", "temperature", "threads"}),
 }
 
 

@@ -57,9 +57,9 @@ def train(
         ['accel', 'gyro']
     """
     from imutool.training.run import train as run
-    from imutool.training.settings import settings_of
+    from imutool.training.settings import placed, settings_of
 
-    chosen = None if settings is None else build(settings_of(method), dict(settings), where="settings")
+    chosen = None if settings is None else build(settings_of(method), placed(method, settings), where="settings")
     check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [logs], overwrite=overwrite)
     return run(
         locals_of(logs, "logs"),

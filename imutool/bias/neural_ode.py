@@ -17,13 +17,15 @@ A drift that lags behind what warms or strains the sensor (`gyro_rate_load` and 
 states, dz/dt = (g(u) - z) / tau: of the rest bias alone a field cannot tell what stays from what decays. They are fitted in
 closed form, where left-out logs bear them out, and C and g see the samples without them.
 
+The scheme `paper` is the paper's own: one field f(b, u, du/dt) a sensor, in rad/s and m/s², with a step at each sample.
+
 Inference takes Euler steps of `drift_step_s`; `imutool.bias.networks.neural_ode` trains with any solver of torchdiffeq.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
@@ -56,7 +58,7 @@ class Config(Settings, frozen=True):
     drift of a hundredth in five seconds is far off after a minute (0.3 m/s² on FETCH).
     """
 
-    scheme: Literal["split", "joint"] | msgspec.UnsetType = msgspec.UNSET  # joint: the paper's (`networks.joint_ode`)
+    scheme: Literal["split", "paper"] | msgspec.UnsetType = msgspec.UNSET  # paper: as written there (`networks.paper_ode`)
     curve_width: Width = 64
     drift: tuple[Sensor, ...] = ("gyro",)
     drift_step_s: Positive = 0.25
@@ -72,12 +74,19 @@ class Config(Settings, frozen=True):
     accel_drift_m_s3: Positive = 1e-3
 
     @property
-    def joint(self) -> bool:
-        """Whether attitude and gyro bias are integrated together; the accelerometer keeps the split scheme."""
-        return self.scheme == "joint"
+    def paper(self) -> bool:
+        """Whether the scheme is the paper's."""
+        return self.scheme == "paper"
+
+    @property
+    def drifting(self) -> tuple[Sensor, ...]:
+        """Sensors whose bias has a field: in the paper's scheme both."""
+        return SENSORS if self.paper else self.drift
 
     def units(self, sensor: Sensor) -> tuple[float, float, float]:
         """Units of a sensor's samples, of its curve and of its drift."""
+        if self.paper:
+            return 1.0, 1.0, 1.0
         if sensor == "gyro":
             return self.gyro_scale_rad_s, self.gyro_curve_rad_s, self.gyro_drift_rad_s2
         return self.accel_scale_m_s2, self.accel_curve_m_s2, self.accel_drift_m_s3
@@ -101,7 +110,7 @@ class Model(BiasModel):
         """Shapes of the statistics, curves and drifts.
 
         Raises:
-            ConfigError: the adjoint with Euler's steps, or the joint scheme without a drift of the gyro.
+            ConfigError: the adjoint with Euler's steps.
         """
         assert isinstance(config, Config)
         if config.adjoint and config.solver == "euler":
@@ -110,36 +119,36 @@ class Model(BiasModel):
                 where="model.adjoint",
                 fix="Use model.solver=rk4 or dopri5 with it, or backpropagation",
             )
-        if config.joint and "gyro" not in config.drift:
-            raise ConfigError("the joint scheme without a drift of the gyro", where="model.drift", expected="gyro among them")
         shapes, width = super().shapes(config), config.curve_width
-        for sensor in SENSORS[1:] if config.joint else SENSORS:
+        for sensor in () if config.paper else SENSORS:
             shapes |= {f"curve.{sensor}.W": (3, 3), f"curve.{sensor}.net.4.weight": (3, width)}
             shapes |= {f"curve.{sensor}.net.0.weight": (width, INPUTS), f"curve.{sensor}.net.0.bias": (width,)}
             shapes |= {f"curve.{sensor}.net.2.weight": (width, width), f"curve.{sensor}.net.2.bias": (width,)}
-        for sensor in dict.fromkeys(config.drift):
-            shapes |= Drift.shapes(_drift_name(config, sensor), HIDDEN[sensor])
+        for sensor in dict.fromkeys(config.drifting):
+            shapes |= Drift.shapes(f"drift.{sensor}", HIDDEN[sensor])
         if config.loads:
             shapes["theta_loads"] = (sum(len(form.parameters) for form in forms("gyro", config.loads)),)
-        return shapes | ({"drift.gyro.W": (3, 3)} if config.joint else {})
+        return shapes
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
-        """Rest dynamics d g / d beta per second, without motion, at the prior."""
+        """Rest dynamics d g / d beta per second, without motion, at the prior; zero in the paper's scheme.
+
+        There a start is forgotten, and what a log adds to the bias is not.
+        """
         F, still = np.zeros((6, 6)), np.zeros(3)
-        for sensor in self.config.drift:
+        for sensor in () if self.config.paper else self.config.drift:
             columns = COLUMNS[sensor]
             F[columns, columns] = self.drift(sensor).by_rest(self.prior_mean[columns], still, still)
         return F
 
     def stretch(self, rest: Vector6, start_s: float = math.nan) -> DriftStream:
-        """Bias stream by Euler: a step every stride of samples, or every sample in the joint scheme."""
+        """Bias stream by Euler: a step every stride of samples, or every sample in the paper's scheme."""
         config = self.config
-        gyro = _no_curve(config.curve_width) if config.joint else self._curve("gyro")
-        drifts = {sensor: self.drift(sensor) for sensor in config.drift if not (config.joint and sensor == "gyro")}
-        curves, stride = Curves(gyro, self._curve("accel")), config.stride(self.rate_hz)
+        drifts = {sensor: self.drift(sensor) for sensor in config.drifting}
+        if config.paper:
+            return PaperStream(drifts, rest, self.rate_hz)
+        curves, stride = Curves(self._curve("gyro"), self._curve("accel")), config.stride(self.rate_hz)
         split = NeuralStream(curves, drifts, stride, self.rate_hz, (SLOW_S, DRIFT_FILTER_S), rest)
-        if config.joint:
-            return JointStream(self.drift("gyro"), self.tensors["drift.gyro.W"], rest, split)
         of_samples = samples_alone(effects := forms("gyro", config.loads or ()))
         if not of_samples:
             return split
@@ -153,7 +162,7 @@ class Model(BiasModel):
 
     def drift(self, sensor: Sensor) -> Drift:
         """Drift of one sensor's rest bias."""
-        return Drift(self.tensors, _drift_name(self.config, sensor), HIDDEN[sensor], self.config.units(sensor)[2])
+        return Drift(self.tensors, f"drift.{sensor}", HIDDEN[sensor], self.config.units(sensor)[2])
 
     def _curve(self, sensor: Sensor) -> CurveWeights:
         scale, curve, _ = self.config.units(sensor)
@@ -162,17 +171,6 @@ class Model(BiasModel):
             for name in ("W", "net.0.weight", "net.0.bias", "net.2.weight", "net.2.bias", "net.4.weight")
         )
         return CurveWeights(W, ((layers[0], layers[1]), (layers[2], layers[3]), layers[4]), scale, NEAR_ZERO, curve)
-
-
-def _drift_name(config: Config, sensor: Sensor) -> str:
-    """Prefix of a drift's tensors."""
-    return "drift.gyro.drift" if config.joint and sensor == "gyro" else f"drift.{sensor}"
-
-
-def _no_curve(width: int) -> CurveWeights:
-    """Curve of the joint scheme's gyro, whose calibration the joint field holds."""
-    layers = (np.zeros((width, INPUTS)), np.zeros(width)), (np.zeros((width, width)), np.zeros(width)), np.zeros((3, width))
-    return CurveWeights(np.zeros((3, 3)), layers, 1.0, NEAR_ZERO, 0.0)
 
 
 class Drift:
@@ -240,44 +238,35 @@ def _perceptron_slope(layers: list[tuple[Array, Array]], x: Array, J: Array) -> 
     return np.asarray(last[0].T @ ((1.0 - x**2)[:, None] * (before[0].T @ J)))
 
 
-class JointStream:
-    """Bias stream of the joint scheme.
+class PaperStream:
+    """Bias stream of the paper's scheme.
 
-    Gyro by Euler from sample to sample, accelerometer from its curve.
+    By Euler from sample to sample, with the field at the sample before.
     """
 
-    def __init__(self, rate: Callable[[Array, Array, Array], Array], W: Array, rest: Vector6, others: DriftStream) -> None:
-        self._rate, self._W, self._rest, self._others = rate, W, rest[:3].astype(np.float64), others
-        self._bias, self._u, self._slope, self._t_s = np.zeros(3), np.zeros(3), np.zeros(3), np.nan
+    def __init__(self, drifts: Mapping[Sensor, Drift], rest: Vector6, rate_hz: float) -> None:
+        self._drifts, self.rest, self._rate_hz = drifts, rest.astype(np.float64), rate_hz
+        self._u, self._slope, self._t_s = np.zeros(6), np.zeros(6), math.nan
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 6"]:
         """Bias at each sample."""
-        bias = self._others(t_s, gyro, accel)
-        for k, (t, u) in enumerate(zip(t_s.tolist(), gyro, strict=True)):
-            bias[k, :3] = self._next(t, u)
+        bias = np.empty((len(t_s), 6))
+        for k, (t, u) in enumerate(zip(t_s.tolist(), np.concatenate([gyro, accel], axis=1), strict=True)):
+            bias[k] = self.one(t, u)
         return bias
-
-    @property
-    def rest(self) -> Vector6:
-        """Latest rest bias: the gyro's without its calibration."""
-        return np.concatenate([self._bias - self._W @ self._u, self._others.rest[3:]])
 
     def one(self, t_s: float, u: Vector6) -> Vector6:
         """Bias at one sample."""
-        bias = self._others.one(t_s, u)
-        bias[:3] = self._next(t_s, u[:3])
-        return bias
-
-    def _next(self, t_s: float, u: Array) -> Array:
-        """Gyro bias at the next sample, from the field at the previous one."""
-        if np.isnan(self._t_s):
-            self._bias, self._slope = self._rest + self._W @ u, np.zeros(3)
-        else:
-            step_s = t_s - self._t_s
-            drift = self._rate(self._bias, self._u, self._slope)
-            self._bias = self._bias + step_s * (self._W @ self._slope + drift)
-            self._slope = (u - self._u) / max(step_s, 1e-9)
+        if not math.isnan(self._t_s):
+            since_s = t_s - self._t_s
+            steps = max(1, round(since_s * self._rate_hz))  # where samples are missing, as if the last had stayed
+            for _ in range(steps):
+                for sensor, rate in self._drifts.items():
+                    half = COLUMNS[sensor]
+                    self.rest[half] += since_s / steps * rate(self.rest[half], self._u[half], self._slope[half])
+                self._slope = np.zeros(6)
+            self._slope = (u - self._u) / max(since_s, 1e-9)
         self._t_s, self._u = t_s, u.copy()
-        return self._bias
+        return self.rest.copy()

@@ -53,7 +53,7 @@ def train(
     registry.load("imutool.bias", method)  # refuse a wrong name before reading any log
     from imutool.config import load
     from imutool.training.run import train as run
-    from imutool.training.settings import settings_of
+    from imutool.training.settings import full_name, settings_of
 
     words: list[str] = []
     if physics is not None:
@@ -61,7 +61,7 @@ def train(
         if left:
             logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(left))
     words += [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
-    settings = load(settings_of(method), config, words)
+    settings = load(settings_of(method), config, [full_name(method, word) for word in words])
     with progress("Training", verbose, quiet) as tell:
         trained = run(
             logs,

@@ -13,7 +13,7 @@ from imutool.bias.io import read_tensors, write_tensors
 from imutool.config import plain
 from imutool.errors import ConfigError, ModelError
 from imutool.training.fit import Stage, Training
-from imutool.training.objective import RobustLoss
+from imutool.training.objectives.objective import RobustLoss
 from imutool.units import SENSORS
 
 FORMAT = "imutool.training/2"

@@ -1,6 +1,6 @@
 """Gradient descent from a closed form: first the gyro, then the accelerometer.
 
-What a step descends on is the objective's to say (`imutool.training.objective`), and it mixes all logs. Beside the sensor's
+What a step descends on is the objective's to say (`imutool.training.objectives`), and it mixes all logs. Beside the sensor's
 weights each log has a track of its own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what
 belongs to the sensor. What is kept is the end of the descent, as a running mean over its last steps, which one step's draw of
 windows cannot throw off; or the closed form it started from, if that drifts less over the longest windows of the held-out
@@ -28,8 +28,8 @@ from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.training import closed_form, statistics
-from imutool.training.increments import IncrementObjective
-from imutool.training.objective import BATCH_SAMPLES, Objective, RestBiases, WindowEndObjective, error
+from imutool.training.objectives.increments import IncrementObjective
+from imutool.training.objectives.objective import BATCH_SAMPLES, Objective, RestBiases, WindowEndObjective, error
 from imutool.training.segments import Pool, corrected, sensors_up_to
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
@@ -218,24 +218,31 @@ class Training:
 
     def _descend(self, stage: Stage) -> Generator[Epoch, None, float]:
         """To the last step; the held-out error there."""
-        settings, sensor = self.settings, stage.sensor
-        steps = settings.steps if self.model.iterative else 0
+        sensor, steps = stage.sensor, self._steps(stage.sensor)
         began, begun_at = time.monotonic(), stage.step
         loss = float("nan")
         while True:
-            if stage.step % settings.validate_every == 0 or stage.step == steps:
+            if stage.step % self.settings.validate_every == 0 or stage.step == steps:
                 score = self._validate(stage)
                 per_step = (time.monotonic() - began) / max(stage.step - begun_at, 1)
                 yield Epoch(sensor, stage.step, steps, loss, score, stage.before, per_step * (steps - stage.step))
             if stage.step >= steps:
                 return score
-            loss = self._one_step(stage, steps)
+            loss = self._one_step(stage)
 
-    def _one_step(self, stage: Stage, steps: int) -> float:
-        warm, cool = min(1.0, (stage.step + 1) / WARM_UP_STEPS), 0.5 * (1 + math.cos(math.pi * stage.step / steps))
-        rate = self._rate(stage.sensor) * warm * cool
+    def _steps(self, sensor: Sensor) -> int:
+        return self.settings.steps if self.model.iterative else 0
+
+    def _rate_at(self, stage: Stage) -> float:
+        warm, cool = (
+            min(1.0, (stage.step + 1) / WARM_UP_STEPS),
+            0.5 * (1 + math.cos(math.pi * stage.step / self._steps(stage.sensor))),
+        )
+        return self._rate(stage.sensor) * warm * cool
+
+    def _one_step(self, stage: Stage) -> float:
         for group in stage.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = self._rate_at(stage)
         self._set_training(stage)
         total = self._descent_direction(stage)
         if not math.isfinite(total):

@@ -30,6 +30,7 @@ from imutool.training import checkpoint
 from imutool.training.calibration import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import compare, simpler_effects
+from imutool.training.paper_scheme import PaperTraining
 from imutool.training.segments import Pool, check_trainable
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
@@ -117,7 +118,8 @@ class _Descent:
         *,
         statistics: bool = True,
     ) -> Training:
-        training = Training(recordings, method, settings, self.device, constant)
+        paper = method == neural_ode.Model.method and settings.model.get("scheme") == "paper"
+        training = (PaperTraining if paper else Training)(recordings, method, settings, self.device, constant)
         if training.model.iterative:
             if self.resume:
                 checkpoint.restore(training, self.kept)
@@ -181,8 +183,8 @@ def _drift_first(
     settings = msgspec.structs.replace(settings, model={k: v for k, v in settings.model.items() if k not in channel})
     loads = settings.model.get("loads")
     if loads is None:
-        joint = settings.model.get("scheme") == "joint"
-        loads = [] if joint else [name for name in physics_of().fits["gyro"].effects if name in DRIFTS]
+        paper = settings.model.get("scheme") == "paper"
+        loads = [] if paper else [name for name in physics_of().fits["gyro"].effects if name in DRIFTS]
     if not loads:
         training = descent(recordings, neural_ode.Model.method, settings)
     else:

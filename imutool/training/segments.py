@@ -195,7 +195,11 @@ def corrected(
     computed anew for every window that overlaps another. What it adds to the rest bias depends on the samples alone: here it
     is taken off them, with their real history, and a constant remains. Only the samples of `part` and the columns of
     `sensors` are corrected. Models that do not look back, and their pool, come back as they are.
+
+    Of a model that forgets its start, what it adds to that start is taken off whole logs.
     """
+    if model.forgets:
+        return static.Network().to(pool.t), _without_motion(model, pool)
     if not model.context:
         return model, pool
     columns = {"gyro": pool.gyro.clone(), "accel": pool.accel.clone()}
@@ -210,6 +214,17 @@ def corrected(
             for sensor in sensors:
                 columns[sensor][some] -= model.sensor_bias(sensor, segment)[0, model.context :]
     return static.Network().to(pool.t), replace(pool, gyro=columns["gyro"], accel=columns["accel"])
+
+
+def _without_motion(model: BiasNetwork, pool: Pool) -> Pool:
+    """Pool without what a model adds to its prior, as `imutool.bias_start.bias_tracking` takes it off."""
+    inference, samples = model.frozen(), torch.cat([pool.gyro, pool.accel], dim=1)
+    start, left = inference.prior_mean, samples.clone()
+    for log in range(len(pool.names)):
+        rows = pool.log == log
+        t_s, u = (x[rows].cpu().double().numpy() for x in (pool.t, samples))
+        left[rows] -= torch.from_numpy(inference.stream(start)(t_s, u[:, :3], u[:, 3:]) - start).to(left)
+    return replace(pool, gyro=left[:, :3].clone(), accel=left[:, 3:].clone())
 
 
 def sensors_up_to(sensor: Sensor) -> Sequence[Sensor]:

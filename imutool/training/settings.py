@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import re
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
@@ -17,15 +19,30 @@ LEAST_RESIDUAL = 1e-6  # rad or m/s: no truth is better, and perfect data must n
 
 
 class IncrementSettings(Settings, frozen=True):
-    """For methods that descend on increments (`imutool.training.increments`).
+    """Lengths and stretches for methods that descend on increments.
 
-    Their lengths, and the stretches that hold
-    them.
+    See `imutool.training.objectives.increments`.
     """
 
     gyro_samples: tuple[Count, ...] = (16, 32)
     accel_samples: tuple[Count, ...] = (16, 32)
     stretch_s: Positive = 16.0
+
+
+class PaperSettings(Settings, frozen=True):
+    """Training of the paper's scheme (`imutool.training.paper_scheme`).
+
+    Numbers of the paper and of its released code.
+    """
+
+    samples: Count = 16  # of a segment
+    segments: Count = 1000  # a step
+    gyro_steps: Annotated[int, msgspec.Meta(ge=0)] = 1800
+    accel_steps: Annotated[int, msgspec.Meta(ge=0)] = 1800
+    rate: Positive = 5e-3  # learning rate of Adam
+    halve_every: Count = 300  # steps
+    weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-6
+    start_average_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a segment's first bias is a mean of so much truth
 
 
 class PoseFloors(Settings, frozen=True):
@@ -85,6 +102,7 @@ class TrainSettings(Settings, frozen=True):
     validate_every: Count = 100  # steps between two lines of progress, each with a checkpoint
     compare: bool = True  # linear and hybrid: score left-out logs, and keep the simplest model that is not beaten
     increments: IncrementSettings = IncrementSettings()
+    paper: PaperSettings = PaperSettings()
     pose_floors: PoseFloors = PoseFloors()
     sensors: SensorPrior = SensorPrior()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -126,3 +144,27 @@ def settings_for(method: str, given: TrainSettings | None) -> TrainSettings:
             fix=f"Build them with imutool.training.settings.settings_of({method!r})",
         )
     return given
+
+
+def full_name(method: str, key: str) -> str:
+    """Full name of a setting, `key` or `key=value`.
+
+    The method's own may be named without `model.`.
+
+    Raises:
+        ConfigError: unknown method.
+    """
+    first = re.split("[.=]", key, maxsplit=1)[0]
+    of_method = {field.name for field in msgspec.structs.fields(registry.load("imutool.bias", method).Config)}
+    return f"model.{key}" if first in of_method - {field.name for field in msgspec.structs.fields(TrainSettings)} else key
+
+
+def placed(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with the method's own in their place, under `model`.
+
+    Raises:
+        ConfigError: unknown method.
+    """
+    general = {key: value for key, value in settings.items() if full_name(method, key) == key}
+    own = {key: value for key, value in settings.items() if key not in general}
+    return {**general, "model": {**general.get("model", {}), **own}} if own else general

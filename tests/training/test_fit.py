@@ -6,16 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from imutool.bias import io
 from imutool.bias.io import load
 from imutool.bias.networks.threads import side_by_side
-from imutool.bias_start import initial_bias
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
 from imutool.errors import ConfigError, DataError, ModelError, NumericsError
@@ -297,23 +294,3 @@ def test_an_unseen_flight_drifts_far_less(sensor_flights: list[Recording], metho
     )
     for figure in ("aoe_deg", "velocity_rmse_m_s", "ape_m"):
         assert debiased[figure] < raw[figure] / 20, figure
-
-
-def test_the_joint_scheme_lowers_the_held_out_error_of_a_curved_sensor(perfect: Make, tmp_path: Path) -> None:
-    """An error that bends with the rate: the closed form cannot follow it, the joint ODE can; its file debiases a log."""
-
-    def bent(seed: int) -> Recording:
-        exact = perfect(seed, duration_s=8.0, still_s=0.5)
-        gyro = exact.imu.gyro + 0.1 * (np.tanh(3.0 * exact.imu.gyro) - exact.imu.gyro)
-        return Recording(exact.name, Imu(exact.imu.t_ns, gyro, exact.imu.accel), exact.truths)
-
-    joint = {"scheme": "joint", "curve_width": 8, "gyro_drift_rad_s2": 0.3}
-    short = settings(gyro_window_s=(0.25,), steps=12, validate_every=12, track_knot_s=8.0, weight_decay=0.0, model=joint)
-    training = Training([bent(1), bent(2)], "neural_ode", short)
-    gyro = [epoch.held_out for epoch in finish(training) if epoch.sensor == "gyro"]
-    assert gyro[-1] < 0.9 * gyro[0]
-    io.save(training.model.frozen(), tmp_path / "joint.safetensors")
-    loaded = io.load(tmp_path / "joint.safetensors")
-    imu = bent(3).imu
-    corrected = apply(loaded, initial_bias.prior(loaded), imu).imu
-    assert np.isfinite(corrected.gyro).all()

@@ -23,7 +23,7 @@ from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration import config_of
 from imutool.training.fit import Epoch, TrainSettings
-from imutool.training.objective import WindowEndObjective
+from imutool.training.objectives.objective import WindowEndObjective
 from imutool.training.run import checkpoint_path, helps, settings_from_physics, train
 from imutool.training.settings import settings_of
 from imutool.units import Sensor

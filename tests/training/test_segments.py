@@ -16,7 +16,7 @@ from imutool.geometry import so3
 from imutool.recording import Imu, Recording
 from imutool.recording.columns import MOST_GAP_S
 from imutool.sensor.made_up_flight import flight
-from imutool.training.objective import RestBiases
+from imutool.training.objectives.objective import RestBiases
 from imutool.training.segments import HELD_OUT, Pool
 
 RATE_HZ = 200.0

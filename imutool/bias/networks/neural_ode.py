@@ -16,11 +16,10 @@ from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
 from imutool.array_types import Float
-from imutool.bias.networks import joint_ode
-from imutool.bias.networks.joint_ode import JointField
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.networks.ode import HermitePath
-from imutool.bias.networks.perceptron import asinh, by_rows, euler_steps, perceptron
+from imutool.bias.networks.paper_ode import BiasOde
+from imutool.bias.networks.perceptron import Drift, asinh, by_rows
 from imutool.bias.neural_ode import DRIFT_FILTER_S, HIDDEN, NEAR_ZERO, SLOW_S, Config, Model
 from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
@@ -52,31 +51,6 @@ class Curve(nn.Module):
         return u @ self.W.mT + self.curve * bend
 
 
-class Drift(nn.Module):
-    """Drift g, the slow rate of the rest bias: a perceptron of two residual blocks."""
-
-    def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
-        super().__init__()
-        self.rate = rate
-        self.block1, self.block2 = perceptron(hidden[0]), perceptron(hidden[1])
-        self.out = nn.Linear(9, 3)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-        # inputs: the state relative to the prior's mean in units of the curve; the motion in its own
-        self.centre: Tensor
-        self.units: Tensor
-        self.register_buffer("centre", torch.zeros(3))
-        self.register_buffer("units", torch.tensor([curve] * 3 + [scale] * 6))
-
-    def forward(self, beta: Float[Tensor, "b 3"], u: Float[Tensor, "b 3"], du: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
-        """Drift dbeta/dt per second."""
-        x = torch.cat([beta - self.centre, u, du], dim=-1) / self.units
-        x = x + self.block1(x)
-        x = x + self.block2(x)
-        y: Tensor = self.rate * self.out(x)
-        return y
-
-
 class Network(BiasNetwork):
     """Network of `imutool.bias.neural_ode`."""
 
@@ -95,55 +69,46 @@ class Network(BiasNetwork):
         curves: dict[str, nn.Module] = {
             sensor: Curve(chosen.curve_width, scale, curve) for sensor, (scale, curve, _) in scales.items()
         }
-        drifts: dict[str, nn.Module] = {sensor: Drift(HIDDEN[sensor], *scales[sensor]) for sensor in SENSORS}
+        drifts = {sensor: Drift(HIDDEN[sensor], *scales[sensor]) for sensor in SENSORS}
+        if chosen.paper:
+            curves, self.forgets = {}, True
+            for drift in drifts.values():
+                drift.out.reset_parameters()
         self.curve = nn.ModuleDict(curves)
-        if chosen.joint:
-            del self.curve["gyro"]
-            drifts["gyro"] = JointField(drifts["gyro"])
-            self.longest_window_s = joint_ode.WINDOW_S
-        self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drift})
+        self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drifting})
 
     def take_loads(self, names: Sequence[str], theta: Float[Tensor, " p"]) -> None:
         """Take over a drift behind the load, fitted before; the samples of the training are corrected for it."""
         self.config = msgspec.structs.replace(self.config, loads=tuple(names))
         self.register_buffer("theta_loads", theta.clone())
 
-    def _joint_start(self, segment: Segment) -> tuple[JointField, Float[Tensor, "b 3"]]:
-        """Joint field, and bias at the first sample."""
-        field = _part(self.drift, "gyro", JointField)
-        return field, segment.rest[:, :3] + segment.gyro[:, 0] @ field.W.mT
-
-    def end_attitude(
-        self, R_start: Float[Tensor, "b 3 3"], segment: Segment, dt: Float[Tensor, "b steps"]
-    ) -> Float[Tensor, "b 3 3"]:
-        """Attitude at the last sample; in the joint scheme by the joint ODE on SO(3)."""
-        if not self.config.joint:
-            return super().end_attitude(R_start, segment, dt)
-        field, start = self._joint_start(segment)
-        return joint_ode.end_attitude(field, segment, start, R_start, self.config.solver, adjoint=self.config.adjoint)
+    def paper_ode(
+        self, sensor: Sensor, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], before: Float[Tensor, "b 3"] | None = None
+    ) -> BiasOde:
+        """ODE of the paper's scheme along some samples; `before` is the sample before the first."""
+        return BiasOde(_part(self.drift, sensor, Drift), t, u, before)
 
     def motion_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """C(u) at each sample; the joint scheme tells no such part from the gyro's bias."""
+        """C(u) at each sample; the paper's scheme has no such part."""
         u, _ = segment.of(sensor)
-        if self.config.joint and sensor == "gyro":
+        if self.config.paper:
             return torch.zeros_like(u)
         motion: Float[Tensor, "batch n 3"] = self.curve[sensor](u, self._filtered(u, SLOW_S))
         return motion
 
     def rest_bias(self, sensor: Sensor, segment: Segment) -> Float[Tensor, "batch n 3"]:
-        """beta at each sample, linear between the steps of the drift; in the joint scheme the gyro's whole bias."""
-        if self.config.joint and sensor == "gyro":
-            field, start = self._joint_start(segment)
-            return joint_ode.bias_path(field, segment, start, self.config.solver, adjoint=self.config.adjoint)
+        """beta at each sample, linear between the steps of the drift; in the paper's scheme the whole bias."""
+        u, rest = segment.of(sensor)
+        if self.config.paper:
+            return self.paper_ode(sensor, segment.t, u).bias(rest, self.config.solver, adjoint=self.config.adjoint)
         if sensor not in self.config.drift:
             return super().rest_bias(sensor, segment)
-        return self._rest_path(segment.t, *segment.of(sensor), _part(self.drift, sensor, Drift))
+        return self._rest_path(segment.t, u, rest, _part(self.drift, sensor, Drift))
 
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
-        """Set the linear part of the curve, or of the joint field."""
-        joint = self.config.joint and sensor == "gyro"
+        """Set the linear part of the curve."""
         with torch.no_grad():
-            (_part(self.drift, sensor, JointField) if joint else _part(self.curve, sensor, Curve)).W.copy_(W)
+            _part(self.curve, sensor, Curve).W.copy_(W)
 
     def _rest_path(
         self, t: Float[Tensor, "b n"], u: Float[Tensor, "b n 3"], rest: Float[Tensor, "b 3"], drift: Drift
@@ -157,7 +122,7 @@ class Network(BiasNetwork):
         knots = self._filtered(u, DRIFT_FILTER_S)[:, : whole * stride + 1 : stride][:, :steps]
         step_s = ((t[:, -1] - t[:, 0]) / (n - 1) * stride)[:, None]
         if self.config.solver == "euler":
-            beta = _euler(drift, knots, step_s, rest)
+            beta = drift.euler(knots, knots[:, 0], step_s, rest)
         else:
             path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
             beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
@@ -187,16 +152,6 @@ class _OnGrid(nn.Module):
         u, du = self.path.value(index), self.path.derivative(index) / self.step_s
         rate: Tensor = self.drift(beta, u, du)
         return self.step_s * rate
-
-
-def _euler(
-    drift: Drift, knots: Float[Tensor, "b steps 3"], step_s: Float[Tensor, "b 1"], rest: Float[Tensor, "b 3"]
-) -> Float[Tensor, "m b 3"]:
-    """Euler's steps, which see the path at its knots alone: there it is the sample, and its slope that to the one before."""
-    slopes = torch.diff(knots, dim=1, prepend=knots[:, :1]) / step_s[:, None]
-    motion = (torch.cat([knots, slopes], dim=2) / drift.units[3:]).transpose(0, 1)
-    blocks = (drift.block1, drift.block2)
-    return euler_steps(blocks, drift.out, motion, rest, drift.centre, drift.units[:3], drift.rate * step_s)
 
 
 def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:

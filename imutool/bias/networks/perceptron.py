@@ -84,6 +84,46 @@ def perceptron(hidden: Sequence[int]) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(hidden[-1], 9))
 
 
+class Drift(nn.Module):
+    """Drift g, the slow rate of the rest bias: a perceptron of two residual blocks."""
+
+    def __init__(self, hidden: tuple[tuple[int, ...], tuple[int, ...]], scale: float, curve: float, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+        self.block1, self.block2 = perceptron(hidden[0]), perceptron(hidden[1])
+        self.out = nn.Linear(9, 3)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+        # inputs: the state relative to the prior's mean in units of the curve; the motion in its own
+        self.centre: Tensor
+        self.units: Tensor
+        self.register_buffer("centre", torch.zeros(3))
+        self.register_buffer("units", torch.tensor([curve] * 3 + [scale] * 6))
+
+    def forward(self, beta: Float[Tensor, "b 3"], u: Float[Tensor, "b 3"], du: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3"]:
+        """Drift dbeta/dt per second."""
+        x = torch.cat([beta - self.centre, u, du], dim=-1) / self.units
+        x = x + self.block1(x)
+        x = x + self.block2(x)
+        y: Tensor = self.rate * self.out(x)
+        return y
+
+    def euler(
+        self,
+        u: Float[Tensor, "b steps 3"],
+        before: Float[Tensor, "b 3"],
+        step_s: Float[Tensor, "b 1"],
+        start: Float[Tensor, "b 3"],
+    ) -> Float[Tensor, "m b 3"]:
+        """States of Euler's steps from `start` on, which see a causal path at its knots alone.
+
+        There it is the sample, and its slope that to the one before. `before` stands before the first.
+        """
+        slopes = torch.diff(u, dim=1, prepend=before[:, None]) / step_s[:, None]
+        motion = (torch.cat([u, slopes], dim=2) / self.units[3:]).transpose(0, 1)
+        return euler_steps((self.block1, self.block2), self.out, motion, start, self.centre, self.units[:3], self.rate * step_s)
+
+
 def euler_steps(
     blocks: Sequence[nn.Sequential],
     out: nn.Linear,

@@ -20,8 +20,8 @@ from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint
 from imutool.training.fit import Training, TrainSettings
-from imutool.training.increments import IncrementObjective, products
-from imutool.training.objective import RestBiases, orientation_error
+from imutool.training.objectives.increments import IncrementObjective, products
+from imutool.training.objectives.objective import RestBiases, orientation_error
 from imutool.training.segments import Pool, corrected
 from imutool.training.settings import IncrementSettings, settings_for, settings_of
 

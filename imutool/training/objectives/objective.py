@@ -171,12 +171,12 @@ class Objective(ABC):
 class WindowEndObjective(Objective):
     """What integration misses at the end of windows of several lengths.
 
-    `imutool.training.objective`.
+    `imutool.training.objectives.objective`.
     """
 
     def _choose(self) -> None:
         named = self.settings.gyro_window_s if self.sensor == "gyro" else self.settings.accel_window_s
-        lengths = dict.fromkeys(self.pool.samples(min(window_s, self.model.longest_window_s)) for window_s in named)
+        lengths = dict.fromkeys(self.pool.samples(window_s) for window_s in named)
         self.pools = [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
 
     def errors(self, first: Int[Tensor, " m"], n: int) -> Float[Tensor, " m"]:

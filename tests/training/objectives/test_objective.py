@@ -11,7 +11,7 @@ import torch
 from imutool.bias.networks import static
 from imutool.bias.networks.network import Segment
 from imutool.recording import Recording
-from imutool.training.objective import error, motion_error, orientation_error
+from imutool.training.objectives.objective import error, motion_error, orientation_error
 from imutool.training.segments import Pool, Windows
 
 N, PERIOD_S = 100, 0.005

@@ -1,0 +1,1 @@
+"""Objectives of the descent: what its steps make smaller."""

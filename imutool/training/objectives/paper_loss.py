@@ -1,0 +1,139 @@
+"""The paper's loss: mean squares over short segments of poses.
+
+Equations 16 and 17, for the scheme `paper` of the neural ODE. A segment starts at a true pose, and at the bias that this pose
+and the next one give (its section on hierarchical training).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from imutool.array_types import Bool, Float, Int
+from imutool.bias.networks.neural_ode import Network
+from imutool.bias.networks.paper_ode import BiasOde
+from imutool.bias.networks.threads import of_each
+from imutool.errors import DataError
+from imutool.geometry import so3
+from imutool.inertial.strapdown import GRAVITY_W
+from imutool.inertial.windows import step_means
+from imutool.training.objectives.objective import BATCH_SAMPLES, Objective
+from imutool.training.segments import Part, Pool
+from imutool.units import Sensor
+
+SEGMENTS = 250  # at a time, side by side on as many cores as there are
+Biases = Float[Tensor, "n 6"]
+
+
+class PaperLoss(Objective):
+    """Mean squares of what integration misses at each sample of a segment.
+
+    All segments count alike.
+    """
+
+    model: Network
+
+    def _choose(self) -> None:
+        self.n = self.settings.paper.samples
+        self.first = self._starts("train")
+        self.start, _ = biases_from_poses(self.pool, self.settings.paper.start_average_s)
+
+    def _starts(self, part: Part) -> Int[Tensor, " m"]:
+        """First samples of the segments of a part; the sample before each gives the path its first slope."""
+        first = self.pool.starts(self.n + 1, part) + 1
+        if not len(first):
+            raise DataError(
+                f"no segment of {self.n} samples of truth without a gap",
+                where=", ".join(self.pool.names),
+                expected="truth that covers some segments, in the last fifth of the logs too",
+                fix="Lower the setting paper.samples, or give logs with more truth",
+            )
+        return first
+
+    def _usual(self) -> dict[int, Float[Tensor, " logs"]]:
+        return {}  # squares have no width
+
+    def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
+        """Terms of some segments each, drawn from all logs alike."""
+        count = self.settings.paper.segments
+        chosen = torch.randint(len(self.first), (count,), generator=generator).to(self.first.device)
+        return [partial(self._term, some, len(some) / count) for some in torch.split(self.first[chosen], SEGMENTS)]
+
+    def _term(self, first: Int[Tensor, " b"], share: float) -> Float[Tensor, ""]:
+        return share * self.squares(first).mean()
+
+    def held_out(self) -> float:
+        """Root of the mean square over the held-out parts."""
+        parts = torch.split(self._starts("held_out"), max(1, BATCH_SAMPLES // self.n))
+        with torch.no_grad():
+            return float(torch.cat(of_each(self.squares, parts), dim=1).mean().sqrt())
+
+    def squares(self, first: Int[Tensor, " b"]) -> Float[Tensor, "n b"]:
+        """Squared error at each later sample: rad² for the gyro, m² plus m²/s² for the accelerometer."""
+        index = first[:, None] + torch.arange(self.n + 1, device=first.device)
+        if self.sensor == "gyro":
+            missed = so3.log(self._attitudes(index) @ self.pool.R_wb[index].transpose(0, 1).mT)
+            return missed[1:].square().sum(-1)
+        with torch.no_grad():
+            R_wb = self._attitudes(index)
+        ode = self._ode("accel", index)
+        config = self.model.config
+        accel = ode.u - ode.bias(self.start[first, 3:], config.solver, adjoint=config.adjoint)
+        a_w = (R_wb.transpose(0, 1) @ accel[..., None])[..., 0] + accel.new_tensor(GRAVITY_W)
+        over_step: Callable[[Tensor], Tensor] = (lambda x: x[:, :-1]) if config.solver == "euler" else step_means
+        dt = torch.diff(self.pool.t[index], dim=1)[..., None]
+        v = _sums(self.pool.v_w[first], over_step(a_w) * dt)
+        p = _sums(self.pool.p_wb[first], over_step(v) * dt)
+        missed = torch.cat([v - self.pool.v_w[index], p - self.pool.p_wb[index]], dim=-1)
+        return missed[:, 1:].square().sum(-1).T
+
+    def _attitudes(self, index: Int[Tensor, "b n"]) -> Float[Tensor, "n b 3 3"]:
+        first, config = index[:, 0], self.model.config
+        ode = self._ode("gyro", index)
+        return ode.attitudes(self.start[first, :3], self.pool.R_wb[first], config.solver, adjoint=config.adjoint)
+
+    def _ode(self, sensor: Sensor, index: Int[Tensor, "b n"]) -> BiasOde:
+        u = self.pool.gyro if sensor == "gyro" else self.pool.accel
+        return self.model.paper_ode(sensor, self.pool.t[index], u[index], u[index[:, 0] - 1])
+
+    def settle(self) -> None:
+        """Nothing: the rest biases take no part."""
+
+
+def biases_from_poses(pool: Pool, average_s: float) -> tuple[Biases, Bool[Tensor, " n"]]:
+    """Bias at each sample from its true pose and the next one, and where there is one.
+
+    It is a mean over `average_s` around the sample:
+    b = omega - Log(R_k^T R_k+1) / dt, and b = a - R_k^T ((v_k+1 - v_k) / dt - g).
+    """
+    dt = torch.diff(pool.t)[:, None]
+    turned = so3.log(pool.R_wb[:-1].mT @ pool.R_wb[1:]) / dt
+    force_w = torch.diff(pool.v_w, dim=0) / dt - pool.v_w.new_tensor(GRAVITY_W)
+    force = (pool.R_wb[:-1].mT @ force_w[..., None])[..., 0]
+    biases = torch.cat([pool.gyro[:-1] - turned, pool.accel[:-1] - force], dim=1)
+    biases = torch.cat([biases, torch.zeros_like(biases[:1])])
+    known = torch.zeros_like(pool.trusted)
+    known[pool.starts(1, "all")] = True
+    biases = torch.where(known[:, None], biases, torch.zeros_like(biases))
+    around = round(0.5 * average_s * pool.rate_hz)
+    if around:
+        for log in range(len(pool.names)):
+            rows = pool.log == log
+            sums, counts = (_around(x[rows], around) for x in (biases, known[:, None].to(biases)))
+            biases[rows] = sums / counts.clamp(min=1.0)
+    return biases, known
+
+
+def _around(x: Float[Tensor, "n k"], m: int) -> Float[Tensor, "n k"]:
+    """Sum of each row, of the m before and of the m after it."""
+    running = torch.cat([torch.zeros_like(x[:1]), torch.cumsum(x, dim=0)])
+    row = torch.arange(len(x), device=x.device)
+    return running[(row + m + 1).clamp(max=len(x))] - running[(row - m).clamp(min=0)]
+
+
+def _sums(start: Float[Tensor, "b 3"], steps: Float[Tensor, "b n 3"]) -> Float[Tensor, "b _ 3"]:
+    """A quantity at each sample from its start and its steps."""
+    return torch.cumsum(torch.cat([start[:, None], steps], dim=1), dim=1)
