@@ -15,12 +15,14 @@ import pickle
 import queue
 import signal
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import ClassVar, Generic, NoReturn, TypeVar
 
 from imutool.mcap_io.storage.system import can_fork, fork, kill, processors
 
 T = TypeVar("T")
+R = TypeVar("R")
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
@@ -70,6 +72,17 @@ class Forked(Generic[T]):
         if self._process:
             _end(self._process)
             self._process = 0
+
+
+def of_each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Function of each item, in order; side by side as far as processors are free."""
+    left, out = list(items), list[R]()
+    while left:
+        first, *others = left[: 1 + _Processes.allowed - len(_Processes.running)]
+        del left[: 1 + len(others)]
+        beside = [Forked(partial(function, item)) for item in others]
+        out += [function(first), *(one.result() for one in beside)]
+    return out
 
 
 def _fork(function: Callable[[], object]) -> int:

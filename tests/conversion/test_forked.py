@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from imutool.conversion import forked
-from imutool.conversion.forked import Forked, forking
+from imutool.conversion.forked import Forked, forking, of_each
 from imutool.errors import DataError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="commands fork on Linux alone")
@@ -43,6 +43,15 @@ def test_a_function_runs_beside_this_process_and_its_result_comes_back() -> None
         assert content == large
         assert first.result() == (process, large)
         assert Forked(os.getpid).result() != os.getpid()
+
+
+@pytest.mark.usefixtures("two")
+def test_every_item_has_its_result_and_half_of_them_are_done_beside_this_process() -> None:
+    with forking():
+        found = of_each(lambda item: (item, os.getpid()), "abcde")
+    assert [item for item, _ in found] == list("abcde")
+    assert [process == os.getpid() for _, process in found] == [True, False, True, False, True]
+    assert of_each(lambda item: (item, os.getpid()), "ab") == [("a", os.getpid()), ("b", os.getpid())]
 
 
 @pytest.mark.usefixtures("two")
