@@ -20,12 +20,13 @@ not taken.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from imutool.array_types import Bool, Float, Int
+from imutool.array_types import Float, Int
 
 Vectors = Float[Tensor, "*batch 3"]
 Rotations = Float[Tensor, "*batch 3 3"]
@@ -162,29 +163,28 @@ def _horner(coefficients: tuple[float, ...], s: Float[Tensor, "*batch"]) -> Floa
     return value
 
 
-def _branches(s: Angles2, coefficients: tuple[float, ...]) -> tuple[Bool[Tensor, "*batch"], Angles2, Angles2]:
-    """Mask of the series branch, its value, and an angle for the closed form that is never small."""
+def _analytic(s: Angles2, coefficients: tuple[float, ...], closed_form: Callable[[Angles2], Angles2]) -> Angles2:
+    """Function of the angle: a series where it is small, else the closed form, which sees no small angle."""
     series = _series_of(s.dtype)
     small = s < series.below
+    if bool(small.all()):
+        return _horner(coefficients[: series.terms], s)
     value = _horner(coefficients[: series.terms], torch.where(small, s, torch.zeros_like(s)))
-    return small, value, torch.where(small, torch.ones_like(s), s).sqrt()
+    return torch.where(small, value, closed_form(torch.where(small, torch.ones_like(s), s).sqrt()))
 
 
 def _sinc(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _SINC)
-    return torch.where(small, value, angle.sin() / angle)
+    return _analytic(s, _SINC, lambda angle: angle.sin() / angle)
 
 
 def _versine(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _VERSINE)
-    half = 0.5 * angle
-    return torch.where(small, value, 0.5 * (half.sin() / half).square())
+    return _analytic(s, _VERSINE, lambda angle: 0.5 * ((0.5 * angle).sin() / (0.5 * angle)).square())
 
 
 def _half_cot(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _HALF_COT)
-    half = 0.5 * angle
-    return torch.where(small, value, (1.0 - half * half.cos() / half.sin()) / angle.square())
+    return _analytic(
+        s, _HALF_COT, lambda angle: (1.0 - 0.5 * angle * (0.5 * angle).cos() / (0.5 * angle).sin()) / angle.square()
+    )
 
 
 def _atan2_over(n2: Float[Tensor, "*batch"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
