@@ -61,6 +61,7 @@ _SINC = (
     1 / 355687428096000,
 )
 _VERSINE = tuple(c / (2 * k + 2) for k, c in enumerate(_SINC))
+_SINE_LEFT = tuple(-c for c in (*_SINC[1:], 1 / 355687428096000 / -342))  # of (1 - sinc(x)) / x²
 _HALF_COT = (  # |B_2k+2| / (2k+2)!, Bernoulli numbers
     1 / 12,
     1 / 720,
@@ -99,6 +100,16 @@ def log(R: Rotations) -> Vectors:
     q = quaternion_wxyz_from_matrix(R)
     w, v = q[..., :1], q[..., 1:]
     return 2.0 * _atan2_over(_squared(v).unsqueeze(-1), w) * v
+
+
+def by_vector(xi: Vectors, by_turn: Vectors) -> Vectors:
+    """Gradient by xi of a function of Exp(xi), from that by a turn of the body: J_r(xi)^T of it.
+
+    J_r(xi)^T = I + (1 - cos a)/a² [xi]x + (1 - sin(a)/a)/a² [xi]x², a = |xi|.
+    """
+    s, across = _squared(xi).unsqueeze(-1), torch.linalg.cross(xi, by_turn)
+    gradient: Tensor = by_turn + _versine(s) * across + _sine_left(s) * torch.linalg.cross(xi, across)
+    return gradient
 
 
 def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
@@ -179,6 +190,10 @@ def _sinc(s: Angles2) -> Angles2:
 
 def _versine(s: Angles2) -> Angles2:
     return _analytic(s, _VERSINE, lambda angle: 0.5 * ((0.5 * angle).sin() / (0.5 * angle)).square())
+
+
+def _sine_left(s: Angles2) -> Angles2:
+    return _analytic(s, _SINE_LEFT, lambda angle: (1.0 - angle.sin() / angle) / angle.square())
 
 
 def _half_cot(s: Angles2) -> Angles2:
