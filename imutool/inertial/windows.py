@@ -45,9 +45,10 @@ def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "
 
 
 def whole_turn(xi: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Product of the rotations Exp(xi[0]) ... Exp(xi[n-1]), at half the cost of the running product.
+    """Product of rotations Exp(xi[0]) ... Exp(xi[n-1]).
 
-    Its derivative d R = R [sum_k S_k^T J_r(xi_k) dxi_k]x, S_k the product of the rotations after k, needs vectors alone.
+    It takes half the time of the running product. Its derivative needs vectors alone: dR = R [sum_k S_k^T J_r(xi_k) dxi_k]x,
+    S_k the product of the rotations after k.
     """
     turn: Tensor = _WholeTurn.apply(xi)  # type: ignore[no-untyped-call]  # torch gives it no type
     return turn
