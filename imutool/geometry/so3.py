@@ -48,7 +48,7 @@ _SERIES = {
     torch.float64: _Series(below=0.25, terms=9, atan_below=1e-2, atan_terms=9),
 }
 
-# sin(x)/x, (1 - cos x)/x² and 1/x² - cot(x/2)/(2x), each as a series in s = x².
+# sin(x)/x, (1 - cos x)/x², (1 - sin(x)/x)/x² and 1/x² - cot(x/2)/(2x), each as a series in s = x².
 _SINC = (
     1.0,
     -1 / 6,
@@ -59,9 +59,10 @@ _SINC = (
     1 / 6227020800,
     -1 / 1307674368000,
     1 / 355687428096000,
+    -1 / 121645100408832000,
 )
 _VERSINE = tuple(c / (2 * k + 2) for k, c in enumerate(_SINC))
-_SINE_LEFT = tuple(-c for c in (*_SINC[1:], 1 / 355687428096000 / -342))  # of (1 - sinc(x)) / x²
+_SINE_LEFT = tuple(-c for c in _SINC[1:])
 _HALF_COT = (  # |B_2k+2| / (2k+2)!, Bernoulli numbers
     1 / 12,
     1 / 720,

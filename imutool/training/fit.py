@@ -270,7 +270,7 @@ class Training:
         self.model.eval()
         for name, module in self.model.named_modules():
             module.training = f".{stage.sensor}" in f".{name}"
-        # for a GPU that is not there torch.manual_seed notes down where it was called from: half a millisecond each time
+        # for a GPU that is not there torch.manual_seed would note down each time where it was called from
         drawing = torch.default_generator if self.pool.t.device.type == "cpu" else torch
         drawing.manual_seed((self.settings.seed + SEED_STRIDE * (stage.step + 1)) % 2**63)
 
