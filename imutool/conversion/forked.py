@@ -17,12 +17,14 @@ import select
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, ClassVar, Generic, NoReturn, TypeVar
 
 from imutool.mcap_io.storage.system import can_fork, fork, kill, processors
 
 T = TypeVar("T")
+R = TypeVar("R")
 SIGNALS = signal.SIGINT, signal.SIGTERM
 WORTH_S = 0.2  # half of it goes for a fork and for memory that is copied when one of two writes to it
 IDLE = 10  # by how much an idle process is nicer than this one
@@ -55,10 +57,15 @@ class Forked(Generic[T]):
     def __init__(self, function: Callable[[], T], *, idle: bool = False) -> None:
         self._function, self._idle, self._process, self._reading = function, idle, 0, -1
         self._got: tuple[T, list[logging.LogRecord]] | None = None
-        for other in select.select(_Processes.running, [], [], 0)[0]:
-            other._read()  # it has its result, and needs neither memory nor processor any more
-        if sum(not other._idle for other in _Processes.running) < _Processes.allowed:
+        if self.free() > 0:
             self._fork()
+
+    @staticmethod
+    def free() -> int:
+        """Number of processors for one more; what has its result needs neither processor nor memory any more."""
+        for one in select.select(_Processes.running, [], [], 0)[0]:
+            one._read()
+        return _Processes.allowed - sum(not one._idle for one in _Processes.running)
 
     def fileno(self) -> int:
         """The end of the pipe by which the result comes."""
@@ -121,8 +128,19 @@ class Forked(Generic[T]):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def each(function: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers with what a function returns for them, in order.
+def of_each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Function of each item, in order; side by side as far as processors are free."""
+    left, out = list(items), list[R]()
+    while left:
+        first, *others = left[: 1 + max(0, Forked.free())]
+        del left[: 1 + len(others)]
+        beside = [Forked(partial(function, item)) for item in others]
+        out += [function(first), *(one.result() for one in beside)]
+    return out
+
+
+def one_by_one(function: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
+    """Numbers with what a function returns for them, in order, until nobody asks for more.
 
     A process takes the second half if that saves time, as far as the time of the first one tells.
     """
