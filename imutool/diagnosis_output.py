@@ -54,12 +54,29 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
         pass  # even the superuser cannot write everywhere
 
 
+def drawings(logs: Callable[[], list[RunData]]) -> Forked[dict[str, str]]:
+    """Drawings of a page of the logs, made while they are diagnosed where time is left."""
+
+    def drawn() -> dict[str, str]:
+        from imutool.viewing.html.report import drawings
+
+        return drawings(logs())
+
+    return Forked(drawn, idle=True)
+
+
 def write(
-    d: Diagnosis, folder: Path, *, logs: Callable[[Path], list[RunData]] | None = None, overwrite: bool = False
+    d: Diagnosis,
+    folder: Path,
+    *,
+    logs: Callable[[Path], list[RunData]] | None = None,
+    drawn: Forked[dict[str, str]] | None = None,
+    overwrite: bool = False,
 ) -> list[str]:
     """Write the folder of a diagnosis; return a remark for each file without its extra.
 
-    With `logs`, which looks at the logs again with the folder's findings in hand, there is a page of them too.
+    With `logs`, which looks at the logs again with the folder's findings in hand, there is a page of them too, with what is
+    `drawn` by then.
     A diagnosis that is replaced goes whole: of its files none is kept.
 
     Raises:
@@ -73,7 +90,7 @@ def write(
     with _told(folder):
         try:
             complete.mkdir(parents=True)
-            remarks = _make(d, complete, logs)
+            remarks = _make(d, complete, logs, drawn)
             _publish(complete, folder, overwrite=overwrite)
         finally:
             with contextlib.suppress(FileNotFoundError):
@@ -90,7 +107,9 @@ def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
         write_page(again, folder / CLOSED, logs=LOG if (folder / LOG).exists() else None, first=d)
 
 
-def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None) -> list[str]:
+def _make(
+    d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | None, drawn: Forked[dict[str, str]] | None
+) -> list[str]:
     (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
     physics_file.write(to_physics_file(d), folder / EFFECT)
     noise = to_noise_file(d)
@@ -106,7 +125,7 @@ def _make(d: Diagnosis, folder: Path, logs: Callable[[Path], list[RunData]] | No
             remarks.append(f"{LOG} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
     report = Forked(partial(_report, d, LOG if seen else None))
     if seen:
-        _logs(seen, folder / LOG)
+        _logs(seen, folder / LOG, drawn.ready() if drawn is not None else None)
     if VIEW not in missing:
         _recording(d, folder / VIEW)
     if REPORT not in missing:
@@ -124,10 +143,10 @@ def _report(d: Diagnosis, logs: str | None) -> str:
     return html(d, logs=logs)
 
 
-def _logs(logs: list[RunData], path: Path) -> None:
+def _logs(logs: list[RunData], path: Path, drawn: dict[str, str] | None) -> None:
     from imutool.viewing.html.report import write_page
 
-    write_page(logs, path)
+    write_page(logs, path, drawn=drawn or {})
 
 
 def _recording(d: Diagnosis, path: Path) -> None:

@@ -29,6 +29,10 @@ Folder = Annotated[
     ),
     FOLDER,
 ]
+Sim = Annotated[
+    Path | None,
+    typer.Option(metavar="SIM", help="Simulation, of any motion if both have poses; by default along the recording's poses."),
+]
 Close = Annotated[
     bool, typer.Option("--close", help="Simulate again with physics.toml (DIR/closed.mcap), diagnose again, and compare.")
 ]
@@ -42,12 +46,7 @@ def diagnose(
     reals: Annotated[
         list[Path], typer.Argument(metavar="REAL...", help="Recordings; several share the physics, each has its own bias.")
     ],
-    sim: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="SIM", help="Simulation, of any motion if both have poses; by default along the recording's poses."
-        ),
-    ] = None,
+    sim: Sim = None,
     signal: Annotated[
         list[str] | None, typer.Option(metavar="TOPIC.field", help="Also compare this field of both logs. Repeatable.")
     ] = None,
@@ -79,7 +78,7 @@ def diagnose(
     from imutool.diagnosis.settings import DiagnoseSettings
     from imutool.viewing.model.load_view import load
 
-    def look(findings: Path) -> list[RunData]:
+    def look(findings: Path | None = None) -> list[RunData]:
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
     if close and (folder is None or len(reals) != 1):
@@ -88,10 +87,11 @@ def diagnose(
     if folder is not None:
         diagnosis_output.refuse(folder, overwrite=overwrite)
     with forking(), progress("Diagnosing", verbose, quiet) as tell:
+        drawn = None if folder is None else diagnosis_output.drawings(look)
         diagnosis = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
         if folder is not None:
             tell(0, 1, "writing")
-            for remark in diagnosis_output.write(diagnosis, folder, logs=look, overwrite=overwrite):
+            for remark in diagnosis_output.write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite):
                 logger.warning("%s", remark)
             if close:
                 settled = partial(run, reals, imu=imu, truth=truth, settings=settings)

@@ -52,6 +52,7 @@ def train(
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method)  # refuse a wrong name before reading any log
     from imutool.config import load
+    from imutool.conversion.forked import forking
     from imutool.training.run import train as run
     from imutool.training.settings import full_name, settings_of
 
@@ -62,7 +63,7 @@ def train(
             logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(left))
     words += [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
     settings = load(settings_of(method), config, [full_name(method, word) for word in words])
-    with progress("Training", verbose, quiet) as tell:
+    with forking(), progress("Training", verbose, quiet) as tell:
         trained = run(
             logs,
             model,

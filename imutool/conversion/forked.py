@@ -13,20 +13,26 @@ import logging.handlers
 import os
 import pickle
 import queue
+import select
 import signal
+import time
 import warnings
-from collections.abc import Callable, Iterator
-from typing import ClassVar, Generic, NoReturn, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Any, ClassVar, Generic, NoReturn, TypeVar
 
 from imutool.mcap_io.storage.system import can_fork, fork, kill, processors
 
 T = TypeVar("T")
+R = TypeVar("R")
 SIGNALS = signal.SIGINT, signal.SIGTERM
+WORTH_S = 0.2  # half of it goes for a fork and for memory that is copied when one of two writes to it
+IDLE = 10  # by how much an idle process is nicer than this one
 
 
 class _Processes:
     allowed = 0  # beside this one
-    running: ClassVar[dict[int, int]] = {}  # the reading end of its pipe by process
+    running: ClassVar[list[Forked[Any]]] = []
 
 
 @contextlib.contextmanager
@@ -37,70 +43,130 @@ def forking() -> Iterator[None]:
         yield
     finally:
         _Processes.allowed = 0
-        for process in list(_Processes.running):
-            _end(process)
+        for one in list(_Processes.running):
+            one.end()
 
 
 class Forked(Generic[T]):
     """Result of a function that runs beside this process if a processor is free.
 
-    What the function returns is pickled. Where it raises, it runs again in `result`, which raises the same.
+    What the function returns is pickled. Where it raises, it runs again in `result`, which raises the same. An `idle` one is
+    for what is needed late: it runs on the time that the others leave, and takes no processor from them.
     """
 
-    def __init__(self, function: Callable[[], T]) -> None:
-        self._function, self._process = function, 0
-        if len(_Processes.running) < _Processes.allowed:
-            self._process = _fork(function)
+    def __init__(self, function: Callable[[], T], *, idle: bool = False) -> None:
+        self._function, self._idle, self._process, self._reading = function, idle, 0, -1
+        self._got: tuple[T, list[logging.LogRecord]] | None = None
+        if self.free() > 0:
+            self._fork()
+
+    @staticmethod
+    def free() -> int:
+        """Number of processors for one more; what has its result needs neither processor nor memory any more."""
+        for one in select.select(_Processes.running, [], [], 0)[0]:
+            one._read()
+        return _Processes.allowed - sum(not one._idle for one in _Processes.running)
+
+    def fileno(self) -> int:
+        """The end of the pipe by which the result comes."""
+        return self._reading
+
+    @property
+    def here(self) -> bool:
+        """Whether no process has run it or runs it."""
+        return not self._process and self._got is None
 
     def result(self) -> T:
         """What the function returns; run here if no process has run it to its end."""
         if self._process:
-            with contextlib.suppress(EOFError, pickle.UnpicklingError):  # it was killed, or the function raised
-                with open(_Processes.running[self._process], "rb", closefd=False) as pipe:
-                    value, records = pickle.load(pipe)  # noqa: S301  from our own process
-                _end(self._process)
-                for record in records:
-                    logging.getLogger(record.name).handle(record)
-                self._process, self._function = 0, lambda: value
-            self.end()
-        return self._function()
+            self._read()
+        if self._got is None:
+            return self._function()
+        value, records = self._got
+        while records:
+            record = records.pop(0)
+            logging.getLogger(record.name).handle(record)
+        return value
+
+    def ready(self) -> T | None:
+        """What a process has made by now; none, and no process any more, where it has not. Its log lines are dropped."""
+        if self._process and select.select([self], [], [], 0)[0]:
+            self._read()
+        self.end()
+        return None if self._got is None else self._got[0]
 
     def end(self) -> None:
         """End the process whose result nobody wants."""
         if self._process:
-            _end(self._process)
+            _Processes.running.remove(self)
+            os.close(self._reading)
+            kill(self._process)
+            os.waitpid(self._process, 0)
             self._process = 0
 
+    def _read(self) -> None:
+        killed_or_raised = EOFError, pickle.UnpicklingError
+        with contextlib.suppress(*killed_or_raised), open(self._reading, "rb", closefd=False) as pipe:
+            self._got = pickle.load(pipe)  # noqa: S301  from our own process
+        self.end()
 
-def _fork(function: Callable[[], object]) -> int:
-    """Number of the process that runs the function; 0 if the system has none to give."""
-    reading, writing = os.pipe()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # or a Ctrl-C would run this process' clean-up in the other
+    def _fork(self) -> None:
+        """Start the process, if the system has one to give."""
+        self._reading, writing = os.pipe()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)  # or a Ctrl-C would run this process' clean-up in the other
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # of the progress bar's thread, which the other never needs
+                self._process = fork()
+            if not self._process:
+                _serve(self._function, writing, IDLE if self._idle else 0)
+            _Processes.running.append(self)
+        except OSError:  # no memory or no number is left for one more
+            os.close(self._reading)
+        finally:
+            os.close(writing)
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def of_each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Function of each item, in order; side by side as far as processors are free."""
+    left, out = list(items), list[R]()
+    while left:
+        first, *others = left[: 1 + max(0, Forked.free())]
+        del left[: 1 + len(others)]
+        beside = [Forked(partial(function, item)) for item in others]
+        out += [function(first), *(one.result() for one in beside)]
+    return out
+
+
+def one_by_one(function: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
+    """Numbers with what a function returns for them, in order, until nobody asks for more.
+
+    A process takes the second half if that saves time, as far as the time of the first one tells.
+    """
+    began = time.perf_counter()
+    first = [(number, function(number)) for number in numbers[:1]]
+    half = len(numbers) - (len(numbers) - 1) // 2
+    worth = (time.perf_counter() - began) * (len(numbers) - half) > WORTH_S
+    beside = Forked(lambda: [function(number) for number in numbers[half:]]) if worth else None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of the progress bar's thread, which the other never needs
-            process = fork()
-        if not process:
-            _serve(function, writing)
-    except OSError:  # no memory or no number is left for one more
-        os.close(reading)
-        os.close(writing)
-        return 0
-    else:
-        os.close(writing)
-        _Processes.running[process] = reading
+        yield from first
+        yield from ((number, function(number)) for number in numbers[1:half])
+        values = map(function, numbers[half:]) if beside is None or beside.here else beside.result()
+        yield from zip(numbers[half:], values, strict=True)
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return process
+        if beside is not None:
+            beside.end()
 
 
-def _serve(function: Callable[[], object], writing: int) -> NoReturn:
+def _serve(function: Callable[[], object], writing: int, nice: int) -> NoReturn:
     """Write what the function returns, and end without any clean-up."""
-    code, _Processes.allowed = 1, 0
+    code, _Processes.allowed, _Processes.running = 1, 0, []
     try:
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+        os.nice(nice)
         gc.freeze()
         said = queue.SimpleQueue[logging.LogRecord]()
         logging.getLogger().handlers = [logging.handlers.QueueHandler(said)]
@@ -111,9 +177,3 @@ def _serve(function: Callable[[], object], writing: int) -> NoReturn:
         code = 0
     finally:
         os._exit(code)
-
-
-def _end(process: int) -> None:
-    os.close(_Processes.running.pop(process))
-    kill(process)
-    os.waitpid(process, 0)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -135,14 +134,13 @@ def _beside_reference(
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    audit = None if simulated is None else Forked(partial(simulator_remarks, simulated))
+    similar = Forked(selection.similar)
     hidden = unobservable(logs, candidates, settings.search)
     diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), sim_findings, hidden, settings)
-    if simulated is not None and audit is not None:
-        if any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
-            report(3, 4, "simulating again")
-            diagnosis = _resimulated(diagnosis, logs, selection, simulated, audit)
-        audit.end()
+    if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
+        report(3, 4, "simulating again")
+        diagnosis = _resimulated(diagnosis, logs, selection, simulated)
+    diagnosis = replace(diagnosis, findings=summarize.with_similar(diagnosis.findings, selection, similar.result()))
     caveat = reference_caveat(recordings) if simulated is None else ""
     remarks = (*another, *left_out, *diagnosis.remarks, *dict.fromkeys(told))
     diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, caveat)
@@ -170,9 +168,7 @@ def read_log(log: Location, *, imu: str | None = None, truth: str | None = None)
     return measured_recording(longest_stretch(read(log, imu=imu, truth=truth)), free_fall=True)
 
 
-def _resimulated(
-    diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording, audit: Forked[list[str]]
-) -> Diagnosis:
+def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: Selection, sim: Recording) -> Diagnosis:
     """Adds the gain of a second simulation, or the reason why there is none."""
     if any(finding.effect == summarize.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
         return diagnosis
@@ -180,7 +176,7 @@ def _resimulated(
         closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis))
     except ImutoolError as error:
         why = f"How much closer it comes is computed, not simulated again: {error}"
-        return replace(diagnosis, remarks=(*diagnosis.remarks, why, *audit.result()))
+        return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
 
 

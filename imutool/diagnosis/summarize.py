@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -189,7 +190,11 @@ def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Ite
 
 
 def finding_of(
-    logs: Sequence[WhitenedLog], selection: Selection, selected: SelectedEffect, floor: Float64[np.ndarray, " k"]
+    logs: Sequence[WhitenedLog],
+    selection: Selection,
+    selected: SelectedEffect,
+    floor: Float64[np.ndarray, " k"],
+    similar: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
 ) -> Finding:
     """Finding of an effect, with its gain on held-out time over the fit without it."""
     pairs, effect, chosen = [log.pair for log in logs], selected.effect, selection.fitted.chosen
@@ -221,12 +226,20 @@ def finding_of(
         held_out=held_out,
         driver=effect.variable if effect.kind == "driven" else "",
         curve=_curve(selected, selection.whole),
-        similar=selected.similar,
+        similar=similar.get(effect.key, ()),
         kind=effect.kind,
         axis=None if effect.axis is None else AXES[effect.axis],
         variable=effect.variable,
         onset_s=_onset_s(selected),
     )
+
+
+def with_similar(
+    findings: Sequence[Finding], selection: Selection, similar: Mapping[str, tuple[str, ...]]
+) -> tuple[Finding, ...]:
+    """Findings with the other effects that would do as well, by the key of the selected effect."""
+    found = {(one.effect.name, one.effect.equation): similar.get(one.effect.key, ()) for one in selection.selected}
+    return tuple(msgspec.structs.replace(one, similar=found.get((one.effect, one.equation), ())) for one in findings)
 
 
 def _onset_s(selected: SelectedEffect) -> float | None:

@@ -198,11 +198,16 @@ class Journal:
         return self._file.read(length)
 
     def _lines(self) -> Iterator[tuple[int, int, _Line]]:
-        """Offset, length and content of every sound line; two that have lost the end between them count both."""
+        """Offset, length and content of every sound line; two that have lost the end between them count both.
+
+        Lines of earlier versions have no CRC. Behind one that has, a line without has lost it.
+        """
         self._file.seek(0)
-        at = 0
+        at, checked = 0, False
         for raw in self._file:
-            line = _decoded(raw)
+            has_crc = CRC.search(raw) is not None
+            checked |= has_crc
+            line = _decoded(raw) if has_crc or not checked else None
             if line is not None:
                 yield at, len(raw), line
             else:
@@ -236,7 +241,7 @@ def _encoded(line: _Line) -> bytes:
 
 
 def _decoded(raw: bytes) -> _Line | None:
-    """Content of a line; None for one that is not sound. Lines of earlier versions have no CRC."""
+    """Content of a line; None for one that is not sound."""
     match = CRC.search(raw)
     if match is not None and crc32(raw[: match.start()] + b"}") != int(match[1], 16):
         return None

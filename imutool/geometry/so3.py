@@ -20,12 +20,13 @@ not taken.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from imutool.array_types import Bool, Float, Int
+from imutool.array_types import Float, Int
 
 Vectors = Float[Tensor, "*batch 3"]
 Rotations = Float[Tensor, "*batch 3 3"]
@@ -47,7 +48,7 @@ _SERIES = {
     torch.float64: _Series(below=0.25, terms=9, atan_below=1e-2, atan_terms=9),
 }
 
-# sin(x)/x, (1 - cos x)/x² and 1/x² - cot(x/2)/(2x), each as a series in s = x².
+# sin(x)/x, (1 - cos x)/x², (1 - sin(x)/x)/x² and 1/x² - cot(x/2)/(2x), each as a series in s = x².
 _SINC = (
     1.0,
     -1 / 6,
@@ -58,8 +59,10 @@ _SINC = (
     1 / 6227020800,
     -1 / 1307674368000,
     1 / 355687428096000,
+    -1 / 121645100408832000,
 )
 _VERSINE = tuple(c / (2 * k + 2) for k, c in enumerate(_SINC))
+_SINE_LEFT = tuple(-c for c in _SINC[1:])
 _HALF_COT = (  # |B_2k+2| / (2k+2)!, Bernoulli numbers
     1 / 12,
     1 / 720,
@@ -98,6 +101,16 @@ def log(R: Rotations) -> Vectors:
     q = quaternion_wxyz_from_matrix(R)
     w, v = q[..., :1], q[..., 1:]
     return 2.0 * _atan2_over(_squared(v).unsqueeze(-1), w) * v
+
+
+def by_vector(xi: Vectors, by_turn: Vectors) -> Vectors:
+    """Gradient by xi of a function of Exp(xi), from that by a turn of the body: J_r(xi)^T of it.
+
+    J_r(xi)^T = I + (1 - cos a)/a² [xi]x + (1 - sin(a)/a)/a² [xi]x², a = |xi|.
+    """
+    s, across = _squared(xi).unsqueeze(-1), torch.linalg.cross(xi, by_turn)
+    gradient: Tensor = by_turn + _versine(s) * across + _sine_left(s) * torch.linalg.cross(xi, across)
+    return gradient
 
 
 def chart_rate(xi: Vectors, omega_b: Vectors) -> Vectors:
@@ -162,29 +175,32 @@ def _horner(coefficients: tuple[float, ...], s: Float[Tensor, "*batch"]) -> Floa
     return value
 
 
-def _branches(s: Angles2, coefficients: tuple[float, ...]) -> tuple[Bool[Tensor, "*batch"], Angles2, Angles2]:
-    """Mask of the series branch, its value, and an angle for the closed form that is never small."""
+def _analytic(s: Angles2, coefficients: tuple[float, ...], closed_form: Callable[[Angles2], Angles2]) -> Angles2:
+    """Function of the angle: a series where it is small, else the closed form, which sees no small angle."""
     series = _series_of(s.dtype)
     small = s < series.below
+    if bool(small.all()):
+        return _horner(coefficients[: series.terms], s)
     value = _horner(coefficients[: series.terms], torch.where(small, s, torch.zeros_like(s)))
-    return small, value, torch.where(small, torch.ones_like(s), s).sqrt()
+    return torch.where(small, value, closed_form(torch.where(small, torch.ones_like(s), s).sqrt()))
 
 
 def _sinc(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _SINC)
-    return torch.where(small, value, angle.sin() / angle)
+    return _analytic(s, _SINC, lambda angle: angle.sin() / angle)
 
 
 def _versine(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _VERSINE)
-    half = 0.5 * angle
-    return torch.where(small, value, 0.5 * (half.sin() / half).square())
+    return _analytic(s, _VERSINE, lambda angle: 0.5 * ((0.5 * angle).sin() / (0.5 * angle)).square())
+
+
+def _sine_left(s: Angles2) -> Angles2:
+    return _analytic(s, _SINE_LEFT, lambda angle: (1.0 - angle.sin() / angle) / angle.square())
 
 
 def _half_cot(s: Angles2) -> Angles2:
-    small, value, angle = _branches(s, _HALF_COT)
-    half = 0.5 * angle
-    return torch.where(small, value, (1.0 - half * half.cos() / half.sin()) / angle.square())
+    return _analytic(
+        s, _HALF_COT, lambda angle: (1.0 - 0.5 * angle * (0.5 * angle).cos() / (0.5 * angle).sin()) / angle.square()
+    )
 
 
 def _atan2_over(n2: Float[Tensor, "*batch"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

@@ -10,8 +10,11 @@ Users: the constant bias (`bias_start.bias_from_truth`), the calibration (`train
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from imutool.array_types import Float
 from imutool.geometry import so3
@@ -41,13 +44,40 @@ def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "
     return products
 
 
-def whole_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch 3 3"]:
-    """Product of all increments, at half the cost of the running product."""
-    while increments.shape[1] > 1:
-        odd = increments[:, increments.shape[1] // 2 * 2 :]
-        pairs = increments[:, : increments.shape[1] // 2 * 2]
-        increments = torch.cat([pairs[:, 0::2] @ pairs[:, 1::2], odd], dim=1)
-    return increments[:, 0]
+def whole_turn(xi: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch 3 3"]:
+    """Product of rotations Exp(xi[0]) ... Exp(xi[n-1]).
+
+    It takes half the time of the running product. Its derivative needs vectors alone: dR = R [sum_k S_k^T J_r(xi_k) dxi_k]x,
+    S_k the product of the rotations after k.
+    """
+    turn: Tensor = _WholeTurn.apply(xi)  # type: ignore[no-untyped-call]  # torch gives it no type
+    return turn
+
+
+class _WholeTurn(torch.autograd.Function):
+    """`whole_turn`."""
+
+    @staticmethod
+    def forward(ctx: Any, xi: Tensor) -> Tensor:
+        increments, ctx.later = so3.exp(xi), []
+        while increments.shape[1] > 1:
+            paired = increments.shape[1] // 2 * 2
+            ctx.later.append(increments[:, 1:paired:2])
+            increments = torch.cat([increments[:, :paired:2] @ ctx.later[-1], increments[:, paired:]], dim=1)
+        ctx.save_for_backward(xi, increments)
+        return increments[:, 0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        xi, whole = ctx.saved_tensors
+        slope = whole.mT @ grad[:, None]
+        by_turn = (slope - slope.mT).flatten(2)[..., [7, 2, 3]]  # of the end; then of each increment, down the tree
+        for later in reversed(ctx.later):
+            by_pair, odd = by_turn[:, : later.shape[1]], by_turn[:, later.shape[1] :]
+            both = torch.stack([(later @ by_pair[..., None])[..., 0], by_pair], dim=2).flatten(1, 2)
+            by_turn = torch.cat([both, odd], dim=1)
+        return so3.by_vector(xi, by_turn)
 
 
 def attitudes(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch n 3 3"]:
@@ -58,7 +88,7 @@ def attitudes(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> 
 
 def end_attitude(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch 3 3"]:
     """Attitude at the last sample only, at half the cost."""
-    return R_start @ whole_product(so3.exp(step_means(gyro) * dt[..., None]))
+    return R_start @ whole_turn(step_means(gyro) * dt[..., None])
 
 
 def rotation_residual(

@@ -33,7 +33,7 @@ def save(training: Training, path: Path) -> None:
         tensors |= {f"closed_form.{name}": value for name, value in stage.closed_form.items()}
         tensors |= {f"mean.{name}": value for name, value in stage.mean.state_dict().items()}
         tensors |= {f"usual.{n}": value for n, value in stage.objective.loss.medians.items()}
-        for index, state in stage.optimizer.state_dict()["state"].items():
+        for index, state in enumerate(stage.optimizer.state.values()):
             tensors |= {f"optimizer.{index}.{name}": value for name, value in state.items()}
     arrays = {name: value.detach().cpu().contiguous().numpy() for name, value in tensors.items()}
     write_tensors(arrays, {"format": FORMAT, "about": json.dumps(about)}, path, overwrite=True)
@@ -70,12 +70,9 @@ def restore(training: Training, path: Path) -> None:
 def _stage(training: Training, about: dict[str, Any], tensors: dict[str, Tensor]) -> Stage:
     stage = training.begin(about["sensor"])
     stage.mean.load_state_dict(_part(tensors, "mean."))
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, value in _part(tensors, "optimizer.").items():
-        index, key = name.split(".", 1)
-        state.setdefault(int(index), {})[key] = value
-    groups = stage.optimizer.state_dict()["param_groups"]
-    stage.optimizer.load_state_dict({"state": state, "param_groups": groups})
+    for index, state in enumerate(stage.optimizer.state.values()):
+        for name, value in state.items():
+            value.copy_(tensors[f"optimizer.{index}.{name}"])
     device = training.pool.t.device
     stage.objective.loss = RobustLoss({int(n): value.to(device) for n, value in _part(tensors, "usual.").items()})
     stage.step, stage.before, stage.closed_form = int(about["step"]), float(about["before"]), _part(tensors, "closed_form.")

@@ -29,7 +29,7 @@ from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.training import closed_form, statistics
 from imutool.training.objectives.increments import IncrementObjective
-from imutool.training.objectives.objective import BATCH_SAMPLES, Objective, RestBiases, WindowEndObjective, error
+from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective, RestBiases, WindowEndObjective, error
 from imutool.training.segments import Pool, corrected, sensors_up_to
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.units import SENSORS, Sensor
@@ -69,7 +69,7 @@ class Stage:
     """What one sensor's descent must remember to go on: also what a checkpoint holds."""
 
     sensor: Sensor
-    optimizer: torch.optim.Optimizer
+    optimizer: AdamW
     mean: AveragedModel  # of the model
     objective: Objective
     step: int = 0
@@ -200,18 +200,17 @@ class Training:
 
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""
-        rate, decay = self._rate(sensor), self.settings.weight_decay
         weights = {name: w for name, w in self.model.named_parameters() if f".{sensor}" in f".{name}"}
         free = [w for name, w in weights.items() if name.startswith(self.model.undecayed)]
         groups = [
-            {"params": [w for name, w in weights.items() if not name.startswith(self.model.undecayed)], "weight_decay": decay},
-            {"params": [*free, self.tracks.knots], "weight_decay": 0.0},
+            ([w for name, w in weights.items() if not name.startswith(self.model.undecayed)], self.settings.weight_decay),
+            ([*free, self.tracks.knots], 0.0),
         ]
         average = get_ema_multi_avg_fn(1 - 1 / AVERAGE_STEPS)  # type: ignore[no-untyped-call]  # torch gives it no type
         # with its buffers: the running statistics of a batch norm belong to the weights they were seen with
         mean = AveragedModel(self.model.eval(), multi_avg_fn=average, use_buffers=True)
         objective = OBJECTIVES[self.model.objective](self.model, sensor, self.pool, self.tracks, self.settings)
-        return Stage(sensor, torch.optim.AdamW(groups, lr=rate), mean, objective)
+        return Stage(sensor, AdamW(groups), mean, objective)
 
     def _rate(self, sensor: Sensor) -> float:
         return self.settings.gyro_rate if sensor == "gyro" else self.settings.accel_rate
@@ -234,15 +233,10 @@ class Training:
         return self.settings.steps if self.model.iterative else 0
 
     def _rate_at(self, stage: Stage) -> float:
-        warm, cool = (
-            min(1.0, (stage.step + 1) / WARM_UP_STEPS),
-            0.5 * (1 + math.cos(math.pi * stage.step / self._steps(stage.sensor))),
-        )
-        return self._rate(stage.sensor) * warm * cool
+        sensor, warm = stage.sensor, min(1.0, (stage.step + 1) / WARM_UP_STEPS)
+        return self._rate(sensor) * warm * 0.5 * (1 + math.cos(math.pi * stage.step / self._steps(sensor)))
 
     def _one_step(self, stage: Stage) -> float:
-        for group in stage.optimizer.param_groups:
-            group["lr"] = self._rate_at(stage)
         self._set_training(stage)
         total = self._descent_direction(stage)
         if not math.isfinite(total):
@@ -251,14 +245,14 @@ class Training:
                 expected="a finite loss",
                 fix=f"Lower the setting {stage.sensor}_rate",
             )
-        stage.optimizer.step()
+        stage.optimizer.step(self._rate_at(stage))
         stage.mean.update_parameters(self.model)
         stage.step += 1
         return total
 
     def _descent_direction(self, stage: Stage) -> float:
         """Put the gradient of a step's loss at the weights; the loss."""
-        free = [tensor for group in stage.optimizer.param_groups for tensor in group["params"]]
+        free = list(stage.optimizer.state)
 
         def derived(term: Callable[[], Tensor]) -> tuple[float, tuple[Tensor | None, ...]]:
             loss = term()
@@ -281,7 +275,9 @@ class Training:
         self.model.eval()
         for name, module in self.model.named_modules():
             module.training = f".{stage.sensor}" in f".{name}"
-        torch.manual_seed((self.settings.seed + SEED_STRIDE * (stage.step + 1)) % 2**63)
+        # for a GPU that is not there torch.manual_seed would note down each time where it was called from
+        drawing = torch.default_generator if self.pool.t.device.type == "cpu" else torch
+        drawing.manual_seed((self.settings.seed + SEED_STRIDE * (stage.step + 1)) % 2**63)
 
     def _validate(self, stage: Stage) -> float:
         model = stage.mean.module

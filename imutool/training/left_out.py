@@ -30,6 +30,7 @@ from imutool.bias.temperature import Scale
 from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.conversion.forked import of_each
 from imutool.errors import DataError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
@@ -81,17 +82,21 @@ def compare(
 
     `trained` has the statistics of all logs, `scale` is that of their temperature.
     """
-    scores: list[Score] = []
     candidates = [c for c in CANDIDATES if all(_known(fit, c, sensor) for sensor, fit in fits.items())]
-    for index, recording in enumerate(_logs(recordings, pool, fits["gyro"])):
+
+    def of_log(numbered: tuple[int, Recording]) -> list[Score]:
+        index, recording = numbered
         effects = {c: {sensor: _names(fit, c, sensor, index) for sensor, fit in fits.items()} for c in candidates}
         models = {c: bound_to(left_out_model(fits, pool, trained, effects[c], index, scale), recording) for c in candidates}
         log = _without_nuisances(recording, fits["gyro"], (), index)
-        scores.append(_score(log, "raw", "", log.imu))
+        scores = [_score(log, "raw", "", log.imu)]
         scores += [_score(log, "static", start, imu) for start in STARTS for imu in _corrected(log, None, start)]
         for name, model in models.items():
             log = _without_nuisances(recording, fits["gyro"], effects[name]["gyro"], index)
             scores += [_score(log, name, start, imu) for start in STARTS for imu in _corrected(log, model, start)]
+        return scores
+
+    scores = [score for some in of_each(of_log, enumerate(_logs(recordings, pool, fits["gyro"]))) for score in some]
     return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS})
 
 

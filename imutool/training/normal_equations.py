@@ -10,7 +10,7 @@ parameters: with a window's residual and Jacobian (`imutool.inertial.windows`), 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
+FREE: Mapping[Sensor, int] = {"gyro": 3, "accel": 5}  # a log's own unknowns that its prediction leaves free: rest bias, tilt
 MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
 REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
@@ -152,11 +153,6 @@ class Seen:
     gyro: Float[Tensor, "n 3"]
     sensors: SensorPrior
 
-    @property
-    def free(self) -> int:
-        """Number of those without a prior when a log is predicted: rest bias, and the tilt of its world."""
-        return 3 if self.sensor == "gyro" else 5
-
 
 @dataclass(frozen=True)
 class WindowSet:
@@ -165,6 +161,7 @@ class WindowSet:
     first: Int[Tensor, " m"]
     n: int
     judged: bool
+    R_wb: dict[int, Tensor] = field(default_factory=dict)  # under the accelerometer, by a chunk's first sample: they stay
 
 
 def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
@@ -176,8 +173,8 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
         DataError: a log without a window that is free of gaps.
     """
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
-    std = np.concatenate([np.zeros(0), *(prior_std(effect, seen.sensors) for effect in effects)])
-    prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
+    std = [prior_std(effect, seen.sensors) for effect in effects]
+    prior = torch.from_numpy(np.concatenate([np.zeros(0), *std]) ** -2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, len(width))
     terms = torch.from_numpy(_terms(seen.signals, effects)).to(seen.pool.t)
@@ -192,7 +189,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
-        problem = Problem(theta, own, prior, width, design_effect(seen.pool), seen.free, fit, judged)
+        problem = Problem(theta, own, prior, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
         if step < len(sets) + 1:
             theta = problem.solve(range(len(prior))).theta
             own = problem.own_at(theta)
@@ -240,9 +237,8 @@ def _equations(
     def derived(some: Int[Tensor, " m"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 k"]]:
         index = some[:, None] + torch.arange(n + 1, device=some.device)
         cut = pool.windows(some, n, pool.t.new_zeros(len(some), 6))
-        u = pool.gyro if seen.sensor == "gyro" else pool.accel
-        true_u = u[index] - error[index] - own[cut.log, None, :3]
-        e, A, by_nuisance = _residual(seen, cut, true_u, index, own)
+        true_u = (pool.gyro if seen.sensor == "gyro" else pool.accel)[index] - error[index] - own[cut.log, None, :3]
+        e, A, by_nuisance = _residual(seen, cut, true_u, index, own, windows.R_wb)
         each = terms[index]
         each = 0.5 * (each[:, :-1] + each[:, 1:]) if seen.sensor == "gyro" else each  # rates hold between samples
         S = A.permute(0, 2, 3, 1).flatten(1, 2) @ each
@@ -260,15 +256,17 @@ def _residual(
     true_u: Float[Tensor, "m n 3"],
     index: Int[Tensor, "m n"],
     own: Float[Tensor, "logs o"],
+    known: dict[int, Tensor],
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m k 3 3"], Float[Tensor, "m 3 _"]]:
     """Residual, its Jacobian by minus each sample, and its Jacobian by the log's nuisances."""
     if seen.sensor == "gyro":
         e, A = rotation_residual(true_u, windows.dt, windows.R_start.mT @ windows.R_end)
         by_nuisance = nuisance_jacobian("gyro", windows, true_u, true_u)
     else:
-        gyro = seen.gyro[index]
-        R_wb = attitudes(windows.R_start, gyro, windows.dt)
-        e, A = velocity_residual(true_u, windows.dt, R_wb, windows.v_end - windows.v_start, true_u.new_tensor(GRAVITY_W))
+        gyro, dv_w, first = seen.gyro[index], windows.v_end - windows.v_start, int(index[0, 0])
+        if first not in known:
+            known[first] = attitudes(windows.R_start, gyro, windows.dt)
+        e, A = velocity_residual(true_u, windows.dt, known[first], dv_w, true_u.new_tensor(GRAVITY_W))
         by_nuisance = nuisance_jacobian("accel", windows, gyro, true_u)
     return e + (by_nuisance @ own[windows.log, 3:, None])[..., 0], A, by_nuisance
 
@@ -278,7 +276,7 @@ def _summed(
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
     """Normal equations with Huber's weights, in units of each log's median residual; and these medians."""
     # errors add up: a median below that of shorter windows comes from so few that a log's own unknowns fit their noise
-    size, logs = e.norm(dim=1), len(shorter)
+    size = e.norm(dim=1)
     usual = median_per_log(size, log, shorter)
     delta = HUBER_MEDIANS * usual[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / REPEATED
@@ -288,7 +286,7 @@ def _summed(
         H, g = torch.einsum("m,mij,mik->jk", w, J_i, J_i), torch.einsum("m,mij,mi->j", w, J_i, e_i)
         return H, g, (w * e_i.square().sum(1)).sum()
 
-    return Equations(*(torch.stack(parts) for parts in zip(*of_each(of_log, range(logs)), strict=True))), usual
+    return Equations(*(torch.stack(parts) for parts in zip(*of_each(of_log, range(len(shorter))), strict=True))), usual
 
 
 def _terms(signals: Signals, effects: Sequence[LinearForm]) -> Float64[np.ndarray, "n q"]:

@@ -16,6 +16,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.training.fit import Stage, Training
+from imutool.training.objectives.objective import AdamW
 from imutool.training.objectives.paper_loss import PaperLoss, biases_from_poses
 from imutool.units import Sensor
 
@@ -43,7 +44,7 @@ class PaperTraining(Training):
         """Fresh stage from the current model, which moves the sensor's field."""
         chosen = self.settings.paper
         field = self.model.get_submodule(f"drift.{sensor}")
-        adam = torch.optim.Adam(field.parameters(), lr=chosen.rate, weight_decay=chosen.weight_decay)
+        adam = AdamW([(list(field.parameters()), chosen.weight_decay)])
         last = get_ema_multi_avg_fn(0.0)  # type: ignore[no-untyped-call]  # torch gives it no type
         mean = AveragedModel(self.model.eval(), multi_avg_fn=last, use_buffers=True)
         return Stage(sensor, adam, mean, self._loss(sensor, self.model))
@@ -53,7 +54,7 @@ class PaperTraining(Training):
 
     def _closed_form(self, sensor: Sensor) -> None:
         """No closed form; each log's mean bias from poses."""
-        biases, known = biases_from_poses(self.pool, 0.0)
+        biases, known = biases_from_poses(self.pool, 1)
         learnt = known & ~self.pool.held_out
         logs = range(len(self.pool.names))
         self.tracks.set(sensor, torch.stack([biases[learnt & (self.pool.log == i)].mean(0) for i in logs])[:, COLUMNS[sensor]])

@@ -42,7 +42,7 @@ class PaperSettings(Settings, frozen=True):
     rate: Positive = 5e-3  # learning rate of Adam
     halve_every: Count = 300  # steps
     weight_decay: Annotated[float, msgspec.Meta(ge=0)] = 1e-6
-    start_average_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # a segment's first bias is a mean of so much truth
+    smoothed_samples: Count = 1  # around a segment's first bias; the released code has 15 for TUM-VI
 
 
 class PoseFloors(Settings, frozen=True):

@@ -114,7 +114,7 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch]) -> Call
     """One optimisation step as `imutool train` takes it."""
     both = {"drift": ["gyro", "accel"]}  # as in the paper; by default the accelerometer's rest bias does not drift
     training = Training([recording], "neural_ode", TrainSettings(model=both))
-    optimizer = training.begin(sensor).optimizer
+    optimizer, rate = training.begin(sensor).optimizer, getattr(training.settings, f"{sensor}_rate")
     loss = RobustLoss({batch.n: torch.ones(1, dtype=torch.float64) for batch in batches})
     if sensor == "accel":  # the paper's second stage leaves the gyro's network alone
         for part in (training.model.curve, training.model.drift):
@@ -125,9 +125,10 @@ def our_step(recording: Recording, sensor: Sensor, batches: list[Batch]) -> Call
         for batch in batches:
             windows = drawn(training, batch)
             total = total + loss(error(training.model, sensor, windows), windows.log, batch.n)
-        optimizer.zero_grad()
+        for weight in optimizer.state:
+            weight.grad = None
         total.backward()
-        optimizer.step()
+        optimizer.step(rate)
         return float(total.detach())
 
     return step

@@ -243,7 +243,7 @@ def test_of_two_diagnoses_that_end_together_one_is_refused(
     if exists:
         folder.mkdir()
     monkeypatch.setattr(diagnosis_output, "refuse", look)
-    monkeypatch.setattr(diagnosis_output, "_make", lambda d, place, logs: [(place / name).touch() for name in FILES][:0])
+    monkeypatch.setattr(diagnosis_output, "_make", lambda d, place, *_: [(place / name).touch() for name in FILES][:0])
     threads = [threading.Thread(target=run) for _ in range(2)]
     for thread in threads:
         thread.start()

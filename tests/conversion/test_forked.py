@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import sys
 import time
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from imutool.conversion import forked
-from imutool.conversion.forked import Forked, forking
+from imutool.conversion.forked import Forked, forking, of_each, one_by_one
 from imutool.errors import DataError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="commands fork on Linux alone")
@@ -43,6 +44,15 @@ def test_a_function_runs_beside_this_process_and_its_result_comes_back() -> None
         assert content == large
         assert first.result() == (process, large)
         assert Forked(os.getpid).result() != os.getpid()
+
+
+@pytest.mark.usefixtures("two")
+def test_every_item_has_its_result_and_half_of_them_are_done_beside_this_process() -> None:
+    with forking():
+        found = of_each(lambda item: (item, os.getpid()), "abcde")
+    assert [item for item, _ in found] == list("abcde")
+    assert [process == os.getpid() for _, process in found] == [True, False, True, False, True]
+    assert of_each(lambda item: (item, os.getpid()), "ab") == [("a", os.getpid()), ("b", os.getpid())]
 
 
 @pytest.mark.usefixtures("two")
@@ -98,6 +108,54 @@ def test_a_function_that_raises_raises_here_and_one_whose_process_dies_runs_here
         with pytest.raises(DataError, match="too little"):
             beside.result()
         assert Forked(die_elsewhere).result() == "done"
+
+
+@pytest.mark.usefixtures("two")
+def test_an_idle_process_takes_no_processor_and_nobody_waits_for_it(caplog: pytest.LogCaptureFixture) -> None:
+    def warned() -> int:
+        logging.getLogger("imutool.test").warning("said again later")
+        return os.getpid()
+
+    with forking():
+        done, slow = Forked(warned, idle=True), Forked(lambda: time.sleep(60.0), idle=True)
+        assert Forked(os.getpid).result() != os.getpid()
+        select.select(forked._Processes.running, [], [], 30.0)
+        assert done.ready() not in (None, os.getpid())
+        began = time.monotonic()
+        assert slow.ready() is None
+        assert time.monotonic() - began < 30.0
+        assert not forked._Processes.running
+    assert Forked(warned, idle=True).ready() is None
+    assert caplog.messages == []
+
+
+@pytest.mark.usefixtures("two")
+def test_a_process_with_its_result_takes_no_processor_and_no_memory() -> None:
+    before = children()
+    with forking():
+        done = Forked(lambda: b"x" * 10_000_000)
+        select.select([done], [], [], 30.0)
+        assert Forked(os.getpid).result() != os.getpid()
+        assert children() <= before
+        assert len(done.result()) == 10_000_000
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize("count", range(8))
+@pytest.mark.parametrize("worth_s", [0.0, 60.0])
+def test_one_by_one_keeps_the_order_and_shares_what_is_worth_it(
+    monkeypatch: pytest.MonkeyPatch, worth_s: float, count: int
+) -> None:
+    monkeypatch.setattr(forked, "WORTH_S", worth_s)
+    here, before = os.getpid(), children()
+    with forking():
+        made = list(one_by_one(lambda k: (10 * k, os.getpid() == here), range(3, 3 + count)))
+        assert [(k, tens) for k, (tens, _) in made] == [(k, 10 * k) for k in range(3, 3 + count)]
+        beside = max(0, (count - 1) // 2) if worth_s == 0.0 else 0
+        assert [mine for _, (_, mine) in made] == [True] * (count - beside) + [False] * beside
+        assert next(one_by_one(lambda k: k, range(count)), (0, 0)) == (0, 0)  # who wants no more leaves no process behind
+        assert children() <= before
+    assert list(one_by_one(str, range(3))) == [(0, "0"), (1, "1"), (2, "2")]
 
 
 @pytest.mark.usefixtures("two")

@@ -18,9 +18,9 @@ LOG_S = 10.0  # below eight nothing is told
 Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def ray_started() -> Iterator[None]:
-    """A cluster of this machine alone, on loopback: two cores. Every RayEngine of this process uses it."""
+    """A cluster of this machine alone, on loopback: two cores. Every RayEngine uses it, so it ends with this folder's tests."""
     before = dict(os.environ)
     os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", **ONE_THREAD}
     import ray  # not before it is said how

@@ -117,6 +117,17 @@ def test_a_changed_digit_in_a_line_is_seen(tmp_path: Path) -> None:
         assert (journal.done("a"), journal.done("b")) == (None, result("b", messages=7))
 
 
+def test_a_line_that_has_lost_its_crc_does_not_count(tmp_path: Path) -> None:
+    """Spaces over the CRC and the entries before it leave JSON that says something else."""
+    fill(tmp_path, "a", "b")
+    journal, whole = tmp_path / NAME, (tmp_path / NAME).read_bytes()
+    hit = re.search(rb'"messages":7(.*?),"crc":"[0-9a-f]{8}"(?=\}\n)', whole)
+    assert hit is not None
+    journal.write_bytes(whole[: hit.start(1)] + b" " * (hit.end() - hit.start(1)) + whole[hit.end() :])
+    with Journal(tmp_path, SETTINGS, resume=True) as read:
+        assert (read.done("a"), read.done("b")) == (None, result("b", messages=7))
+
+
 def test_lines_of_an_earlier_version_count(tmp_path: Path) -> None:
     fill(tmp_path, "a")
     (tmp_path / NAME).write_bytes(re.sub(rb',"crc":"[0-9a-f]{8}"', b"", (tmp_path / NAME).read_bytes()))

@@ -17,7 +17,7 @@ from imutool.inertial.windows import (
     running_product,
     step_means,
     velocity_residual,
-    whole_product,
+    whole_turn,
 )
 
 # A product of n rotations rounds n times in sequence; the tree rounds no more. 100 steps of one rounding each, and slack.
@@ -27,9 +27,12 @@ STEP, DERIVATIVE = 1e-6, 1e-8
 G_W = torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
 
 
+def vectors(seed: int, batch: int, n: int) -> torch.Tensor:
+    return torch.randn(batch, n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
 def rotations(seed: int, batch: int, n: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return so3.exp(torch.randn(batch, n, 3, generator=generator, dtype=torch.float64)).to(dtype)
+    return so3.exp(vectors(seed, batch, n)).to(dtype)
 
 
 def samples(seed: int, batch: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -43,13 +46,26 @@ def samples(seed: int, batch: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
 @given(seed=st.integers(0, 2**31), batch=st.integers(1, 3), n=st.integers(1, 70))
 @settings(max_examples=30, deadline=None)
 def test_running_and_whole_products_are_the_sequential_ones(dtype: torch.dtype, seed: int, batch: int, n: int) -> None:
-    increments = rotations(seed, batch, n, dtype)
+    xi = vectors(seed, batch, n).to(dtype)
+    increments = so3.exp(xi)
     expected, one_by_one = increments[:, 0], [increments[:, 0]]
     for k in range(1, n):
         expected = expected @ increments[:, k]
         one_by_one.append(expected)
     torch.testing.assert_close(running_product(increments), torch.stack(one_by_one, 1), rtol=0, atol=PRODUCT[dtype])
-    torch.testing.assert_close(whole_product(increments), expected, rtol=0, atol=PRODUCT[dtype])
+    torch.testing.assert_close(whole_turn(xi), expected, rtol=0, atol=PRODUCT[dtype])
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("n", [1, 2, 7, 12])
+def test_the_derivative_of_the_whole_turn_is_that_of_its_operations(n: int, size: float) -> None:
+    xi = (size * vectors(11, 2, n)).requires_grad_()
+    weight, one_by_one = rotations(12, 2, 1)[:, 0], so3.exp(xi).unbind(1)
+    expected = one_by_one[0]
+    for increment in one_by_one[1:]:
+        expected = expected @ increment
+    slopes = (torch.autograd.grad((weight * R).sum(), xi)[0] for R in (whole_turn(xi), expected))
+    torch.testing.assert_close(*slopes, rtol=0, atol=PRODUCT[torch.float64])
 
 
 def test_attitudes_start_at_the_start_and_end_at_the_end_attitude() -> None:

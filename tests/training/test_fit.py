@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from imutool.bias.io import load
-from imutool.bias.networks.threads import side_by_side
+from imutool.bias.networks.threads import of_each, side_by_side
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
+from imutool.conversion import forked
+from imutool.conversion.forked import Forked, forking
 from imutool.errors import ConfigError, DataError, ModelError, NumericsError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
@@ -98,6 +102,16 @@ def test_more_threads_give_the_same_bits(recordings: list[Recording], uninterrup
         finish(again)
     assert torch.get_num_threads() == 3
     assert same(again, uninterrupted[0])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="commands fork on Linux alone")
+def test_a_forked_process_waits_for_no_thread_of_its_parents(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forked, "processors", lambda: 2)
+    torch.set_num_threads(2)
+    with side_by_side(), forking():
+        names = of_each(lambda _: threading.current_thread().name, range(4))
+        assert threading.current_thread().name not in names
+        assert Forked(lambda: of_each(lambda k: k + 1, range(4))).result() == [1, 2, 3, 4]
 
 
 def test_another_seed_gives_another_model(recordings: list[Recording], uninterrupted: tuple[Training, list[Epoch]]) -> None:

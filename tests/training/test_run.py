@@ -23,7 +23,7 @@ from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration import config_of
 from imutool.training.fit import Epoch, TrainSettings
-from imutool.training.objectives.objective import WindowEndObjective
+from imutool.training.objectives.objective import AdamW, WindowEndObjective
 from imutool.training.run import checkpoint_path, helps, settings_from_physics, train
 from imutool.training.settings import settings_of
 from imutool.units import Sensor
@@ -114,7 +114,7 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_no_torn_checkpoint(
     logs: list[Path], expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:
     """The draw of a step is done, or its weights half moved; what goes on from there must still be the same training."""
-    calls, whole_update, whole_loss = 0, torch.optim.AdamW.step, WindowEndObjective.terms
+    calls, whole_update, whole_loss = 0, AdamW.step, WindowEndObjective.terms
 
     def update(*words: Any, **named: Any) -> Any:
         nonlocal calls
@@ -133,7 +133,7 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_no_torn_checkpoint(
 
     out = tmp_path / "m.safetensors"
     with monkeypatch.context() as patched:
-        patched.setattr(*((torch.optim.AdamW, "step", update) if place == "update" else (WindowEndObjective, "terms", terms)))
+        patched.setattr(*((AdamW, "step", update) if place == "update" else (WindowEndObjective, "terms", terms)))
         with pytest.raises(KeyboardInterrupt):
             train(logs, out, method="neural_ode", settings=TINY)
     assert calls == 4

@@ -25,6 +25,7 @@ from imutool.config import Settings
 from imutool.units import SENSORS, Sensor
 
 NEGLIGIBLE = 1e-15
+PAPER_WEIGHTS = 1e-3  # standard deviation at the start, as in the released code
 
 
 class Curve(nn.Module):
@@ -72,8 +73,9 @@ class Network(BiasNetwork):
         drifts = {sensor: Drift(HIDDEN[sensor], *scales[sensor]) for sensor in SENSORS}
         if chosen.paper:
             curves, self.forgets = {}, True
-            for drift in drifts.values():
-                drift.out.reset_parameters()
+            for layer in (layer for drift in drifts.values() for layer in drift.modules() if isinstance(layer, nn.Linear)):
+                nn.init.normal_(layer.weight, 0.0, PAPER_WEIGHTS)
+                nn.init.zeros_(layer.bias)
         self.curve = nn.ModuleDict(curves)
         self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drifting})
 

@@ -7,6 +7,7 @@ on starting and ending them.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,6 +19,8 @@ import torch
 T = TypeVar("T")
 R = TypeVar("R")
 _pool: ContextVar[ThreadPoolExecutor | None] = ContextVar("_pool", default=None)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: _pool.set(None))  # a forked process has none of the threads
 
 
 @contextmanager

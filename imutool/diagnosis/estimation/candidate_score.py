@@ -12,7 +12,7 @@ import numpy as np
 from imutool.array_types import Float, Float64, Int64
 from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, priors
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
-from imutool.diagnosis.estimation.observability import WANDER, with_free
+from imutool.diagnosis.estimation.observability import WANDER, finer_curve, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor.effect import Effect, Stage, Theta
@@ -31,7 +31,7 @@ class SelectedEffect:
     """Selected effect with its parameters and the cost of leaving it out.
 
     `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
-    that no motion showed, `similar` other effects that explain about as much in its place.
+    that no motion showed.
     """
 
     effect: Effect
@@ -41,18 +41,18 @@ class SelectedEffect:
     p_value: float
     false_discovery_rate: float
     gain: float
-    similar: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Selected effects, strongest first; fits; number of trials, and of effects in every fit."""
+    """Selected effects, strongest first, with fits, trials, and what finds those like each."""
 
     selected: tuple[SelectedEffect, ...]
     fitted: Fit
     whole: Fit
     tried: int
     always: int = 0
+    similar: Callable[[], Mapping[str, tuple[str, ...]]] = dict
 
 
 class _Axis(NamedTuple):
@@ -285,13 +285,13 @@ def portable(search: Any, found: Fit) -> Portable:
     return Portable(chosen, numbers, len(search.unnamed))
 
 
-def restored(described: Portable, like: Fit, effects: Sequence[Effect], finer: Callable[[Effect], Effect | None]) -> Fit:
-    """Fit as another process described it; `finer` makes curves that are not in `effects`."""
+def restored(described: Portable, like: Fit, effects: Sequence[Effect]) -> Fit:
+    """Fit as another process described it; finer curves are made again."""
     by_key, chosen = {effect.key: effect for effect in effects}, list[tuple[Effect, Theta]]()
     for key, names, theta in described.chosen:
         whole = by_key[key]
         free = [k for k, parameter in enumerate(whole.parameters) if parameter.name in names]
-        effect = with_free(whole, free) if len(free) == len(names) else finer(whole)
+        effect = with_free(whole, free) if len(free) == len(names) else finer_curve(like.logs, whole)
         assert effect is not None, f"{key} was made from the same samples"
         chosen.append((effect, theta))
     passes = tuple(ForwardPass(log.pair, tuple(chosen)) for log in like.logs)

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from imutool.conversion.forked import Forked
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.conversion.forked import Forked, one_by_one
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
@@ -30,6 +30,7 @@ from imutool.diagnosis.estimation.observability import (
     unidentified,
     values_of,
     with_common_arm,
+    with_finer_curve,
     with_steady_clock,
     without_implausible,
     without_unseen_low_pass,
@@ -38,15 +39,14 @@ from imutool.diagnosis.estimation.significance import (
     Scatter,
     bic,
     estimate_onsets,
+    first_refuted,
     gain_for,
-    held_out_gains,
-    held_out_p_value,
-    prediction_p_value,
+    gain_of,
     scatter,
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import Curve, SplineCurve, finer, like
+from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
@@ -81,7 +81,7 @@ def select_effects(
     if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
         described = other.result()
-        trial = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed), first.finer)
+        trial = restored(described, start, (*(effect for effect, _ in always), *candidates, *unnamed))
         better = bic(trial) < bic(now) - settings.clearly_better
         answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
@@ -100,7 +100,7 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
         hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
         better = search.added(now) if count < settings.most_effects and not hopeless else None
         if better is not None:
-            now = search.pruned(search.exchanged(search.refined(better)))
+            now = search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
         else:
@@ -172,21 +172,6 @@ class _Search:
         start = values_of(effect, reduced, theta)
         return trial if reduced is effect else fit(self.logs, (*others, (reduced, start)), near=near, give_up_above=limit)
 
-    def refined(self, now: Fit) -> Fit:
-        """The fit with more knots in the curve that has just come in, where an edge pays for them."""
-        others, (effect, _) = now.chosen[:-1], now.chosen[-1]
-        if not isinstance(effect.forward, Curve):
-            return now
-        fine = self.finer(effect)
-        if fine is None:
-            return now
-        trial = fit(self.logs, (*others, (fine, fine.null_value.astype(float))), near=now)
-        return trial if bic(trial) < bic(now) - self.settings.clearly_better else now
-
-    def finer(self, curve: Effect) -> Effect | None:
-        """A curve with more knots."""
-        return finer(curve, like([log.pair for log in self.logs if isinstance(log.pair, Pair)]))
-
     def exchanged(self, now: Fit) -> Fit:
         """Fit with an effect replaced by another of the catalogue that explains more."""
         for k in self.removable(now) if len(now.chosen) - len(self.always) <= self.settings.exchanged_effects else ():
@@ -221,13 +206,17 @@ class _Search:
 
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""
-        for k in self.removable(now):
+        fits = dict[int, Fit]()
+
+        def without(k: int) -> Fit:
             effect, theta = now.chosen[k]
             least = gain_for(self.threshold - self.candidates.log_choices[effect.key], len(theta))
             limit = now.objective + self.settings.give_up_factor * least  # a superfluous effect leaves less after a few steps
-            without = fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, give_up_above=limit)
-            if self.candidates.log_p(effect, without.objective - now.objective) > self.threshold:
-                return self.pruned(without)
+            return fits.setdefault(k, fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, give_up_above=limit))
+
+        for k, objective in one_by_one(lambda k: without(k).objective, self.removable(now)):
+            if self.candidates.log_p(now.chosen[k][0], objective - now.objective) > self.threshold:
+                return self.pruned(fits[k] if k in fits else without(k))
         return now
 
     def tested(self, now: Fit) -> Selection:
@@ -235,20 +224,27 @@ class _Search:
         first = len(self.always)
         while len(now.chosen) > first:
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
+            unseen = Forked(partial(first_refuted, now, first))
             whole = fit(self.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
+                unseen.end()
                 now = fit(self.logs, reduced)
                 continue
-            other = fit(self.logs, now.chosen, part="held_out", near=now)
-            whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
-            verdicts = self._verdicts(now, other, whole)
-            worst = max(range(len(verdicts)), key=lambda k: verdicts[k].false_discovery_rate)
-            if verdicts[worst].false_discovery_rate <= self.settings.false_discovery_rate:
-                selected = [replace(verdict, similar=tuple(self._rivals(first + k, now))) for k, verdict in enumerate(verdicts)]
+            refuted, verdicts = unseen.result(), list[SelectedEffect]()
+            if refuted > first:
+                whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+                verdicts = self._verdicts(whole, range(first, refuted))
+            rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
+            worst = max(range(len(rates)), key=lambda k: rates[k])
+            if rates[worst] <= self.settings.false_discovery_rate:
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
-                return Selection(tuple(sorted(selected, key=lambda verdict: -verdict.gain)), fitted, whole, self.tried, first)
+                selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
+                return Selection(selected, fitted, whole, self.tried, first, partial(self._similar, now))
             now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
         return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried, first)
+
+    def _similar(self, now: Fit) -> dict[str, tuple[str, ...]]:
+        return {now.keys[k]: tuple(self._rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
         """Fits with another effect of the catalogue in the place of one, that leave about as little (Akaike's criterion)."""
@@ -263,37 +259,38 @@ class _Search:
                     found.setdefault(effect.name, trial)
         return found
 
-    def _verdict(self, k: int, fitted: Fit, other: Fit, whole: Fit, scattered: Scatter | None) -> SelectedEffect:
+    def _verdicts(self, whole: Fit, passed: range) -> list[SelectedEffect]:
+        """Verdicts on effects that passed on unseen time, up to the first that goes, with no trust in model errors."""
+        exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
+        denoised = any(log.pair.denoised for log in self.logs)
+        white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
+        scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
+        for k, gain in one_by_one(partial(gain_of, whole), passed):
+            verdict = self._verdict(k, gain, whole, scattered)
+            if verdict is None:
+                break
+            verdicts.append(verdict)
+        gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
+        left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
+
+        def hidden(iterations: int | None) -> frozenset[str]:
+            more = {key: gain_of(whole, k, iterations) for key, k in left.items()} if FOLLOWING & gains.keys() else {}
+            return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
+
+        below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
+        return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
+
+    def _verdict(self, k: int, gain: float, whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
+        """Verdict on one effect by all rows; none if chance explains it or it is no answer."""
         effect, theta = whole.chosen[k]
-        without = fit(self.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part="all", near=whole)
-        gain = without.objective - whole.objective
-        if any(other_effect.jumps for other_effect, _ in without.chosen):
-            gain /= whole.settings.between_samples**2  # whatever moves the signal a little wins single samples at an edge
-        log_p = self.candidates.log_p(effect, gain)
-        if scattered is not None:
-            log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
-        blocks = np.concatenate([held_out_gains(fitted, k, "held_out"), held_out_gains(other, k, "fitted")])
-        exact_p = prediction_p_value(blocks) if all(log.pair.exact for log in self.logs) else 1.0
-        held_out_p = min(held_out_p_value(blocks[:, 0]), exact_p)
-        rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
         curve = isinstance(effect.forward, SplineCurve)
-        beyond = beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std, curve=curve)
-        if held_out_p > self.settings.held_out_p_value or beyond:
-            rate = 1.0
+        if beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std, curve=curve):
+            return None
+        log_p = self.candidates.log_p(effect, gain)
+        if scattered is not None:
+            log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
+        rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
         unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
-        return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain)
-
-    def _verdicts(self, fitted: Fit, other: Fit, whole: Fit) -> list[SelectedEffect]:
-        """Verdicts with no trust in model errors of far larger effects; up to the first effect that goes in any case."""
-        exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
-        white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
-        scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
-        for k in range(len(self.always), len(whole.chosen)):
-            verdicts.append(self._verdict(k, fitted, other, whole, scattered))
-            if verdicts[-1].false_discovery_rate == 1.0 and not FOLLOWING & {one.effect.key for one in verdicts[:-1]}:
-                return verdicts  # a later one could show a model error only of those that follow the motion
-        gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
-        hidden = below_model_error(gains, self.settings, denoised=any(log.pair.denoised for log in self.logs), poses=not exact)
-        return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in hidden else verdict for verdict in verdicts]
+        return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain) if rate < 1.0 else None

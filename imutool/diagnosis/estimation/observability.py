@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.significance import bic
+from imutool.diagnosis.estimation.unnamed_effects import Curve, finer, like
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
@@ -128,6 +130,21 @@ def with_steady_clock(
         at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
         fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in pair)), near=now))
     return min(fits, key=bic)
+
+
+def with_finer_curve(logs: Sequence[WhitenedLog], now: Fit) -> Fit:
+    """Fit with more knots in the curve that has just come in, where an edge pays for them (BIC)."""
+    others, (effect, _) = now.chosen[:-1], now.chosen[-1]
+    fine = finer_curve(logs, effect) if isinstance(effect.forward, Curve) else None
+    if fine is None:
+        return now
+    trial = fit(logs, (*others, (fine, fine.null_value.astype(float))), near=now)
+    return trial if bic(trial) < bic(now) - now.logs[0].pair.settings.search.clearly_better else now
+
+
+def finer_curve(logs: Sequence[WhitenedLog], curve: Effect) -> Effect | None:
+    """Curve with more knots; none where the variable has no room for them."""
+    return finer(curve, like([log.pair for log in logs if isinstance(log.pair, Pair)]))
 
 
 def with_common_arm(

@@ -59,6 +59,28 @@ def bic(found: Fit) -> float:
     return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)
 
 
+def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:
+    """Squares that leaving an effect out costs; after fewer steps of the others, at most."""
+    others = (*whole.chosen[:k], *whole.chosen[k + 1 :])
+    without = fit(whole.logs, others, part=whole.part, iterations=iterations, near=whole)
+    jumps = any(effect.jumps for effect, _ in others)  # whatever moves the signal a little wins single samples at an edge
+    return (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
+
+
+def first_refuted(fitted: Fit, first: int) -> int:
+    """Index of the first effect that unseen blocks refute; the number of effects if none is.
+
+    Blocks that this fit has not seen, and those that a fit of the others has not.
+    """
+    other, exact = fit(fitted.logs, fitted.chosen, part="held_out", near=fitted), all(log.pair.exact for log in fitted.logs)
+    for k in range(first, len(fitted.chosen)):
+        blocks = np.concatenate([held_out_gains(fitted, k, other.part), held_out_gains(other, k, fitted.part)])
+        p_value = min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if exact else 1.0)
+        if p_value > fitted.logs[0].pair.settings.search.held_out_p_value:
+            return k
+    return len(fitted.chosen)
+
+
 def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
     """p-value of the held-out improvement under H0, by Student's t or by ranks.
 

@@ -158,7 +158,8 @@ def _summarized(
     level, logs, names = noise_floor([log]), [log], pair.names
     selection, small = _above_model_error(log, selection, level)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
-    findings = [_with_python(finding_of(logs, selection, selected, level)) for selected in selection.selected]
+    similar = selection.similar()
+    findings = [_with_python(finding_of(logs, selection, selected, level, similar)) for selected in selection.selected]
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
         findings = [_with_learnt_error(finding) for finding in findings]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}

@@ -1,4 +1,4 @@
-"""Objectives of the descent: window errors, a robust loss, and each log's free rest bias.
+"""Objectives of the descent and its steps: window errors, a robust loss, free rest biases.
 
 The paper's losses are mean squares (eq. 16, 17). Here the error of a window is divided by the median error of windows of its
 length and log, and goes through Huber's function: an outlier of the motion capture pulls no harder than an ordinary window, and
@@ -14,9 +14,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adamw import adamw
 
 from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
@@ -32,6 +34,33 @@ from imutool.units import SENSORS, Sensor
 
 TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²
 TRACK_WALK = {"gyro": 1e-4, "accel": 2e-3}  # how far a rest bias may walk in a second^1/2, rad/s and m/s²
+
+
+class AdamW:
+    """AdamW by the function of PyTorch.
+
+    PyTorch's class would import the compiler of PyTorch, which takes a second of CPU time.
+
+    Attributes:
+        state: what the next step depends on, by weight, in the order of the groups.
+    """
+
+    def __init__(self, groups: Sequence[tuple[Sequence[Tensor], float]]) -> None:
+        self.groups = groups  # weights, and how fast they decay
+        self.state: dict[Tensor, dict[str, Tensor]] = {
+            weight: {"exp_avg": torch.zeros_like(weight), "exp_avg_sq": torch.zeros_like(weight), "step": torch.tensor(0.0)}
+            for weights, _ in groups
+            for weight in weights
+        }
+
+    @torch.no_grad()
+    def step(self, rate: float) -> None:
+        """Move the weights that have a gradient."""
+        for weights, decay in self.groups:
+            some = {weight: weight.grad for weight in weights if weight.grad is not None}
+            means, squares, steps = ([self.state[w][name] for w in some] for name in ("exp_avg", "exp_avg_sq", "step"))
+            usual: dict[str, Any] = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "amsgrad": False, "maximize": False}
+            adamw([*some], [*some.values()], means, squares, [], steps, lr=rate, weight_decay=decay, **usual)
 
 
 class RestBiases(nn.Module):

@@ -6,10 +6,12 @@ and the next one give (its section on hierarchical training).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
+from scipy.signal import savgol_filter
 from torch import Tensor
 
 from imutool.array_types import Bool, Float, Int
@@ -24,6 +26,8 @@ from imutool.training.objectives.objective import BATCH_SAMPLES, Objective
 from imutool.training.segments import Part, Pool
 from imutool.units import Sensor
 
+LOSS_UNITS = 1e6  # mrad² and mm², as in the released code: in rad² gradients would be as small as Adam's epsilon
+CUBIC = 3  # order of the smoothing polynomial
 SEGMENTS = 250  # at a time, side by side on as many cores as there are
 Biases = Float[Tensor, "n 6"]
 
@@ -39,7 +43,7 @@ class PaperLoss(Objective):
     def _choose(self) -> None:
         self.n = self.settings.paper.samples
         self.first = self._starts("train")
-        self.start, _ = biases_from_poses(self.pool, self.settings.paper.start_average_s)
+        self.start, _ = biases_from_poses(self.pool, self.settings.paper.smoothed_samples)
 
     def _starts(self, part: Part) -> Int[Tensor, " m"]:
         """First samples of the segments of a part; the sample before each gives the path its first slope."""
@@ -63,7 +67,7 @@ class PaperLoss(Objective):
         return [partial(self._term, some, len(some) / count) for some in torch.split(self.first[chosen], SEGMENTS)]
 
     def _term(self, first: Int[Tensor, " b"], share: float) -> Float[Tensor, ""]:
-        return share * self.squares(first).mean()
+        return share * LOSS_UNITS * self.squares(first).mean()
 
     def held_out(self) -> float:
         """Root of the mean square over the held-out parts."""
@@ -103,11 +107,11 @@ class PaperLoss(Objective):
         """Nothing: the rest biases take no part."""
 
 
-def biases_from_poses(pool: Pool, average_s: float) -> tuple[Biases, Bool[Tensor, " n"]]:
+def biases_from_poses(pool: Pool, smoothed: int) -> tuple[Biases, Bool[Tensor, " n"]]:
     """Bias at each sample from its true pose and the next one, and where there is one.
 
-    It is a mean over `average_s` around the sample:
-    b = omega - Log(R_k^T R_k+1) / dt, and b = a - R_k^T ((v_k+1 - v_k) / dt - g).
+    b = omega - Log(R_k^T R_k+1) / dt, and b = a - R_k^T ((v_k+1 - v_k) / dt - g). A cubic of so many samples around each
+    smooths them (Savitzky and Golay), where there are as many without a gap.
     """
     dt = torch.diff(pool.t)[:, None]
     turned = so3.log(pool.R_wb[:-1].mT @ pool.R_wb[1:]) / dt
@@ -118,20 +122,13 @@ def biases_from_poses(pool: Pool, average_s: float) -> tuple[Biases, Bool[Tensor
     known = torch.zeros_like(pool.trusted)
     known[pool.starts(1, "all")] = True
     biases = torch.where(known[:, None], biases, torch.zeros_like(biases))
-    around = round(0.5 * average_s * pool.rate_hz)
-    if around:
-        for log in range(len(pool.names)):
-            rows = pool.log == log
-            sums, counts = (_around(x[rows], around) for x in (biases, known[:, None].to(biases)))
-            biases[rows] = sums / counts.clamp(min=1.0)
+    if smoothed > CUBIC:
+        ends = (torch.nonzero(~known)[:, 0] + 1).tolist()
+        for first, end in itertools.pairwise([0, *ends]):
+            if end - 1 - first >= smoothed:
+                some = biases[first : end - 1].cpu().numpy()
+                biases[first : end - 1] = torch.from_numpy(savgol_filter(some, smoothed, CUBIC, axis=0)).to(biases)
     return biases, known
-
-
-def _around(x: Float[Tensor, "n k"], m: int) -> Float[Tensor, "n k"]:
-    """Sum of each row, of the m before and of the m after it."""
-    running = torch.cat([torch.zeros_like(x[:1]), torch.cumsum(x, dim=0)])
-    row = torch.arange(len(x), device=x.device)
-    return running[(row + m + 1).clamp(max=len(x))] - running[(row - m).clamp(min=0)]
 
 
 def _sums(start: Float[Tensor, "b 3"], steps: Float[Tensor, "b n 3"]) -> Float[Tensor, "b _ 3"]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import platform
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -41,6 +42,8 @@ PICTURES: tuple[Callable[[RunData], Picture | None], ...] = (
     report_signals.allan_deviation,
     report_errors.event_lanes,
 )
+EVENTS = "events"  # the picture of them
+NOTHING: Mapping[str, str] = MappingProxyType({})
 STYLE = """
 h1 { font-size: 22px; color: var(--ink); margin: 0 0 8px; }
 h2.log { font-size: 22px; border-top: 2px solid var(--grid); padding-top: 18px; }
@@ -63,11 +66,11 @@ summary { cursor: pointer; font-size: 15px; padding: 8px 0; color: var(--soft); 
 """
 
 
-def page(logs: Sequence[RunData]) -> str:
+def page(logs: Sequence[RunData], drawn: Mapping[str, str] = NOTHING) -> str:
     """HTML of the report; several logs are compared first.
 
     No request leaves the page, it needs no script, and text from the logs is escaped. Parts without data (truth, models,
-    events) are left out.
+    events) are left out. What is `drawn` already is not drawn again.
 
     Raises:
         ConfigError: no logs, or matplotlib is not installed.
@@ -76,18 +79,30 @@ def page(logs: Sequence[RunData]) -> str:
         raise ConfigError("no logs", where="report", expected="at least one")
     require_matplotlib()
     if len(logs) == 1:
-        body = [f"<h1>{text(logs[0].name)}</h1>", *_log(logs[0], "log1", alone=True), *_made()]
+        body = [f"<h1>{text(logs[0].name)}</h1>", *_log(logs[0], "log1", drawn, alone=True), *_made()]
         return document(logs[0].name, body, STYLE)
     body = [f"<h1>{len(logs)} logs</h1>", f'<p class="conclusion">{text(summary_of_logs(logs))}</p>', *_compared(logs)]
     for k, data in enumerate(logs, start=1):
-        body += [f'<h2 class="log" id="log{k}">{text(data.name)}</h2>', *_log(data, f"log{k}", alone=False)]
+        body += [f'<h2 class="log" id="log{k}">{text(data.name)}</h2>', *_log(data, f"log{k}", drawn, alone=False)]
     return document(f"{len(logs)} logs", [*body, *_made()], STYLE)
 
 
-def write_page(logs: Sequence[RunData], path: Location, *, overwrite: bool = False) -> None:
+def drawings(logs: Sequence[RunData]) -> dict[str, str]:
+    """Drawings of the page by identifier, but for those of events: a diagnosis adds some later."""
+    return {
+        name: _svg(panel, picture.name, k)
+        for number, data in enumerate(logs, start=1)
+        for picture in _pictures(data)
+        if picture is not None and picture.name != EVENTS
+        for k, panel in enumerate(picture.panels)
+        for name in [f"log{number}-{picture.name}-{k}"]
+    }
+
+
+def write_page(logs: Sequence[RunData], path: Location, *, drawn: Mapping[str, str] = NOTHING, overwrite: bool = False) -> None:
     """Write the page (ConfigError: as `page`, or the file exists or cannot be written)."""
     with Target(path, overwrite=overwrite) as target:  # refuses before the work is done, leaves nothing after a failure
-        target.write(page(logs).encode())
+        target.write(page(logs, drawn).encode())
 
 
 def write_pngs(data: RunData, folder: Path, *, overwrite: bool = False) -> list[Path]:
@@ -135,7 +150,7 @@ def _pictures(data: RunData) -> Iterator[Picture | None]:
         yield make(data)
 
 
-def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
+def _log(data: RunData, key: str, drawn: Mapping[str, str], *, alone: bool) -> Iterator[str]:
     """Section of one log; among several logs its pictures are folded on screen."""
     pictures = [picture for picture in _pictures(data) if picture is not None]
     yield f'<p class="conclusion">{text(conclusion(data))}</p>'
@@ -149,27 +164,28 @@ def _log(data: RunData, key: str, *, alone: bool) -> Iterator[str]:
     if not alone:
         yield "<details><summary>Pictures, events and provenance</summary>"
     for picture in pictures:
-        yield from _drawn(picture, key)
-        if picture.name == "events":
+        yield from _drawn(picture, key, drawn)
+        if picture.name == EVENTS:
             yield from report_errors.event_table(data)
     yield from _provenance(data, key)
     if not alone:
         yield "</details>"
 
 
-def _drawn(picture: Picture, key: str) -> Iterator[str]:
+def _drawn(picture: Picture, key: str, drawn: Mapping[str, str]) -> Iterator[str]:
     yield f'<section id="{key}-{picture.name}"><h3>{text(picture.title)}</h3>'
     if picture.caption:
         yield f'<p class="note">{text(picture.caption)}</p>'
     yield '<div class="pair">' if not picture.panels[0].wide else "<div>"
     for k, panel in enumerate(picture.panels):
-        yield f"<figure>{prefix_ids(_svg(panel, f'{picture.name}-{k}'), f'{key}-{picture.name}-{k}')}</figure>"
+        name = f"{key}-{picture.name}-{k}"
+        yield f"<figure>{prefix_ids(drawn.get(name) or _svg(panel, picture.name, k), name)}</figure>"
     yield "</div></section>"
 
 
-def _svg(panel: Panel, name: str) -> str:
+def _svg(panel: Panel, picture: str, number: int) -> str:
     width = WIDTH_INCH if panel.wide else HALF_INCH
-    return svg(panel.draw, panel.height_inch, name, width_inch=width, label=panel.label)
+    return svg(panel.draw, panel.height_inch, f"{picture}-{number}", width_inch=width, label=panel.label)
 
 
 def _figures(data: RunData, key: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from imutool.bias import io
 from imutool.bias.networks import ode as chart
 from imutool.bias.networks.network import Segment
-from imutool.bias.networks.neural_ode import Network
+from imutool.bias.networks.neural_ode import PAPER_WEIGHTS, Network
 from imutool.bias.networks.paper_ode import BiasOde
 from imutool.bias.networks.perceptron import Drift
 from imutool.bias.neural_ode import Config
@@ -22,14 +22,18 @@ from imutool.sensor.made_up_flight import flight
 
 RATE_HZ = 200.0
 STREAM = 1e-6  # rad/s and m/s²: of numpy against torch, as for every model
+WEIGHTS = 0.1
 LATE = 1e-2  # rad: Euler is late by half a step, 2.5 ms of a few rad/s
 SENSORS: tuple[Literal["gyro", "accel"], ...] = ("gyro", "accel")
 
 
 def lively() -> Network:
-    """Model of the paper's scheme, with fields as they are drawn."""
+    """Model of the paper's scheme, with fields of some size."""
     torch.manual_seed(0)
-    return Network(Config(scheme="paper"), RATE_HZ).double().requires_grad_(False).eval()
+    model = Network(Config(scheme="paper"), RATE_HZ).double().requires_grad_(False).eval()
+    for value in model.parameters():
+        value.mul_(WEIGHTS / PAPER_WEIGHTS)
+    return model
 
 
 @pytest.fixture(scope="module")

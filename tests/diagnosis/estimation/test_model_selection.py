@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.special import gammaincc
@@ -15,9 +16,9 @@ from imutool.diagnosis.estimation import model_selection
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
-from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.significance import log_p_value
+from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effects import clock_wander
 
@@ -141,6 +142,31 @@ def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_nam
     assert short.selected[0].gain == whole.selected[0].gain
 
 
+@pytest.mark.parametrize("model_error", [1e-9, 0.5])
+def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_could_hide_one(
+    model_error: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = {"clock_offset": [0.001], "gyro_scale": [0.02, 0.0, 0.01], "lever_arm": [0.1, -0.1, 0.05]}
+    log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
+    candidates, now = planted.catalogue(), fit([log], planted.acting(truth), part="all")
+    settings, asked_of = (
+        msgspec.structs.replace(log.pair.settings.search, model_error=model_error),
+        list[tuple[int, int | None]](),
+    )
+
+    def recorded(whole: Fit, k: int, iterations: int | None = None) -> float:
+        asked_of.append((k, iterations))
+        return gain_of(whole, k, iterations)
+
+    monkeypatch.setattr(model_selection, "gain_of", recorded)
+    known = Candidates([log], candidates)
+    search = model_selection._Search([log], candidates, (), (), 0.0, settings, lambda word: None, known)
+    offset, *_ = search._verdicts(now, range(1))
+    assert (offset.false_discovery_rate == 1.0) == (model_error == 0.5)
+    assert asked_of == [(0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
+    assert all(gain_of(now, k) <= gain_of(now, k, 0) for k in range(3))
+
+
 # ── one, two ──
 
 
@@ -245,7 +271,7 @@ def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -
         drift, temp = (
             planted.acting({name: size})[0][0] for name, size in (("gyro_bias_drift", [0] * 4), ("temperature", [0] * 6))
         )
-        return {one.effect.key: one.similar for one in select_effects([planted.weighed(pair)], (drift, temp)).selected}
+        return dict(select_effects([planted.weighed(pair)], (drift, temp)).similar())
 
     (name, rivals), *more = told(rising).items()
     assert {name, *rivals} == {"gyro_bias_drift", "temperature"}

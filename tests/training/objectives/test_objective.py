@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ import torch
 from imutool.bias.networks import static
 from imutool.bias.networks.network import Segment
 from imutool.recording import Recording
-from imutool.training.objectives.objective import error, motion_error, orientation_error
+from imutool.training.objectives.objective import AdamW, error, motion_error, orientation_error
 from imutool.training.segments import Pool, Windows
 
 N, PERIOD_S = 100, 0.005
@@ -23,6 +24,29 @@ def windows(perfect: Callable[..., Recording], rest: list[float]) -> Windows:
     pool = Pool.of([perfect(1, duration_s=8.0, still_s=0.5)])
     first = pool.starts(N, "train", hop=37)
     return pool.windows(first, N, torch.tensor(rest, dtype=torch.float64).expand(len(first), 6))
+
+
+def test_steps_are_those_of_pytorchs_class_without_the_import_of_its_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    def weights() -> list[torch.Tensor]:
+        return [torch.linspace(-1.0, 1.0, size, dtype=torch.float64).requires_grad_() for size in (7, 3, 2)]
+
+    def descend(some: list[torch.Tensor], step: Callable[[float], None]) -> None:
+        for k in range(5):
+            for weight in some[:2]:  # the last has no gradient, and must not decay
+                weight.grad = weight.detach().exp() * (-1.0) ** k
+            step(0.1 / (k + 1))
+
+    def step_of_theirs(rate: float) -> None:
+        for group in theirs.param_groups:
+            group["lr"] = rate
+        theirs.step()
+
+    expected, found = weights(), weights()
+    theirs = torch.optim.AdamW([{"params": expected[::2], "weight_decay": 0.1}, {"params": expected[1:2], "weight_decay": 0.0}])
+    descend(expected, step_of_theirs)
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)
+    descend(found, AdamW([(found[::2], 0.1), (found[1:2], 0.0)]).step)
+    assert all(map(torch.equal, expected, found))
 
 
 def test_an_exact_sensor_has_no_error(perfect: Callable[..., Recording]) -> None:

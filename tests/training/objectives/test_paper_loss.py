@@ -44,7 +44,7 @@ def still(pool: Pool, sensor: str, **changes: int) -> PaperLoss:
 
 def test_consecutive_poses_give_the_bias(perfect: Make) -> None:
     pool = Pool.of([biased(perfect)])
-    found, known = biases_from_poses(pool, 0.0)
+    found, known = biases_from_poses(pool, 1)
     assert int(known.sum()) == len(known) - 1  # all but the last
     off = (found - torch.from_numpy(BIAS))[known].abs()
     assert off[:, :3].max() < LATE["gyro"]
@@ -52,18 +52,18 @@ def test_consecutive_poses_give_the_bias(perfect: Make) -> None:
     torch.testing.assert_close(found[known].mean(0), torch.from_numpy(BIAS), rtol=0.02, atol=1e-2)
 
 
-def test_a_mean_over_some_time_takes_the_noise_off_and_no_gap_into_it(perfect: Make) -> None:
+def test_smoothing_takes_noise_off_and_no_gap_into_it(perfect: Make) -> None:
     pool = Pool.of([biased(perfect, noise=0.1)])
     trusted = pool.trusted.clone()
     trusted[700:720] = False
     pool = replace(pool, trusted=trusted, R_wb=torch.where(trusted[:, None, None], pool.R_wb, torch.full_like(pool.R_wb, 0.5)))
-    single, known = biases_from_poses(pool, 0.0)
-    averaged, _ = biases_from_poses(pool, 0.25)
+    single, known = biases_from_poses(pool, 1)
+    smoothed, _ = biases_from_poses(pool, 51)
     assert not known[700:720].any()
-    spread = [float((x - torch.from_numpy(BIAS))[known][:, :3].std()) for x in (single, averaged)]
+    spread = [float((x - torch.from_numpy(BIAS))[known][:, :3].std()) for x in (single, smoothed)]
     assert spread[0] == pytest.approx(0.1, rel=0.1)
-    assert spread[1] < 0.02
-    assert float((averaged - torch.from_numpy(BIAS))[690:730].abs().max()) < LATE["accel"]
+    assert spread[1] < 0.03
+    assert float((smoothed - torch.from_numpy(BIAS))[690:730].abs().max()) < LATE["accel"]
 
 
 def test_a_segment_from_its_true_bias_misses_what_the_bias_changes(perfect: Make) -> None:
@@ -92,7 +92,7 @@ def test_a_steps_terms_are_the_mean_over_all_its_segments(perfect: Make) -> None
     chosen = torch.randint(len(loss.first), (600,), generator=torch.Generator().manual_seed(3))
     whole = loss.squares(loss.first[chosen]).mean()
     assert len(terms) > 1
-    torch.testing.assert_close(torch.stack([term() for term in terms]).sum(), whole, rtol=1e-12, atol=0)
+    torch.testing.assert_close(torch.stack([term() for term in terms]).sum(), 1e6 * whole, rtol=1e-12, atol=0)
 
 
 def test_truth_too_short_for_a_segment_is_refused(perfect: Make) -> None:

@@ -163,6 +163,17 @@ def test_events_have_lanes_and_rows_and_of_many_the_rest_is_counted(seen: RunDat
     assert f"{90 - listed} more are drawn above but not listed" in said
 
 
+def test_what_was_drawn_before_the_last_events_were_known_is_not_drawn_again(
+    seen: RunData, page: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names, svg = list[str](), report.svg
+    drawn = report.drawings([replace(seen, events=seen.events[:1])])
+    assert drawn
+    monkeypatch.setattr(report, "svg", lambda draw, height, name, **how: names.append(name) or svg(draw, height, name, **how))
+    assert re.sub("p-p[0-9a-f]{10}", "", report.page([seen], drawn)) == re.sub("p-p[0-9a-f]{10}", "", page)
+    assert names == ["events-0"]
+
+
 def curve_titles(content: str) -> list[str]:
     return re.findall(r'<g id="[^"]*curve-\d+"><title>([^<]*)</title>', content)
 
