@@ -117,9 +117,9 @@ class Forked(Generic[T]):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # of the progress bar's thread, which the other never needs
-                self._process = fork()
+                self._process = fork(IDLE if self._idle else 0)
             if not self._process:
-                _serve(self._function, writing, IDLE if self._idle else 0)
+                _serve(self._function, writing)
             _Processes.running.append(self)
         except OSError:  # no memory or no number is left for one more
             os.close(self._reading)
@@ -159,14 +159,13 @@ def one_by_one(function: Callable[[int], T], numbers: Sequence[int]) -> Iterator
             beside.end()
 
 
-def _serve(function: Callable[[], object], writing: int, nice: int) -> NoReturn:
+def _serve(function: Callable[[], object], writing: int) -> NoReturn:
     """Write what the function returns, and end without any clean-up."""
     code, _Processes.allowed, _Processes.running = 1, 0, []
     try:
         for number in SIGNALS:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-        os.nice(nice)
         gc.freeze()
         said = queue.SimpleQueue[logging.LogRecord]()
         logging.getLogger().handlers = [logging.handlers.QueueHandler(said)]

@@ -68,7 +68,7 @@ def test_on_one_processor_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.usefixtures("two")
 def test_where_the_system_has_no_process_to_give_the_function_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none_left() -> int:
+    def none_left(nicer: int) -> int:
         raise BlockingIOError
 
     monkeypatch.setattr(forked, "fork", none_left)

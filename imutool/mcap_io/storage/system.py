@@ -85,11 +85,14 @@ def can_fork() -> bool:
     return sys.platform == "linux"
 
 
-def fork() -> int:
-    """Copy this process: 0 in the copy, its number here."""
+def fork(nicer: int = 0) -> int:
+    """Copy this process: 0 in the copy, which is `nicer` by so much, its number here."""
     if sys.platform == "win32":
         raise NotImplementedError("a fork")
-    return os.fork()
+    process = os.fork()
+    if not process:
+        os.nice(nicer)
+    return process
 
 
 def kill(process: int) -> None:
