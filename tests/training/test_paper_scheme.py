@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,9 @@ def scaled(perfect: Make, seed: int) -> Recording:
     return Recording(exact.name, Imu(exact.imu.t_ns, gyro, exact.imu.accel), exact.truths)
 
 
-def training(perfect: Make, **paper: Any) -> PaperTraining:
+def training(perfect: Make, model: Mapping[str, Any] = MappingProxyType({}), **paper: Any) -> PaperTraining:
     settings = settings_of("neural_ode")(
-        validate_every=10, model={"scheme": "paper"}, paper=PaperSettings(**{**PAPER, **paper})
+        validate_every=10, model={"scheme": "paper", **model}, paper=PaperSettings(**{**PAPER, **paper})
     )
     return PaperTraining([scaled(perfect, 1), scaled(perfect, 2)], "neural_ode", settings)
 
@@ -73,6 +74,22 @@ def test_the_second_stage_leaves_the_gyros_field_alone(perfect: Make) -> None:
         before = fields.setdefault(epoch.sensor, now)
         assert epoch.sensor == "gyro" or torch.equal(before, now)
     assert set(fields) == {"gyro", "accel"}
+
+
+@pytest.mark.parametrize("adjoint", [False, True])
+def test_solver_and_adjoint_are_a_choice(perfect: Make, adjoint: bool) -> None:
+    """The adjoint's direction is that of backpropagation, as far as the solver has converged."""
+    few = {"gyro_steps": 1, "accel_steps": 1, "segments": 20, "samples": 4}
+    made = training(perfect, {"solver": "rk4", "adjoint": adjoint}, **few)
+    direct = training(perfect, {"solver": "rk4"}, **few)
+    for one in (made, direct):
+        one._closed_form("gyro")
+        one._descent_direction(one.begin("gyro"))
+    gradients = [one.model.get_submodule("drift.gyro.out").get_parameter("weight").grad for one in (made, direct)]
+    assert gradients[0] is not None
+    assert gradients[1] is not None
+    assert gradients[1].norm() > 0
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-2, atol=1e-3 * float(gradients[1].norm()))
 
 
 def test_an_interrupted_training_goes_on_to_the_same_model(perfect: Make, tmp_path: Path) -> None:
