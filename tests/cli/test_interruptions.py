@@ -230,8 +230,8 @@ def test_a_signal_while_the_input_is_read(here: Path, name: str) -> None:
         assert time.monotonic() - began < SOON_S + SLACK_S
         assert run.returncode == CODES[number], stderr
         assert "Traceback" not in stderr
-        assert session(run.pid) == []
-        (here / number.name / "reading").unlink()
+        soon(lambda pid=run.pid: not session(pid))  # the system ends the copies of one that is killed a moment later
+        (here / number.name / "reading").unlink(missing_ok=True)
     assert {path: digest for path, digest in digests(here).items() if ".partial" not in path} == before
 
 

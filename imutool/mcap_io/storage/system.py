@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+END_WITH_PARENT = 1  # of Linux: PR_SET_PDEATHSIG
 KILLED = (-signal.SIGKILL, -signal.SIGTERM) if sys.platform != "win32" else (1, 1)  # exit codes of a process that was killed
 LOCKED_AT = 1 << 62  # byte that Windows locks, behind all content: locked bytes could not be read
 
@@ -86,11 +87,17 @@ def can_fork() -> bool:
 
 
 def fork(nicer: int = 0) -> int:
-    """Copy this process: 0 in the copy, which is `nicer` by so much, its number here."""
+    """Copy this process: 0 in the copy, which is `nicer` by so much and ends with this one; its number here."""
     if sys.platform == "win32":
         raise NotImplementedError("a fork")
+    import ctypes
+
+    parent, prctl = os.getpid(), ctypes.CDLL(None).prctl
     process = os.fork()
     if not process:
+        prctl(END_WITH_PARENT, signal.SIGKILL)
+        if os.getppid() != parent:  # it has ended already
+            os._exit(1)
         os.nice(nicer)
     return process
 
