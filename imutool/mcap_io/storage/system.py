@@ -87,7 +87,10 @@ def can_fork() -> bool:
 
 
 def fork(nicer: int = 0) -> int:
-    """Copy this process: 0 in the copy, which is `nicer` by so much and ends with this one; its number here."""
+    """Copy this process: 0 in the copy, its number here.
+
+    The copy is `nicer` by so much, and ends with this one.
+    """
     if sys.platform == "win32":
         raise NotImplementedError("a fork")
     import ctypes
