@@ -78,14 +78,6 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-LONG = {"test_readme.py", "test_demo.py", "test_examples.py", "test_installed.py", "test_docs.py"}  # whole commands, one by one
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long tests come first: at the end one worker would be left alone with them."""
-    items.sort(key=lambda item: item.path.name not in LONG)
-
-
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of real recordings."""
