@@ -180,7 +180,7 @@ def _publish(complete: Path, folder: Path, *, overwrite: bool) -> None:
 
 def _move(complete: Path, folder: Path) -> None:
     """Replace each file of an old diagnosis; remove those without a new one."""
-    for name in FILES:
+    for name in (*FILES, CLOSED):
         if (complete / name).exists():
             (complete / name).replace(folder / name)
         else:

@@ -204,6 +204,7 @@ def test_a_wrong_setting_is_refused(folder: Path, word: str) -> None:
 def test_other_files_in_the_folder_stay(tmp_path: Path) -> None:
     (tmp_path / "real.mcap").write_bytes(b"mine")
     assert diagnosis_output.write(diagnoses.NOTHING, tmp_path) == []
+    (tmp_path / diagnosis_output.CLOSED).touch()  # of the diagnosis that is replaced: it goes as well
     assert diagnosis_output.write(diagnoses.ARM, tmp_path, overwrite=True) == []
     assert (tmp_path / "real.mcap").read_bytes() == b"mine"
     without_logs = {*diagnosis_output.FILES, "real.mcap"} - {diagnosis_output.LOG}
