@@ -45,9 +45,9 @@ class BiasNetwork(nn.Module, ABC):
 
     method: ClassVar[str]
     iterative: ClassVar[bool] = True  # false where the closed form is the whole solution
+    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # loss of the training (imutool.training)
     prefers: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # TrainSettings that differ from the general defaults
     undecayed: ClassVar[tuple[str, ...]] = ()  # name prefixes of parameters without weight decay
-    objective: ClassVar[Literal["window_ends", "increments"]] = "window_ends"  # loss of the training (imutool.training)
     context: int = 0  # samples before a segment that its bias depends on; such a bias is rest + f(samples)
     forgets: bool = False  # the bias follows from all samples so far, whatever it was at the start
     prior_mean: Tensor

@@ -18,7 +18,7 @@ from imutool.array_types import Bool, Float, Int
 from imutool.bias.networks.neural_ode import Network
 from imutool.bias.networks.paper_ode import BiasOde
 from imutool.bias.networks.threads import of_each
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import step_means
@@ -41,9 +41,16 @@ class PaperLoss(Objective):
     model: Network
 
     def _choose(self) -> None:
-        self.n = self.settings.paper.samples
+        chosen = self.settings.paper
+        if 1 < chosen.smoothed_samples <= CUBIC:
+            raise ConfigError(
+                "no cubic smooths so few samples",
+                where="paper.smoothed_samples",
+                expected=f"1 for none, or {CUBIC + 1} and more",
+            )
+        self.n = chosen.samples
         self.first = self._starts("train")
-        self.start, _ = biases_from_poses(self.pool, self.settings.paper.smoothed_samples)
+        self.start, _ = biases_from_poses(self.pool, chosen.smoothed_samples)
 
     def _starts(self, part: Part) -> Int[Tensor, " m"]:
         """First samples of the segments of a part; the sample before each gives the path its first slope."""

@@ -11,7 +11,7 @@ import torch
 
 from imutool.bias.networks.neural_ode import Network
 from imutool.bias.neural_ode import Config
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Recording
 from imutool.training.objectives.objective import RestBiases
 from imutool.training.objectives.paper_loss import PaperLoss, biases_from_poses
@@ -93,6 +93,12 @@ def test_a_steps_terms_are_the_mean_over_all_its_segments(perfect: Make) -> None
     whole = loss.squares(loss.first[chosen]).mean()
     assert len(terms) > 1
     torch.testing.assert_close(torch.stack([term() for term in terms]).sum(), 1e6 * whole, rtol=1e-12, atol=0)
+
+
+def test_smoothing_that_would_do_nothing_is_refused(perfect: Make) -> None:
+    pool = Pool.of([biased(perfect)])
+    with pytest.raises(ConfigError, match=r"paper\.smoothed_samples.*4 and more"):
+        still(pool, "gyro", smoothed_samples=3)
 
 
 def test_truth_too_short_for_a_segment_is_refused(perfect: Make) -> None:
