@@ -1,9 +1,10 @@
 """Load that a sensor bore before its log began.
 
-It counts where the bias drifts behind the load. A model learns such a drift from logs that begin with a cold sensor. A log may begin later: the sensor has been on for an hour,
-or the log is a part of a longer one. The states of the drift then have a start of their own. Here it is what the mean load of
-the log's first minutes would have left after a time T. The log itself tells T: for each of some times the samples without the
-drift go through the filter that tracks the rest bias, and the likelihood of its innovations weighs that time.
+It counts where the bias drifts behind the load. A model learns such a drift from logs that begin with a cold sensor. A log may
+begin later: the sensor has been on for an hour, or the log is a part of a longer one. The states of the drift then have a start
+of their own. Here it is what the mean load of the log's first minutes would have left after a time T. The log itself tells T:
+for each of some times the samples without the drift go through the filter that tracks the rest bias, and the likelihood of its
+innovations weighs that time.
 """
 
 from __future__ import annotations
