@@ -16,12 +16,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from imutool.conversion.forked import Forked
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.noise import datasheet
+from imutool.processes.forked import Forked
 from imutool.report import json_text
 from imutool.sensor import physics_file
 

@@ -17,7 +17,7 @@ TIERS = (
     ("array_types", "errors"),
     ("config", "location", "registry", "report", "units", "geometry", "recording"),
     ("inertial", "mcap_io", "bag"),
-    ("noise", "cleaning"),
+    ("noise", "cleaning", "processes"),
     ("sensor", "log_info", "exporting"),
     ("bias",),
     ("bias_start",),

@@ -73,9 +73,9 @@ def diagnose(
     """
     from imutool import diagnosis_output
     from imutool.config import load as load_settings
-    from imutool.conversion.forked import forking
     from imutool.diagnosis.diagnose import diagnose as run
     from imutool.diagnosis.settings import DiagnoseSettings
+    from imutool.processes.forked import forking
     from imutool.viewing.model.load_view import load
 
     def look(findings: Path | None = None) -> list[RunData]:

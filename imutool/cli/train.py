@@ -52,7 +52,7 @@ def train(
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method)  # refuse a wrong name before reading any log
     from imutool.config import load
-    from imutool.conversion.forked import forking
+    from imutool.processes.forked import forking
     from imutool.training.run import train as run
     from imutool.training.settings import full_name, settings_of
 

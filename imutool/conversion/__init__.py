@@ -1,1 +1,1 @@
-"""Conversion of data sets to MCAP logs; worker processes of conversion and fleets."""
+"""Conversion of data sets to MCAP logs."""

@@ -13,9 +13,9 @@ from imutool import registry
 from imutool.conversion.corrections import write_corrected
 from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
-from imutool.conversion.worker_pool import WorkerBugError, WorkerPool
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
+from imutool.processes.worker_pool import WorkerBugError, WorkerPool
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias_start.stretches import longest_stretch, measured_recording
-from imutool.conversion.forked import Forked
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
@@ -50,6 +49,7 @@ from imutool.log_info.conventions import warn_of_recordings
 from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
+from imutool.processes.forked import Forked
 from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels

@@ -20,11 +20,11 @@ from typing import Any, Protocol
 
 import msgspec
 
-from imutool.conversion.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 from imutool.errors import ConfigError, LogError, not_installed, redact
 from imutool.fleet.task import Result, Task
 from imutool.fleet.work import work
 from imutool.mcap_io.storage import system
+from imutool.processes.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends
 POLL_S = 0.5

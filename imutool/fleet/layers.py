@@ -15,11 +15,11 @@ import msgspec
 import numpy as np
 
 from imutool import __version__
-from imutool.conversion.worker_pool import WorkerPool
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.fleet import results
 from imutool.fleet.work import UnitReport
 from imutool.location import to_location
+from imutool.processes.worker_pool import WorkerPool
 
 if TYPE_CHECKING:
     from imutool.viewing.model.run_data import RunData

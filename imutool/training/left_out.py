@@ -29,10 +29,10 @@ from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.conversion.forked import of_each
 from imutool.errors import DataError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
+from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 from imutool.training.calibration import LINEAR, Calibration, effects_beyond_chance, parameter_columns
 from imutool.training.segments import Pool
@@ -95,7 +95,8 @@ def compare(
             scores += [_score(log, name, start, imu) for start in STARTS for imu in _corrected(log, model, start)]
         return scores
 
-    scores = [score for some in of_each(of_log, enumerate(_logs(recordings, pool, fits["gyro"]))) for score in some]
+    logs = list(enumerate(_logs(recordings, pool, fits["gyro"])))
+    scores = [score for some in of_each(of_log, logs) for score in some]
     return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS})
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import shift
 from support import planted
 
 from imutool.mcap_io.write import write
@@ -20,6 +22,7 @@ OF_ONE = 0.05  # z of so many honest draws lies as near to 1: its own deviation 
 ARM_M = (0.3, -0.2, 0.25)
 DRAWN = 0.06  # of a slope from so many draws
 LAG_S = 5e-4  # of a lag: a matrix of all windows takes a little of what a mean lag does
+LONG_S, MOST_LAG_STD_S = 90.0, 2e-3  # time that shows a lag at 0.3 Hz; a deviation that tells twelve milliseconds from none
 POSE_NOISE = 0.05  # of what the lever arm adds: how inexact splines through exact poses may be
 
 
@@ -163,6 +166,17 @@ def test_a_lag_that_changes_is_told_window_by_window_whatever_the_scale(check: A
     ]
     lags = check.lags_s(turning[0], turning[1] @ np.diag([1.06, 0.91, 0.98]), rate_hz)
     np.testing.assert_allclose(lags, [0.003, 0.003, -0.002, -0.002], atol=LAG_S)
+
+
+def test_positions_that_come_late_are_found_in_every_band_and_none_where_they_do_not(check: Any) -> None:
+    felt, late_s = planted.rich(4, LONG_S), 0.012
+    f_w = np.einsum("nij,nj->ni", felt.R_wb, felt.accel)
+    late = np.einsum("nji,nj->ni", felt.R_wb, shift(f_w, (late_s * felt.rate_hz, 0.0), order=3, mode="nearest"))
+    for ideal, expected_s in ((felt, 0.0), (replace(felt, accel=late), late_s)):
+        pair = replace(planted.pair(felt, {}, 1), ideal=ideal)
+        for lag_s, std_s in check.position_lags_s(pair):
+            assert abs(lag_s - expected_s) < 4.0 * std_s + LAG_S
+            assert std_s < MOST_LAG_STD_S
 
 
 def test_physics_of_one_recording_removes_its_misfit_of_another(bench: Any, tmp_path: Path) -> None:

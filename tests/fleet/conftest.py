@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from support import planted
 
-from imutool.conversion.worker_pool import ONE_THREAD
 from imutool.fleet.engine import ProcessEngine
 from imutool.mcap_io.write import write
+from imutool.processes.worker_pool import ONE_THREAD
 
 LOG_S = 10.0  # below eight nothing is told
 Robot = Callable[[Path, int, Mapping[str, Sequence[float]]], None]

@@ -17,11 +17,11 @@ from imutool.bias.io import load
 from imutool.bias.networks.threads import of_each, side_by_side
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply
-from imutool.conversion import forked
-from imutool.conversion.forked import Forked, forking
 from imutool.errors import ConfigError, DataError, ModelError, NumericsError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
+from imutool.processes import forked
+from imutool.processes.forked import Forked, forking
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training import checkpoint

@@ -16,7 +16,6 @@ from functools import partial
 
 import numpy as np
 
-from imutool.conversion.forked import Forked, one_by_one
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
@@ -49,6 +48,7 @@ from imutool.diagnosis.estimation.significance import (
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
+from imutool.processes.forked import Forked, of_each
 from imutool.sensor.effect import Effect, Theta
 
 
@@ -214,7 +214,8 @@ class _Search:
             limit = now.objective + self.settings.give_up_factor * least  # a superfluous effect leaves less after a few steps
             return fits.setdefault(k, fit(self.logs, (*now.chosen[:k], *now.chosen[k + 1 :]), near=now, give_up_above=limit))
 
-        for k, objective in one_by_one(lambda k: without(k).objective, self.removable(now)):
+        removable = self.removable(now)
+        for k, objective in zip(removable, of_each(lambda k: without(k).objective, removable), strict=True):
             if self.candidates.log_p(now.chosen[k][0], objective - now.objective) > self.threshold:
                 return self.pruned(fits[k] if k in fits else without(k))
         return now
@@ -265,7 +266,7 @@ class _Search:
         denoised = any(log.pair.denoised for log in self.logs)
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
         scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
-        for k, gain in one_by_one(partial(gain_of, whole), passed):
+        for k, gain in zip(passed, of_each(partial(gain_of, whole), passed), strict=True):
             verdict = self._verdict(k, gain, whole, scattered)
             if verdict is None:
                 break

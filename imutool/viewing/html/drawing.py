@@ -220,7 +220,7 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
 def _lay_out(figure: Any) -> None:
     """Place the axes once; `savefig` would draw everything an extra time to do so.
 
-    matplotlib asks again and again which ticks an axis has, where labels end, and how far they reach beyond moved axes.
+    matplotlib asks again and again where labels end, and how far they reach beyond moved axes.
     """
     import matplotlib
 
@@ -228,9 +228,9 @@ def _lay_out(figure: Any) -> None:
     measured = every if all(axes.get_aspect() == "auto" and axes.get_label() != "<colorbar>" for axes in every) else []
     for axes in every:
         for axis in (axes.xaxis, axes.yaxis):
-            axis._get_tick, axis._copy_tick_props = _copied(axis._get_tick), lambda *_: None
-            axis._update_ticks = _remembered(axis, axis._update_ticks)
-            axis._get_ticklabel_bboxes = _remembered(axis, axis._get_ticklabel_bboxes)
+            _add_ticks(axis.majorTicks, len(axis.get_majorticklocs()))
+            _add_ticks(axis.minorTicks, len(axis.get_minorticklocs()))
+            axis.get_tightbbox = _remembered(axes, axis.get_tightbbox)
     for axes in measured:
         axes.get_tightbbox = _measured_once(axes, axes.get_tightbbox)
     figure.get_layout_engine().execute(figure)
@@ -240,30 +240,27 @@ def _lay_out(figure: Any) -> None:
         figure.set_layout_engine(None)
 
 
-def _copied(make: Callable[[bool], Any]) -> Callable[[bool], Any]:
-    """Ticks of an axis, copied from the first: to make one takes six times as long."""
-    first = lru_cache(make)
-
-    def tick(major: bool) -> Any:
-        out = copy(first(major))
+def _add_ticks(ticks: list[Any], count: int) -> None:
+    """Add copies of an axis' first tick: to make one takes six times as long."""
+    while 0 < len(ticks) < count:
+        tick = copy(ticks[0])
         for part in ("label1", "label2", "tick1line", "tick2line", "gridline"):
-            setattr(out, part, copy(getattr(out, part)))
-        return out
+            setattr(tick, part, copy(getattr(tick, part)))
+        tick.gridline.set_clip_box(None)  # a grid line ends where the axes do
+        ticks.append(tick)
 
-    return tick
 
-
-def _remembered(axis: Any, ask: Callable[..., Any]) -> Callable[..., Any]:
-    """Last answer of an axis, asked anew where its limits or its place changed."""
+def _remembered(axes: Any, measure: Callable[..., Any]) -> Callable[..., Any]:
+    """Last box of an axis, measured anew where the limits or the place of its axes changed."""
     known: list[Any] = []
 
-    def answer(*asked: Any) -> Any:
-        state = *axis.get_view_interval(), *axis.axes.bbox.bounds
+    def box(*asked: Any, **how: Any) -> Any:
+        state = *axes.viewLim.bounds, *axes.bbox.bounds, asked, how
         if not known or known[0] != state:
-            known[:] = state, ask(*asked)
+            known[:] = state, measure(*asked, **how)
         return known[1]
 
-    return answer
+    return box
 
 
 def _measured_once(axes: Any, measure: Callable[..., Any]) -> Callable[..., Any]:

@@ -70,7 +70,7 @@ with Target(pathlib.Path("b")) as target:
 assert pathlib.Path("b").read_bytes() == pathlib.Path("a").read_bytes()[100:20_000]
 with open("b", "a+b") as file:
     assert system.lock(file)
-import imutool.fleet.run, imutool.fleet.engine, imutool.conversion.worker_pool
+import imutool.fleet.run, imutool.fleet.engine, imutool.processes.worker_pool
 """
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging.handlers
+import math
 import os
 import pickle
 import queue
@@ -17,8 +18,9 @@ import select
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import chain, repeat
 from typing import Any, ClassVar, Generic, NoReturn, TypeVar
 
 from imutool.mcap_io.storage.system import can_fork, fork, kill, processors
@@ -128,35 +130,25 @@ class Forked(Generic[T]):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def of_each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """Function of each item, in order; side by side as far as processors are free."""
-    left, out = list(items), list[R]()
-    while left:
-        first, *others = left[: 1 + max(0, Forked.free())]
-        del left[: 1 + len(others)]
-        beside = [Forked(partial(function, item)) for item in others]
-        out += [function(first), *(one.result() for one in beside)]
-    return out
+def of_each(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
+    """Function of each item, in order, until nobody asks for more.
 
-
-def one_by_one(function: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers with what a function returns for them, in order, until nobody asks for more.
-
-    A process takes the second half if that saves time, as far as the time of the first one tells.
+    The first item is done here. Free processors take equal shares of the others if that saves time, as its time tells.
     """
     began = time.perf_counter()
-    first = [(number, function(number)) for number in numbers[:1]]
-    half = len(numbers) - (len(numbers) - 1) // 2
-    worth = (time.perf_counter() - began) * (len(numbers) - half) > WORTH_S
-    beside = Forked(lambda: [function(number) for number in numbers[half:]]) if worth else None
+    first = [function(item) for item in items[:1]]
+    took = time.perf_counter() - began
+    size = max(1, math.ceil((len(items) - 1) / (1 + max(0, Forked.free()))))
+    shares = [items[k : k + size] for k in range(1, len(items), size)]
+    worth = took * (len(items) - 1 - size) > WORTH_S
+    beside = [Forked(partial(lambda share: [function(item) for item in share], share)) for share in shares[1:] if worth]
     try:
         yield from first
-        yield from ((number, function(number)) for number in numbers[1:half])
-        values = map(function, numbers[half:]) if beside is None or beside.here else beside.result()
-        yield from zip(numbers[half:], values, strict=True)
+        for share, process in zip(shares, chain([None], beside, repeat(None)), strict=False):
+            yield from map(function, share) if process is None or process.here else process.result()
     finally:
-        if beside is not None:
-            beside.end()
+        for process in beside:
+            process.end()
 
 
 def _serve(function: Callable[[], object], writing: int) -> NoReturn:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import select
 import sys
@@ -12,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from imutool.conversion import forked
-from imutool.conversion.forked import Forked, forking, of_each, one_by_one
 from imutool.errors import DataError
+from imutool.processes import forked
+from imutool.processes.forked import Forked, forking, of_each
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="commands fork on Linux alone")
 
@@ -44,15 +45,6 @@ def test_a_function_runs_beside_this_process_and_its_result_comes_back() -> None
         assert content == large
         assert first.result() == (process, large)
         assert Forked(os.getpid).result() != os.getpid()
-
-
-@pytest.mark.usefixtures("two")
-def test_every_item_has_its_result_and_half_of_them_are_done_beside_this_process() -> None:
-    with forking():
-        found = of_each(lambda item: (item, os.getpid()), "abcde")
-    assert [item for item, _ in found] == list("abcde")
-    assert [process == os.getpid() for _, process in found] == [True, False, True, False, True]
-    assert of_each(lambda item: (item, os.getpid()), "ab") == [("a", os.getpid()), ("b", os.getpid())]
 
 
 @pytest.mark.usefixtures("two")
@@ -142,20 +134,23 @@ def test_a_process_with_its_result_takes_no_processor_and_no_memory() -> None:
 
 @pytest.mark.usefixtures("two")
 @pytest.mark.parametrize("count", range(8))
+@pytest.mark.parametrize("processors", [1, 2, 4])
 @pytest.mark.parametrize("worth_s", [0.0, 60.0])
-def test_one_by_one_keeps_the_order_and_shares_what_is_worth_it(
-    monkeypatch: pytest.MonkeyPatch, worth_s: float, count: int
+def test_each_item_has_its_result_in_order_and_free_processors_share_what_is_worth_it(
+    monkeypatch: pytest.MonkeyPatch, worth_s: float, processors: int, count: int
 ) -> None:
     monkeypatch.setattr(forked, "WORTH_S", worth_s)
+    monkeypatch.setattr(forked, "processors", lambda: processors)
     here, before = os.getpid(), children()
     with forking():
-        made = list(one_by_one(lambda k: (10 * k, os.getpid() == here), range(3, 3 + count)))
-        assert [(k, tens) for k, (tens, _) in made] == [(k, 10 * k) for k in range(3, 3 + count)]
-        beside = max(0, (count - 1) // 2) if worth_s == 0.0 else 0
-        assert [mine for _, (_, mine) in made] == [True] * (count - beside) + [False] * beside
-        assert next(one_by_one(lambda k: k, range(count)), (0, 0)) == (0, 0)  # who wants no more leaves no process behind
+        made = list(of_each(lambda k: (10 * k, os.getpid()), range(3, 3 + count)))
+        assert [tens for tens, _ in made] == [10 * k for k in range(3, 3 + count)]
+        share = max(1, math.ceil((count - 1) / processors)) if worth_s == 0.0 else count
+        assert [process == here for _, process in made] == [k < 1 + share for k in range(count)]
+        assert len({process for _, process in made}) == min(count, max(1, math.ceil((count - 1) / share) if share else 0))
+        assert next(of_each(lambda k: k, range(count)), 0) == 0  # who wants no more leaves no process behind
         assert children() <= before
-    assert list(one_by_one(str, range(3))) == [(0, "0"), (1, "1"), (2, "2")]
+    assert list(of_each(str, range(3))) == ["0", "1", "2"]
 
 
 @pytest.mark.usefixtures("two")

@@ -42,7 +42,7 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NU
 START = """
 import sys, json
 sys.path[:] = json.loads(sys.argv[2])
-from imutool.conversion.worker_pool import serve
+from imutool.processes.worker_pool import serve
 serve(int(sys.argv[1]))
 """
 Tick = Callable[[int], None]

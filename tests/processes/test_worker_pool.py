@@ -15,8 +15,8 @@ from support import pool_functions
 from support.pool_functions import follow
 from support.processes import below, lives, soon
 
-from imutool.conversion.worker_pool import Outcome, WorkerBugError, WorkerDiedError, WorkerPool
 from imutool.errors import ConfigError
+from imutool.processes.worker_pool import Outcome, WorkerBugError, WorkerDiedError, WorkerPool
 
 LEFT_S = 2.0
 
@@ -80,7 +80,7 @@ def test_workers_that_do_not_start_are_an_error_not_a_loop(tmp_path: Path, monke
 DRIVER = """
 import sys
 from pathlib import Path
-from imutool.conversion.worker_pool import WorkerPool
+from imutool.processes.worker_pool import WorkerPool
 from support.pool_functions import follow
 with WorkerPool(follow, 2) as pool:
     list(pool.run([("last 60", sys.argv[1] + name) for name in "ab"]))

@@ -1,0 +1,1 @@
+"""Functions in other processes: forked ones of this process, and a pool of worker processes."""
