@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -86,9 +87,11 @@ def select_effects(
         answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
         other.end()
-    selections = (search.tested(search.simplified(found)) for search, found in answers)
+    several = [(search, found.chosen[: len(always) + 1]) for search, found in answers if len(found.chosen) > len(always) + 1]
+    alone = ((search, fit(logs, chosen)) for search, chosen in several)  # what came in later may have spoilt the first
+    selections = (search.tested(search.simplified(found)) for search, found in chain(answers, alone))
     best = next(selections)
-    return best if best.selected else next(selections, best)  # unseen time has refuted all of the best
+    return best if best.selected else next((one for one in selections if one.selected), best)  # unseen time refuted the best
 
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
