@@ -197,14 +197,14 @@ class _Search:
 
     def simplified(self, now: Fit) -> Fit:
         """Fit with the simpler of two effects that the logs hardly tell apart."""
-        for key in [effect.key for effect, _ in now.chosen if effect.kind == "unknown"]:
-            rivals = self._rivals(now.keys.index(key), now).values()  # a name that leaves no more says more
-            now = next((trial for trial in rivals if trial.objective < now.objective), now)
+        for effect in [effect for effect, _ in now.chosen if effect.kind != "catalogue"]:
+            rivals = self._rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
+            left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
+            now = next((trial for trial in rivals if left(trial) < left(now)), now)
         now = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
-        log_p = self.candidates.log_p
         return with_common_arm(
-            self.logs, now, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < self.threshold
+            self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold
         )
 
     def pruned(self, now: Fit) -> Fit:
