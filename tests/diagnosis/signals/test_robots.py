@@ -55,7 +55,7 @@ def test_a_ripple_up_to_the_end_of_the_band_leaves_spectrum_for_the_noise(tmp_pa
 
 
 def test_a_channel_that_drives_without_a_lag_gets_its_name_beside_a_slow_barometer(tmp_path: Path) -> None:
-    """What the temperature adds to a pressure is the catalogue's `pressure_temperature`, no unnamed drive with a lag of nothing."""
+    """What the temperature adds to a pressure is `pressure_temperature`, no drive without a name and with a lag of nothing."""
     conceal_robot(tmp_path, 24032, "flight", "pair")
     within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
 
