@@ -245,7 +245,7 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
 
 
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
-    """Whether a fitted frequency lies beyond the poses' band, is too slow, or rings louder than the samples.
+    """Whether a fitted frequency lies beyond the poses' band, is too slow, or rings too loud.
 
     Smoothed poses lose and delay motion there by themselves, which looks alike.
     """
