@@ -280,6 +280,7 @@ def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
 
 
 def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smooth: bool) -> dict[str, str]:
+    untrained = init == "auto" and model.method == static.Model.method
     return {
         "version": __version__,
         "command": "debias",
@@ -294,6 +295,6 @@ def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smo
         "rest_std": json.dumps(start.std.tolist()),
         "smooth": "true" if smooth else "false",
         **({"temperature": model.log_drift.name} if model.log_drift else {}),
-        # without a model: the mean over all rest, also later
-        "causal": "false" if smooth or (init == "auto" and model.method == static.Model.method) else "true",
+        # without a model: the mean over all rest, also later; an earlier load follows from the first two minutes
+        "causal": "false" if smooth or model.load_before is not None or untrained else "true",
     }

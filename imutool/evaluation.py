@@ -16,12 +16,11 @@ from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics

@@ -16,13 +16,13 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
-from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
+from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
-from imutool.bias_start.model_choice import check_smooth, find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.location import LogPath, location
@@ -33,16 +33,18 @@ from imutool.recording import Imu, Recording
 Model = str | Path | BiasModel
 
 
-def load_model(name: str | Path, *, rate_hz: float | None = None) -> BiasModel:
+def load_model(name: str | Path, *, rate_hz: float | None = None, on_s: float | None = None) -> BiasModel:
     """Bias model from a file, by the name of a model that ships, or `static`.
 
     Args:
         name: `FILE.safetensors`, a name that `imutool models` lists, `static`, or a `physics.toml`.
         rate_hz: Sample rate; needed for a `physics.toml` alone.
+        on_s: Seconds for which the sensor was on before its first sample, for a model that has learned how it warms up. Without
+            them a recording tells; an `OnlineDebiaser`, which cannot look ahead, takes the sensor for cold.
 
     Raises:
         ModelError: No such model (the message suggests the nearest name), or a damaged file.
-        ConfigError: A `physics.toml` that cannot be read.
+        ConfigError: A `physics.toml` that cannot be read, or a negative time.
 
     Examples:
         >>> import imutool
@@ -52,7 +54,8 @@ def load_model(name: str | Path, *, rate_hz: float | None = None) -> BiasModel:
         >>> imutool.load_model("euroc-adis16448-hybrid").method
         'hybrid'
     """
-    return static.Model() if str(name) == static.Model.method else find_model(name, rate_hz)
+    model = static.Model() if str(name) == static.Model.method else find_model(name, rate_hz)
+    return model if on_s is None else switched_on_before(model, on_s)
 
 
 def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:

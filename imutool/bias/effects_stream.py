@@ -9,11 +9,14 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.bias.model import COLUMNS, DriftStream, Stream, Vector6
 from imutool.sensor.linear_form import CompiledEffects
-from imutool.sensor.signals import SignalFilter
+from imutool.sensor.signals import Load, SignalFilter
 
 
 class EffectsStream:
-    """Bias stream: effects, then the neural ODE on the corrected samples."""
+    """Bias stream: effects, then the neural ODE on the corrected samples.
+
+    `load` is that before the first sample.
+    """
 
     def __init__(
         self,
@@ -23,8 +26,9 @@ class EffectsStream:
         ode: DriftStream | None,
         rest: Vector6,
         start_s: float,
+        load: Load | None = None,
     ) -> None:
-        self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted))
+        self._signals = SignalFilter(rate_hz, max(gyro.wanted, accel.wanted), load)
         self._matrix = np.concatenate([gyro.matrix, accel.matrix], axis=1)
         self._gyro, self._accel, self._only_product = gyro, accel, not (gyro.others or accel.others)
         self._ode, self._rest, self._start_s = ode, rest, start_s

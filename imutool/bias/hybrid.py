@@ -22,7 +22,7 @@ from imutool.bias.model import Array, BiasModel, CovarianceModel, Shapes, Stream
 from imutool.bias.temperature import columns_of, forms, samples_alone
 from imutool.config import Settings
 from imutool.sensor.linear_form import CompiledEffects, LinearForm, compiled, patterns
-from imutool.sensor.signals import SignalFilter, Signals
+from imutool.sensor.signals import LOAD, SignalFilter, Signals
 from imutool.units import SENSORS, Sensor
 
 
@@ -90,11 +90,15 @@ class Model(BiasModel):
         """Bias stream, with filters that start at its first sample."""
         ode = None if self.ode is None else self.ode.stretch(rest)
         gyro, accel = (self._compiled(sensor) for sensor in SENSORS)
-        return EffectsStream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64), start_s)
+        return EffectsStream(self.rate_hz, gyro, accel, ode, rest.astype(np.float64), start_s, self.load_before)
 
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics of the neural ODE."""
         return np.zeros((6, 6)) if self.ode is None else self.ode.rest_dynamics()
+
+    def follows_load(self) -> bool:
+        """Whether an effect is a drift behind the load."""
+        return any(self._compiled(sensor).wanted > LOAD.start for sensor in SENSORS)
 
     def temperature_parameters(self) -> Mapping[Sensor, tuple[Array, Array]]:
         """Parameters of the drifts with a log's temperature, by sensor."""
@@ -113,7 +117,7 @@ class Model(BiasModel):
             values, vectors = np.linalg.eigh(self.tensors[f"covariance_{sensor}"][np.ix_(own, own)])
             root = vectors * np.sqrt(np.maximum(values, 0.0))
             roots[sensor] = patterns(effects) @ root
-        filter_ = SignalFilter(self.rate_hz, max(self._compiled(sensor).wanted for sensor in SENSORS))
+        filter_ = SignalFilter(self.rate_hz, max(self._compiled(sensor).wanted for sensor in SENSORS), self.load_before)
 
         def root_at(
             t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]

@@ -129,13 +129,15 @@ class BiasModel(ABC):
 
     It computes in float64; files hold float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
     those that are not given are zero. `log_drift` is that of the log that the model is bound to, and its streams take samples
-    without it; `remarks` say what makes it less sure.
+    without it; `remarks` say what makes it less sure. `load_before` is what load the sensor bore before the log, where it did
+    not begin cold (`imutool.bias_start.earlier_load`).
     """
 
     method: ClassVar[str]
     card: Mapping[str, Any]
     log_drift: LogDrift | None = None
     remarks: tuple[str, ...] = ()
+    load_before: Float64[np.ndarray, "3 11"] | None = None
 
     def __init__(self, config: Settings, rate_hz: float, tensors: Mapping[str, np.ndarray] | None = None) -> None:
         self.config, self.rate_hz, self.card = config, rate_hz, {}
@@ -185,6 +187,10 @@ class BiasModel(ABC):
     def rest_dynamics(self) -> Float64[np.ndarray, "6 6"]:
         """Rest dynamics d(drift of the rest bias) / d(rest bias) per second; zero for most models."""
         return np.zeros((6, 6))
+
+    def follows_load(self) -> bool:
+        """Whether the bias drifts behind the sensor's load, for instance while it warms up."""
+        return False
 
     def temperature_parameters(self) -> Mapping[Sensor, tuple[Array, Array]]:
         """Parameters of the drift with a log's temperature, and their covariance, by sensor."""

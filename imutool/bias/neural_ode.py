@@ -153,7 +153,11 @@ class Model(BiasModel):
         if not of_samples:
             return split
         loads = compiled(of_samples, self.tensors["theta_loads"][columns_of(effects, temperature=False)])
-        return EffectsStream(self.rate_hz, loads, compiled((), np.zeros(0)), split, rest, start_s)
+        return EffectsStream(self.rate_hz, loads, compiled((), np.zeros(0)), split, rest, start_s, self.load_before)
+
+    def follows_load(self) -> bool:
+        """Whether the gyro drifts behind its load."""
+        return bool(samples_alone(forms("gyro", self.config.loads or ())))
 
     def temperature_parameters(self) -> Mapping[Sensor, tuple[Array, Array]]:
         """Parameters of the gyro's drift with a log's temperature; their covariance is not kept."""

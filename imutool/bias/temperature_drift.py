@@ -12,7 +12,7 @@ from imutool.array_types import Float64, Int64
 from imutool.bias.model import COLUMNS, BiasModel, Covariances, Vector6
 from imutool.bias.temperature import TemperatureFilter, celsius_of, channel_of, holding, scale_of
 from imutool.mcap_io.temperature import EVERY_NS, is_temperature, thinned
-from imutool.recording import Imu, Recording, Scalars
+from imutool.recording import Imu, Scalars
 from imutool.sensor.signals import TEMPERATURE_TERMS
 
 MOST_AGE_S = 60.0  # of a number of the channel: a case warms within minutes
@@ -145,12 +145,6 @@ def _widened(model: BiasModel) -> BiasModel:
     least = model.card.get("turn_on_least_std")
     model.card = {**model.card, "sessions": sessions, "turn_on_least_std": None if least is None else wider(least).tolist()}
     return model
-
-
-def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
-    """Model with its drift in a recording (`bound`)."""
-    t_ns = recording.imu.t_ns
-    return bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
 
 
 def rows_without_drift(model: BiasModel, t_ns: Stamps, gyro: Rows3, accel: Rows3) -> tuple[Rows3, Rows3]:

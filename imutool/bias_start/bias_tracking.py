@@ -15,7 +15,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
-from imutool.bias_start.prior_width import BiasPrior
+from imutool.bias_start.prior_width import MOST_CHANGE, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.preintegration import integrate
@@ -23,6 +23,7 @@ from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 from imutool.recording.columns import quantile
 
 BLOCK_S = 0.5
+FAR = 5.0  # standard deviations
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
 
@@ -78,7 +79,8 @@ class _Block(NamedTuple):
 class BiasFilter:
     """Bias filter for a stream of samples in batches of any size; batch borders change nothing.
 
-    With `ahead`, blocks wait until `OnlineRestDetector` knows whether a stop begins with them, which takes 1.5 s.
+    With `ahead`, blocks wait until `OnlineRestDetector` knows whether a stop begins with them, which takes 1.5 s. Samples
+    that look like a stop, at a rate that no bias of the sensor has, are a steady turn.
     """
 
     def __init__(
@@ -132,9 +134,9 @@ class BiasFilter:
             yield self._pass(*self._waiting.popleft())
 
     def _pass(self, block: _Block, rests: bool) -> FilteredBlock:
-        t, u, s = block.t_s, block.u, self.settings
+        t, u, s, prior = block.t_s, block.u, self.settings, self._prior
+        rests = rests and bool((np.abs(u[:-1, :3].mean(axis=0) - prior.mean[:3]) < MOST_CHANGE[:3] + FAR * prior.std[:3]).all())
         if self.state is None:
-            prior = self._prior
             P = np.diag(np.concatenate([prior.std, prior.ground_std]) ** 2)
             self.state = inertial_filter.level(u[:, 3:].mean(axis=0), prior.mean, np.zeros(6), P, s)
         x, T = self.state, float(t[-1] - t[0])

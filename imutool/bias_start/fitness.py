@@ -25,7 +25,7 @@ from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.bias_start.prior_width import BiasPrior, supported_std
+from imutool.bias_start.prior_width import MOST_CHANGE, BiasPrior, supported_std
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
@@ -38,7 +38,6 @@ MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other s
 MOST_DEVIATIONS = 5.0  # between the log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
 MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
-MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
 TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
 DEPENDENT = (
     2.0  # ratio of the shown bias's deviation to the filter's, whose velocities are independent; a circling hand's are not
@@ -67,7 +66,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
 
     `about` is what the log says of its origin: `sensor`, `dataset`.
     """
-    samples = _head(batches)
+    samples = head(batches)
     wrong = _wrong_gravity(samples) if len(samples[0]) else ""
     if wrong:
         return Fitness("unfit", (wrong,))
@@ -98,6 +97,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     if doubts:
         return Fitness("doubtful", tuple(doubts))
     followed = [] if model.log_drift is None else [f"its bias follows {model.log_drift.name}"]
+    if model.load_before is not None:
+        followed.append("the sensor was in use before the log, so that its drift does not begin cold")
     return Fitness("fits", (_agreement(found, prior), *followed))
 
 
@@ -107,7 +108,7 @@ def _prior(model: BiasModel) -> BiasPrior:
     return prior if model.prior_std.any() else replace(prior, std=UNKNOWN_STD)
 
 
-def _head(batches: Iterable[Samples]) -> Samples:
+def head(batches: Iterable[Samples]) -> Samples:
     """Samples of the first `CHECKED_S` seconds."""
     parts = list(itertools.takewhile(lambda part: not len(part[0]) or part[0][0] < CHECKED_S, batches))
     t_s = np.concatenate([np.zeros(0), *(part[0] for part in parts)])

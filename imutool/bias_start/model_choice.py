@@ -21,6 +21,7 @@ from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
 from imutool.bias_start.bias_from_truth import TRUTH_S, from_truth
 from imutool.bias_start.bias_tracking import Samples
+from imutool.bias_start.earlier_load import with_earlier_load
 from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import (
     InitialBias,
@@ -138,11 +139,24 @@ def choose_model_and_start(
     if model.temperature_parameters():
         start_ns = int(first_minute.imu.t_ns[0])
         model = bound(model, temperatures(log), topic, start_ns, start_ns + _duration_ns(log, topic))
+    model = with_earlier_load(model, _Batches(log, topic, survey, model), int(first_minute.imu.t_ns[0]))
     if smooth:
         start = _smoothed(model, _Batches(log, topic, survey, model), log.path, int(first_minute.imu.t_ns[0]))
     else:
         start = find_initial_bias(init, model, first_minute)
     return model, start if start.noise.any() else replace(start, noise=_noise(first_minute.imu))
+
+
+def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
+    """Model with its drift in a recording.
+
+    It follows the recorded temperature, and begins at the load that the sensor bore before.
+    """
+    t_ns = recording.imu.t_ns
+    model = bound(model, recording.scalars, recording.imu_topic, int(t_ns[0]), int(t_ns[-1]))
+    if not model.follows_load():
+        return model
+    return with_earlier_load(model, [model_samples(model, recording.imu)], int(t_ns[0]))
 
 
 def _warn_of_conventions(log: Log, topic: str) -> None:

@@ -21,8 +21,8 @@ from imutool.cleaning.stamp_line import WRAPS, read_stamps, restamped
 from imutool.conversion.message_writer import write_log
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
-from imutool.log_info.conventions import Body, turned_body
 from imutool.log_info.inspection import sound_samples
+from imutool.log_info.pose_imu_rotation import Body, turned_body
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch
 from imutool.mcap_io.codec.encode import NO_ORIENTATION

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64, Int64
-from imutool.diagnosis.estimation.alignment import with_simulation
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.significance import scatter
+from imutool.diagnosis.estimation.time_alignment import with_simulation
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.wording.quantity import Quantity, value

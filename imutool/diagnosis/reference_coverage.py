@@ -10,7 +10,7 @@ import numpy as np
 from imutool.array_types import Bool
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.alignment import same_motion, with_simulation, with_truth
+from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent

@@ -22,14 +22,13 @@ from imutool.cleaning.truth import Truth, read_truth
 from imutool.inertial.stationary import rest_stretches
 from imutool.location import Location
 from imutool.log_info.conventions import (
-    agreement,
-    body_warnings,
     convention_summary,
     convention_warnings,
     conventions,
     coverage,
     transforms,
 )
+from imutool.log_info.pose_imu_rotation import agreement, body_warnings
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected

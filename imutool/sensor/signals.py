@@ -39,11 +39,13 @@ TURNING_RAD_S = np.array([0.0, 0.3, 0.7, 1.5, 3.0])  # knots of the ramps
 SHAKING_M_S2 = np.array([0.0, 0.5, 2.0, 6.0])
 RAMPS = (len(TURNING_RAD_S) - 1, len(SHAKING_M_S2) - 1)
 LOADS = 1 + RAMPS[0] + 2 * RAMPS[1]
+ON = 0  # which load is that the sensor is on
 LOAD = slice(27, 27 + len(LOAD_TAU_S) * LOADS)  # the loads behind the first filter, then behind the next
 COUNT = LOAD.stop
 TEMPERATURE_TERMS = 3 * (1 + len(LOAD_TAU_S))  # polynomials of a temperature, at once and behind the filters
 
 Vectors = Float64[np.ndarray, "n 3"]
+Load = Float64[np.ndarray, "3 11"]  # state of a slow drift, by time constant and load
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +107,11 @@ class Signals:
 class SignalFilter:
     """Causal filter from samples to signals, in blocks of any size; its state is the last row.
 
-    It fills the first `wanted` columns of a row, and more where that is no extra work; the others are zero.
+    It fills the first `wanted` columns of a row, and more where that is no extra work; the others are zero. `load` is the state
+    of the load before the first sample, of a cold sensor by default.
     """
 
-    def __init__(self, rate_hz: float, wanted: int = COUNT) -> None:
+    def __init__(self, rate_hz: float, wanted: int = COUNT, load: Load | None = None) -> None:
         self._filters, self._derives, self._loads = (wanted > part.start for part in (FILTERED, DOTS, LOAD))
         self._gain = -np.expm1(-1.0 / (rate_hz * TAU_S))
         self._load_gain = -np.expm1(-1.0 / (rate_hz * LOAD_TAU_S))[:, None]
@@ -123,6 +126,8 @@ class SignalFilter:
         self._step, self._step_slow, self._step_turn, self._step_power = step, step[:6], step[6:9], step[9:]
         self._fast = step[3:6]  # the force without its mean, until it is a step
         self._load = row[LOAD].reshape(len(LOAD_TAU_S), LOADS)
+        if load is not None:
+            self._load[:] = load
 
     def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Signals:
         """The signals at each sample of a block."""

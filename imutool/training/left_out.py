@@ -27,9 +27,8 @@ from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
-from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.correction import apply
-from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.errors import DataError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift

@@ -3,7 +3,8 @@
     python tests/bench/drift.py [--kind rate] [--method hybrid --set model.remainder=false] [--start truth]
 
 Six training logs of 60 to 120 s, four test logs of other motions (100 s, one of five minutes); every log is a switching-on of
-its own, cold (`tests/support/drifting.py`). AOE in degrees, mean over the test logs.
+its own, cold (`tests/support/drifting.py`). With `--cut-s` the test logs begin later: warm and in motion. AOE in degrees, mean
+over the test logs.
 """
 
 from __future__ import annotations
@@ -34,20 +35,29 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], help="Of hybrid and neural_ode.")
     parser.add_argument("--start", action="append")
     parser.add_argument("--sensor", type=int, default=0)
+    parser.add_argument("--cut-s", type=float, default=0.0, help="Seconds cut off at the start of each test log.")
     options = parser.parse_args()
     methods = options.method or ["linear", "neural_ode", "hybrid"]
-    print(f"| drift, start | raw | static | {' | '.join(methods)} |\n|{'---|' * (len(methods) + 3)}")
+    columns = ["raw", *["static"] * (not options.cut_s), *methods]
+    print(f"| drift, start | {' | '.join(columns)} |\n|{'---|' * (len(columns) + 1)}")
     for kind in options.kind or KINDS:
         with tempfile.TemporaryDirectory() as folder:
             sensor = Drifting(kind=kind, sensor_seed=options.sensor)
-            score(Path(folder), sensor, methods, options.set, options.start or STARTS)
+            score(Path(folder), sensor, methods, options.set, options.start or STARTS, options.cut_s)
 
 
-def score(folder: Path, sensor: Drifting, methods: list[str], words: list[str], starts: list[str] | tuple[str, ...]) -> None:
+def score(
+    folder: Path,
+    sensor: Drifting,
+    methods: list[str],
+    words: list[str],
+    starts: list[str] | tuple[str, ...],
+    cut_s: float,
+) -> None:
     """Trains every method, and prints its mean AOE for each start."""
     training = [save(folder, seed, sensor, duration_s) for seed, duration_s in enumerate(TRAINING_S)]
-    tests = [save(folder, seed, sensor, duration_s) for seed, duration_s in enumerate(TEST_S, start=50)]
-    models = ["static"]
+    tests = [save(folder, seed, sensor, duration_s, cut_s) for seed, duration_s in enumerate(TEST_S, start=50)]
+    models = ["static"] * (not cut_s)  # what is left does not begin at rest
     for method in methods:
         models.append(str(folder / f"{method}.safetensors"))
         known = {"hybrid": words, "neural_ode": [word for word in words if not word.startswith("model.remainder")]}
@@ -60,10 +70,10 @@ def score(folder: Path, sensor: Drifting, methods: list[str], words: list[str], 
         print(f"| {sensor.kind}, {start} | {mean_aoe(tests, models, start)} |", flush=True)
 
 
-def save(folder: Path, seed: int, sensor: Drifting, duration_s: float) -> Path:
-    """Log on disk."""
-    path = folder / f"{seed}.mcap"
-    write(log(seed, sensor, duration_s), path)
+def save(folder: Path, seed: int, sensor: Drifting, duration_s: float, cut_s: float = 0.0) -> Path:
+    """Log on disk: what follows the first `cut_s` of a longer one."""
+    path, whole = folder / f"{seed}.mcap", log(seed, sensor, cut_s + duration_s)
+    write(whole.between(int(whole.imu.t_ns[0] + 1e9 * cut_s), int(whole.imu.t_ns[-1])), path)
     return path
 
 

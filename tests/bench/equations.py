@@ -25,7 +25,7 @@ from support.robot_cases.cases import UNNAMED, conceal_robot
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.alignment import aligned
+from imutool.diagnosis.signals.aligned_signal import aligned
 from imutool.diagnosis.signals.pairing import paired
 
 COLUMN = "/joint_states.effort[0]"

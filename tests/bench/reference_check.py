@@ -26,11 +26,11 @@ from sensor_tables import markdown
 
 from imutool.diagnosis.diagnose import EVERY_UNIT, candidates_for
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.alignment import with_truth
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.significance import scatter
+from imutool.diagnosis.estimation.time_alignment import with_truth
 from imutool.diagnosis.reference_coverage import align, without_unusable
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.read import read

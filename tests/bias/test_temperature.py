@@ -25,10 +25,9 @@ from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_scale, temperature_tensors
 from imutool.bias.temperature import FORMS, Scale, TemperatureFilter, channel_of
-from imutool.bias.temperature_drift import bound_to
 from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior, tracked_from_prior
-from imutool.bias_start.model_choice import find_initial_bias
+from imutool.bias_start.model_choice import bound_to, find_initial_bias
 from imutool.bias_start.stretches import read_stretches
 from imutool.debiasing import debias
 from imutool.mcap_io.read import read

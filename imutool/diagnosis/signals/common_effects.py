@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
-from imutool.diagnosis.signals.alignment import AlignedSignal
+from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 

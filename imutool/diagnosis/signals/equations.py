@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.signals.alignment import AlignedSignal
+from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples
 

@@ -15,7 +15,7 @@ from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
 from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
 from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
-from imutool.diagnosis.signals.alignment import AlignedSignal, Column
+from imutool.diagnosis.signals.aligned_signal import AlignedSignal, Column
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 
 RICH_KNOTS = 12

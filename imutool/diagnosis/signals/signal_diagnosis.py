@@ -22,14 +22,14 @@ from imutool.diagnosis.localization import locate_findings
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import common_effects as common
-from imutool.diagnosis.signals.alignment import AlignedSignal, aligned
+from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
 from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.noise import lsb_of, rich_residual, whitened
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
-from imutool.sensor.robot_effects import joint_effort, joint_transmission, wheel, world_sensors
+from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction, joint_transmission, wheel, world_sensors
 
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
@@ -41,9 +41,9 @@ NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s)
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
     "efforts": (
-        joint_effort.friction_effects,
-        joint_effort.load_effects,
-        joint_effort.actuator_effects,
+        joint_friction.friction_effects,
+        joint_actuator_and_load.load_effects,
+        joint_actuator_and_load.actuator_effects,
         joint_transmission.effects,
     ),
     "positions": (joint_transmission.position_effects,),
@@ -106,10 +106,10 @@ def diagnose_signal(
 
 def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
     """Selection with friction fitted where its joint slides, if any joint has some."""
-    if all(joint_effort.with_stiction(effect) is effect for effect, _ in selection.whole.chosen):
+    if all(joint_friction.with_stiction(effect) is effect for effect, _ in selection.whole.chosen):
         return selection
     chosen = [
-        tuple((joint_effort.with_stiction(effect), theta) for effect, theta in one.chosen)
+        tuple((joint_friction.with_stiction(effect), theta) for effect, theta in one.chosen)
         for one in (selection.fitted, selection.whole)
     ]
     fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")

@@ -10,7 +10,7 @@ import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples
-from imutool.sensor.signals import LOAD_TAU_S
+from imutool.sensor.signals import LOAD_TAU_S, ON
 from imutool.units import AXES
 
 
@@ -29,7 +29,7 @@ def load_drift(name: str, loads: slice, of: tuple[str, ...], equation: str, obse
 
 EFFECT = load_drift(
     "gyro_warm_up",
-    slice(0, 1),
+    slice(ON, ON + 1),
     ("",),
     "gyro += sum_k A_k z_k, dz_k/dt = (1 - z_k) / tau_k",
     "the log begins with a cold sensor",

@@ -9,7 +9,7 @@ import pytest
 from support import planted
 
 from imutool.diagnosis.estimation.aligned_log import Pair, split
-from imutool.diagnosis.estimation.alignment import wiener_filter, with_simulation, with_truth
+from imutool.diagnosis.estimation.time_alignment import wiener_filter, with_simulation, with_truth
 from imutool.errors import DataError
 from imutool.recording import Recording, Scalars
 

@@ -1,4 +1,4 @@
-"""Alignment of a recording with a simulation or its true poses: one clock, a row a sample.
+"""Time alignment of a recording with a simulation or true poses: one clock, a row a sample.
 
 A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
 look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, without noise

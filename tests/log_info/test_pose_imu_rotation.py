@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.truth import Truth
-from imutool.log_info.conventions import agreement
+from imutool.log_info.pose_imu_rotation import agreement
 from imutool.recording import Imu
 
 RNG = np.random.default_rng(6)

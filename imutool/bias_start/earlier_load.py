@@ -1,0 +1,114 @@
+"""Load that a sensor bore before its log began.
+
+It counts where the bias drifts behind the load. A model learns such a drift from logs that begin with a cold sensor. A log may
+begin later: the sensor has been on for an hour, or the log is a part of a longer one. The states of the drift then have a start
+of their own. Here it is what the mean load of the log's first minutes would have left after a time T. The log itself tells T:
+for each of some times the samples without the drift go through the filter that tracks the rest bias, and the likelihood of its
+innovations weighs that time.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
+from imutool.bias_start.fitness import head
+from imutool.bias_start.initial_bias import bias_prior
+from imutool.errors import ConfigError
+from imutool.inertial.inertial_filter import STILL, VELOCITY, FilterSettings
+from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
+
+EARLIER_S = np.array([0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 512.0])  # T; after the last the slowest state has settled
+COLD = 0.5  # prior probability of T = 0; the others share the rest
+STUDENT = 7.0  # degrees of freedom of the innovations, so that one jolt does not decide
+
+
+def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: int | None = None) -> BiasModel:
+    """Model whose drift begins where the log shows the sensor.
+
+    The model itself where a cold start is likely, or its earlier load given. `batches` are seconds since the log's first
+    sample, gyro and accel; as many count as for the fitness.
+    """
+    if not model.follows_load() or model.load_before is not None:
+        return model
+    samples = head(batches)
+    if len(samples[0]) < 2:
+        return model
+    mean = _mean_load(model.rate_hz, samples)
+    loads = -np.expm1(-EARLIER_S[:, None] / LOAD_TAU_S)[..., None] * mean
+    log_likelihood = np.array([_log_likelihood(_after(model, load), samples, first_ns) for load in loads])
+    prior = np.array([COLD, *[(1.0 - COLD) / (len(loads) - 1)] * (len(loads) - 1)])
+    weights = prior * np.exp(log_likelihood - log_likelihood.max())
+    weights /= weights.sum()
+    if weights[0] >= 0.5:
+        return model
+    return _after(model, np.einsum("t,tkl->kl", weights, loads))
+
+
+def switched_on_before(model: BiasModel, on_s: float) -> BiasModel:
+    """Model of a sensor that was on for some seconds before its first sample.
+
+    It bore no other load.
+
+    Raises:
+        ConfigError: a negative time, or no number.
+    """
+    if not 0.0 <= on_s < math.inf:
+        raise ConfigError(f"{on_s!r}", where="on_s", expected="seconds, zero or more")
+    if not model.follows_load():
+        return model
+    load = np.zeros((len(LOAD_TAU_S), LOADS))
+    load[:, ON] = -np.expm1(-on_s / LOAD_TAU_S)
+    return _after(model, load)
+
+
+def _mean_load(rate_hz: float, samples: Samples) -> Float64[np.ndarray, "11"]:
+    """Mean load, from the state z of its fastest filter: a step of z is its gain times the load without z."""
+    z = SignalFilter(rate_hz)(*samples).load[:, 0]
+    gain = -math.expm1(-1.0 / (rate_hz * LOAD_TAU_S[0]))
+    return np.asarray(z.mean(axis=0) + z[-1] / (gain * len(z)))
+
+
+def _after(model: BiasModel, load: Load) -> BiasModel:
+    """The model after a load; a copy."""
+    out = copy.copy(model)
+    out.load_before = load
+    return out
+
+
+def _log_likelihood(model: BiasModel, samples: Samples, first_ns: int | None) -> float:
+    """Log-likelihood of the rest bias, of the velocity and of what the gyro reads at rest, half second by half second."""
+    t_s, gyro, accel = samples
+    prior = bias_prior(model, first_ns)
+    bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
+    gyro, accel = gyro - bias[:, :3], accel - bias[:, 3:]
+    filter_ = BiasFilter(prior, ahead=True)
+    blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
+    return sum(_velocity(block) + (_rate(block, t_s, gyro) if block.resting else 0.0) for block in blocks)
+
+
+def _velocity(block: FilteredBlock) -> float:
+    """Log-likelihood of the velocity that a block ends with, which is bounded in motion and zero at rest."""
+    s, expected = FilterSettings(), block.step.expected
+    bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / (block.end_s - block.start_s)
+    noise = s.rest_m_s**2 if block.resting else bounded
+    return _student(expected.v_w, expected.P[VELOCITY, VELOCITY] + noise * np.eye(3))
+
+
+def _rate(block: FilteredBlock, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:
+    """Log-likelihood of a block's mean rate at rest, where the gyro reads its bias."""
+    own = gyro[np.searchsorted(t_s, block.start_s) : np.searchsorted(t_s, block.end_s)]
+    expected = block.step.expected
+    noise = own.var(axis=0) / len(own) + FilterSettings().rest_rad_s ** 2
+    return _student(own.mean(axis=0) - expected.rest_bias(True)[:3], STILL @ expected.P @ STILL.T + np.diag(noise))
+
+
+def _student(x: Float64[np.ndarray, "3"], S: Float64[np.ndarray, "3 3"]) -> float:
+    square = float(x @ np.linalg.solve(S, x))
+    return -0.5 * (STUDENT + 3.0) * math.log1p(square / STUDENT) - 0.5 * float(np.linalg.slogdet(S)[1])

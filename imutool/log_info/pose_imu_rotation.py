@@ -1,0 +1,111 @@
+"""Rotation between a log's poses and its IMU, and how far the poses explain the gyro."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.cleaning.truth import Truth, read_truth, turning
+from imutool.geometry import quaternion
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.log import Log
+from imutool.recording import Imu, seconds
+
+LEAST_TURNS = 20  # between poses
+LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
+LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be told
+ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
+UNSURE_DEG = 3.0  # standard deviation of a rotation that is not told
+TURNED_DEG = 10.0  # more than a mount that was meant to be straight
+SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
+
+
+class Turned(NamedTuple):
+    """Rotation vector from the body of the poses to the gyro."""
+
+    deg: Float64[np.ndarray, "3"]
+    std_deg: Float64[np.ndarray, "3"]
+
+
+class Agreement(NamedTuple):
+    """What poses explain of the gyro, and how their body is turned."""
+
+    rms_rad_s: float
+    explained: float
+    turned: Turned | None  # None if the motion does not show it
+
+
+def agreement(poses: Truth, imu: Imu) -> Agreement | None:
+    """Agreement of the turns of poses with the gyro; None where the two share too little motion.
+
+    gyro = b + R omega, with the constant bias b and rotation R that fit best (Kabsch), over intervals of a tenth of a second.
+    """
+    if len(imu) < LEAST_TURNS or len(poses.t_ns) < LEAST_TURNS:
+        return None
+    start_ns, end_ns, rate = turning(poses)
+    first, last = int(imu.t_ns[0]), int(imu.t_ns[-1])
+    steps = (end_ns - start_ns).astype(float)
+    inside = (start_ns >= first) & (end_ns <= last) & (steps < 4.0 * np.median(steps)) & np.isfinite(rate).all(axis=1)
+    if inside.sum() < LEAST_TURNS:
+        return None
+    t = seconds(imu.t_ns, first)
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (imu.gyro[1:] + imu.gyro[:-1]) / 2.0, axis=0)])
+    begin, end = seconds(start_ns[inside], first), seconds(end_ns[inside], first)
+    mean = np.stack([(np.interp(end, t, c) - np.interp(begin, t, c)) / (end - begin) for c in turned.T], axis=1)
+    gyro, omega = mean - mean.mean(axis=0), rate[inside] - rate[inside].mean(axis=0)
+    motion = float(np.sqrt((gyro**2).sum(axis=1).mean()))
+    if motion < LEAST_RATE_RAD_S:
+        return None
+    left, _, right = np.linalg.svd(gyro.T @ omega)
+    turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    rms = float(np.sqrt(((gyro - omega @ turn.T) ** 2).sum(axis=1).mean()))
+    explained = max(0.0, 1.0 - (rms / motion) ** 2)
+    body = _turned(turn, gyro, rms, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
+    return Agreement(rms, explained, body)
+
+
+def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
+    """Warning of poses whose body is turned far against the gyro."""
+    deg = float(np.linalg.norm(turned_deg))
+    fix = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; imutool convert LOG OUT --fix corrects it"
+    return [fix] if deg > TURNED_DEG else []
+
+
+class Body(NamedTuple):
+    """Rotation from a turned body of poses to the gyro's axes, and its frames in transforms."""
+
+    turn: Float64[np.ndarray, "3 3"]
+    frames: frozenset[str]
+
+
+def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
+    """Body of poses that is turned by more than `TURNED_DEG`.
+
+    A frame of a transform that has the same orientations is the same body.
+    """
+    poses = read_truth(log, topics=[topic])
+    found = None if poses is None else agreement(poses, imu)
+    if poses is None or found is None or found.turned is None or not body_warnings(topic, found.turned.deg.tolist()):
+        return None
+    alike, other = set[str](), set[str]()
+    for named in log.with_schema((schemas.TF,)):
+        for batch in log.pose_batches(named.name):
+            _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
+            same = np.abs((poses.q_wb_wxyz[mine] * batch.q_wb_wxyz[theirs]).sum(axis=1)) > 1.0 - SAME_TURN
+            (alike if len(same) and same.all() else other).add(batch.child_frame_id)
+    return Body(quaternion.matrix(quaternion.exp(np.radians(found.turned.deg)[None]))[0], frozenset(alike - other))
+
+
+def _turned(
+    turn: Float64[np.ndarray, "3 3"], gyro: Float64[np.ndarray, "n 3"], rms_rad_s: float, length_s: float
+) -> Turned | None:
+    """Rotation with its deviations, if these are small: an error about each axis moves the rates about the other two."""
+    squares = gyro.T @ gyro * (length_s / ERRORS_LAST_S / len(gyro))
+    seen = np.trace(squares) * np.eye(3) - squares
+    if np.linalg.eigvalsh(seen)[0] <= 0.0:
+        return None
+    std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
+    return Turned(np.degrees(quaternion.log(quaternion.of_matrix(turn))[0]), std_deg) if std_deg.max() < UNSURE_DEG else None

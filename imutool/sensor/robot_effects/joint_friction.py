@@ -1,0 +1,92 @@
+"""Friction of a joint, in its effort: Coulomb, viscous, Stribeck, and stiction at rest.
+
+tau = (F_c + F_s exp(-(v / v_s)^2)) sign(v) + F_v v (Armstrong-Helouvry, Dupont, Canudas de Wit, A survey of models, analysis
+tools and compensation methods for the control of machines with friction, Automatica 30 (1994), eq. 2 to 6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import binary_opening
+
+from imutool.array_types import Float64
+from imutool.sensor.effect import Effect, Parameter, Theta
+from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.signal_samples import SignalSamples
+
+STEEP, LEAST_STEEP = 3.0, 1e-3  # of the velocity's noise and size, within which its sign turns
+AT_REST, LEAST_REST = 4.0, 3  # of that velocity, and samples: a joint that turns round is faster
+PLAUSIBLE_SHARE = 0.5  # of the effort's standard deviation
+STRIBECK = (0.03, 0.1, 0.3)  # velocities to start from, over the standard deviation
+SLOWEST = 0.5  # a faster fall is Coulomb friction, over the standard deviation
+
+
+@dataclass(frozen=True)
+class _Friction:
+    joint: int
+    steep: float
+    kind: str
+    slowest: float
+    command: str = ""
+
+    def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
+        if self.kind == "viscous":
+            return s.with_added(self.joint, theta[0] * s.state[f"dq{self.joint}"])
+        velocity = s.state[f"v{self.joint}"]
+        sign = np.clip(velocity / self.steep, -1.0, 1.0)
+        force = theta[0] * sign * (self._near_rest(velocity, theta) if len(theta) > 1 else 1.0)
+        if self.command:
+            rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(LEAST_REST, bool))
+            held = np.clip(s.channel(self.command) - s.y[:, self.joint], -np.abs(theta[0]), np.abs(theta[0]))
+            force = np.where(rests, held, force)
+        return s.with_added(self.joint, force)
+
+    def _near_rest(self, velocity: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
+        return np.asarray(np.exp(-((velocity / min(theta[1], self.slowest)) ** 2)))
+
+
+def with_stiction(effect: Effect) -> Effect:
+    """Coulomb friction that holds a joint at rest; any other effect as it is.
+
+    At rest the force is what the command leaves over, up to the level (eq. 3 of the survey): sliding alone shows the level. It
+    follows the recording there, and can therefore not be searched for.
+    """
+    if effect.name != "coulomb_friction" or not isinstance(effect.forward, _Friction):
+        return effect
+    return replace(effect, forward=replace(effect.forward, command=effect.sensors[0]), linear=False)
+
+
+def friction_effects(scale: Scale) -> Iterator[Effect]:
+    """Coulomb, viscous and Stribeck friction of each joint."""
+    for k in scale.columns:
+        size, speed, unit = PLAUSIBLE_SHARE * scale.size[k], scale.state[f"dq{k}"], scale.units[k]
+        steep, slowest = max(STEEP * scale.state[f"noise{k}"], LEAST_STEEP * speed), SLOWEST * speed
+        level = Parameter("level", unit, size)
+        yield scale.effect(
+            "coulomb_friction",
+            (k,),
+            "effort += level sign(velocity)",
+            (level,),
+            _Friction(k, steep, "coulomb", slowest),
+            "the joint turns both ways",
+        )
+        yield scale.effect(
+            "viscous_friction",
+            (k,),
+            "effort += coefficient velocity",
+            (Parameter("coefficient", f"{unit} s/rad".strip(), size / speed),),
+            _Friction(k, steep, "viscous", slowest),
+            "the velocity varies",
+        )
+        yield scale.effect(
+            "stribeck_friction",
+            (k,),
+            "effort += level exp(-(velocity / slow)^2) sign(velocity)",
+            (level, Parameter("slow", "rad/s", speed, positive=True, step=0.02, least=4.0 * steep)),
+            _Friction(k, steep, "stribeck", slowest),
+            "the joint turns slowly and fast, both ways",
+            starts=[np.array([0.1 * size, share * speed]) for share in STRIBECK],
+        )
