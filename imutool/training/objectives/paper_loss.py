@@ -68,10 +68,13 @@ class PaperLoss(Objective):
         return {}  # squares have no width
 
     def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
-        """Terms of some segments each, drawn from all logs alike."""
+        """Terms of some segments each, all from one log that is drawn for this step."""
         count = self.settings.paper.segments
-        chosen = torch.randint(len(self.first), (count,), generator=generator).to(self.first.device)
-        return [partial(self._term, some, len(some) / count) for some in torch.split(self.first[chosen], SEGMENTS)]
+        log_of = self.pool.log[self.first]
+        logs = log_of.unique()  # those that have a segment
+        first = self.first[log_of == logs[torch.randint(len(logs), (1,), generator=generator)]]
+        chosen = torch.randint(len(first), (count,), generator=generator).to(first.device)
+        return [partial(self._term, some, len(some) / count) for some in torch.split(first[chosen], SEGMENTS)]
 
     def _term(self, first: Int[Tensor, " b"], share: float) -> Float[Tensor, ""]:
         return share * LOSS_UNITS * self.squares(first).mean()

@@ -86,10 +86,10 @@ def test_a_wrong_bias_turns_by_itself_times_the_time(perfect: Make) -> None:
 
 
 def test_a_steps_terms_are_the_mean_over_all_its_segments(perfect: Make) -> None:
-    pool = Pool.of([biased(perfect), biased(perfect)])
-    loss = still(pool, "accel", segments=600)
+    loss, again = still(Pool.of([biased(perfect)]), "accel", segments=600), torch.Generator().manual_seed(3)
     terms = loss.terms(torch.Generator().manual_seed(3))
-    chosen = torch.randint(len(loss.first), (600,), generator=torch.Generator().manual_seed(3))
+    torch.randint(1, (1,), generator=again)  # the log of the step
+    chosen = torch.randint(len(loss.first), (600,), generator=again)
     whole = loss.squares(loss.first[chosen]).mean()
     assert len(terms) > 1
     torch.testing.assert_close(torch.stack([term() for term in terms]).sum(), 1e6 * whole, rtol=1e-12, atol=0)
@@ -105,3 +105,25 @@ def test_truth_too_short_for_a_segment_is_refused(perfect: Make) -> None:
     pool = Pool.of([biased(perfect)])
     with pytest.raises(DataError, match="no segment of 5000 samples"):
         still(pool, "gyro", samples=5000)
+
+
+def test_a_step_draws_its_segments_from_one_log(perfect: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over many steps from all."""
+    pool = Pool.of([biased(perfect), biased(perfect, noise=0.01)])
+    seen: list[set[int]] = []
+
+    def drawn(first: torch.Tensor) -> torch.Tensor:
+        seen.append(set(pool.log[first].tolist()))
+        return torch.zeros(1)
+
+    loss, generator = still(pool, "gyro", segments=600), torch.Generator().manual_seed(0)
+    monkeypatch.setattr(loss, "squares", drawn)
+    logs: list[set[int]] = []
+    for _ in range(20):
+        seen.clear()
+        for term in loss.terms(generator):
+            term()
+        assert len(seen) == 3
+        logs.append(set.union(*seen))
+    assert {len(of_step) for of_step in logs} == {1}
+    assert set.union(*logs) == {0, 1}
