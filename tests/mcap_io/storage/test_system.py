@@ -1,4 +1,4 @@
-"""One module knows what systems do differently; nothing else uses what only some have."""
+"""The module that knows what systems do differently answers where a system lacks what it asks for."""
 
 from __future__ import annotations
 
