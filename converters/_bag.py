@@ -21,6 +21,7 @@ from imutool.errors import ConfigError, DataError, LogError, not_installed
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
 from . import Sequence, _asl
+from ._ros_types import ros2_name
 from ._table import Table
 
 logger = logging.getLogger(__name__)
@@ -65,13 +66,7 @@ def _known_once(path: Path, mtime_ns: int, size: int) -> tuple[dict[str, str], s
                 raise DataError("cannot be read as a ROS 1 bag (no index, and not one message)", where=path)
             lost = f"{bag.lost} stretches of it lost, the first: {bag.losses[0].reason}" if bag.lost else "nothing of it lost"
             wrong = f"the bag has no index; {count} messages were found chunk by chunk, {lost}"
-        return {c.topic: _ros2(c.kind) for _, c in sorted(bag.connections.items())}, wrong
-
-
-def _ros2(kind: str) -> str:
-    """Message type in ROS 2 spelling."""
-    package, _, name = kind.partition("/")
-    return f"{package}/msg/{name}" if "/" not in name else kind
+        return {c.topic: ros2_name(c.kind) for _, c in sorted(bag.connections.items())}, wrong
 
 
 def recording(
@@ -201,7 +196,7 @@ def _payloads(path: Path, topic: str) -> Iterator[tuple[str, bytes]]:
             for message in chunk.messages:
                 of = bag.connections[message.connection]
                 if of.topic == topic:
-                    yield _ros2(of.kind), chunk.data[message.data_at : message.end]
+                    yield ros2_name(of.kind), chunk.data[message.data_at : message.end]
 
 
 def _decoder(path: Path) -> Callable[[bytes, str], Any]:

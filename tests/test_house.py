@@ -50,10 +50,16 @@ def modules(folder: Path, package: str) -> dict[str, ast.Module]:
     return found
 
 
+@functools.cache
+def nodes(tree: ast.Module) -> list[ast.AST]:
+    """All nodes of a module, found once for all tests."""
+    return list(ast.walk(tree))
+
+
 def imports(tree: ast.Module, known: set[str]) -> set[str]:
     """Modules that a module imports anywhere in it, also inside functions; `from package import module` names the module."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -173,7 +179,7 @@ def folders() -> dict[str, list[str]]:
 
 def functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
     """Every function and method of a module."""
-    yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+    yield from (node for node in nodes(tree) if isinstance(node, ast.FunctionDef))
 
 
 def lines_of(node: ast.FunctionDef) -> int:
@@ -199,6 +205,41 @@ def test_functions_are_short() -> None:
     assert statistics.median(size for _, size in sizes) <= MEDIAN_FUNCTION_LINES
 
 
+# ── what only some systems have: one module knows it ──
+
+POSIX_MODULES = {"fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "posix", "syslog"}
+POSIX_NAMES = {
+    "os": {
+        *("fork", "forkpty", "sync", "sysconf", "getuid", "geteuid", "getgid", "killpg", "setsid", "getpgid", "mkfifo", "nice"),
+        *("chown", "lchown", "pread", "pwrite", "posix_fadvise", "posix_fallocate", "sendfile", "copy_file_range", "statvfs"),
+        *("sched_getaffinity", "wait3", "wait4", "WNOHANG", "O_DIRECTORY", "O_NONBLOCK", "fchmod", "getloadavg", "pipe2"),
+    },
+    "signal": {"SIGKILL", "SIGALRM", "SIGHUP", "SIGPIPE", "SIGUSR1", "SIGCHLD", "setitimer", "alarm", "pause", "pthread_kill"},
+}
+SYSTEM = "imutool.mcap_io.storage.system"
+
+
+def of_posix_alone(tree: ast.Module) -> Iterator[str]:
+    for node in nodes(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in POSIX_MODULES)
+        elif isinstance(node, ast.ImportFrom) and (node.module in POSIX_MODULES or node.module in POSIX_NAMES):
+            names = {alias.name for alias in node.names}
+            yield from names & POSIX_NAMES.get(node.module or "", names)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if node.attr in POSIX_NAMES.get(node.value.id, ()):
+                yield f"{node.value.id}.{node.attr}"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("/dev/shm"):
+            yield node.value
+        elif isinstance(node, ast.keyword) and node.arg in {"pass_fds", "preexec_fn"}:
+            yield f"{node.arg}="
+
+
+def test_no_other_module_uses_what_only_posix_has() -> None:
+    assert {name: used for name, tree in everything().items() if name != SYSTEM and (used := [*of_posix_alone(tree)])} == {}
+    assert {*of_posix_alone(everything()[SYSTEM])} >= {"fcntl", "resource", "os.sysconf"}
+
+
 # ── names and words ──
 
 FIRST_LINE = 90  # characters of a docstring's first line
@@ -216,7 +257,7 @@ def test_no_private_name_is_imported_from_another_room() -> None:
     found = []
     for name, tree in everything().items():
         home = name if name in folders() else name.rpartition(".")[0]
-        for node in ast.walk(tree):
+        for node in nodes(tree):
             if isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "imutool":
                 named = [f"{node.module}.{alias.name}" for alias in node.names]
                 found += [f"{name}: {other}" for other in named if is_private(other) and not other.startswith(f"{home}.")]
@@ -252,7 +293,7 @@ PRIVATE_PHRASES = ("what is told", "what is said", "is had", "cannot be had", "n
 def test_no_private_language_in_docstrings() -> None:
     found = []
     for name, tree in everything().items():
-        for node in ast.walk(tree):
+        for node in nodes(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
                 text = (ast.get_docstring(node) or "").lower()
                 found += [f"{name}: {phrase}" for phrase in PRIVATE_PHRASES if phrase in text]
@@ -308,10 +349,10 @@ def test_a_list_of_arrays_names_no_length() -> None:
     named = []
     for module, tree in package().items():
         names = {name.rpartition(".")[2]: name for name in aliases if name.rpartition(".")[0] == module}
-        for node in ast.walk(tree):
+        for node in nodes(tree):
             if isinstance(node, ast.ImportFrom):
                 names |= {name.asname or name.name: f"{node.module}.{name.name}" for name in node.names}
-        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for function in (node for node in nodes(tree) if isinstance(node, ast.FunctionDef)):
             for argument in function.args.args + function.args.kwonlyargs:
                 for node in ast.walk(argument.annotation or ast.Constant(None)):
                     if (

@@ -74,8 +74,8 @@ def test_view_without_a_model_imports_the_viewer_alone(imported: Callable[..., s
     assert (tmp_path / "out.rrd").is_file()
 
 
-def test_training_shows_that_the_spy_sees(imported: Callable[..., set[str]], logs: Path) -> None:
-    assert "torch" in imported("train", logs / "flight_1.mcap", "-o", "m.safetensors", "--method", "linear")
+def test_noise_in_motion_shows_that_the_spy_sees(imported: Callable[..., set[str]], logs: Path) -> None:
+    assert "torch" in imported("info", logs / "flight_1.mcap", "--noise")
 
 
 INFERENCE = """

@@ -7,7 +7,8 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_args
 
@@ -76,21 +77,13 @@ def caught() -> Iterator[None]:
         raise
 
 
-@dataclass(frozen=True)
-class Written:
-    """Mark of a parameter that names an output; the fields are those of `OutputFile`."""
-
-    suffixes: tuple[str, ...] = ()
-    files: tuple[str, ...] | None = None
-    keeps: bool = False
-    of_each: str = ""
-    may_be_folder: bool = False
+Written = partial(OutputFile, "", None)  # marks a parameter that names an output: its name and value come with a command
 
 
-def written(function: Callable[..., Any]) -> dict[str, Written]:
+def written(function: Callable[..., Any]) -> dict[str, OutputFile]:
     """Outputs among the parameters of a command's function."""
     marks = {
-        name: [mark for mark in get_args(parameter.annotation) if isinstance(mark, Written)]
+        name: [mark for mark in get_args(parameter.annotation) if isinstance(mark, OutputFile)]
         for name, parameter in inspect.signature(function, eval_str=True).parameters.items()
     }
     return {name: found[0] for name, found in marks.items() if found}
@@ -135,14 +128,8 @@ class Command(TyperCommand):
         marks = written(type(self).function)
         places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
         wanted = [
-            OutputFile(
-                *(name, place, mark.suffixes, mark.files),
-                keeps=mark.keeps or (resume and _is_report(place)),
-                of_each=mark.of_each,
-                may_be_folder=mark.may_be_folder,
-            )
+            replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and _is_report(place)))
             for name, place in places.items()
-            for mark in (marks[name],)
         ]
         inputs = [value for name, value in values.items() if name not in marks]
         check_outputs(wanted, inputs, overwrite=bool(values.get("overwrite")))

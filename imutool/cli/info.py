@@ -77,9 +77,6 @@ def _described(
     from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 
     place = to_location(log)
-    if isinstance(place, Path) and place.is_dir():
-        fix = f"Name its logs, or report on all of them with: imutool fleet info {place} OUT"
-        raise ConfigError("is a folder", where=place, expected="an MCAP log", fix=fix)
     with RecoveredLog(place, max_chunk=max_chunk) as opened:
         report, about = describe(opened, check=not quick), opened.metadata().get("imutool", {})
         if "dataset" in about:

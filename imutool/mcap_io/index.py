@@ -32,6 +32,7 @@ from imutool.mcap_io.storage.source import Source
 
 SMALL = 4096  # bytes of a chunk in which messages are found sooner than in its message indexes
 MAX_SUMMARY = 1 << 29  # bytes; that of a 100 GB log has some 20 million
+CONVERT = "`imutool convert` makes one of other recordings"
 
 
 class LogIndex:
@@ -151,7 +152,7 @@ class LogIndex:
         start = source.at(0, min(len(MAGIC), source.size))
         if start != MAGIC[: len(start)]:
             what = f"this is not an MCAP log: it starts with {start!r}"
-            raise LogError(what, expected=repr(MAGIC), fix="`imutool convert` makes one of other recordings")
+            raise LogError(what, expected=repr(MAGIC), fix=CONVERT)
         at = source.size - len(MAGIC) - FOOTER_SIZE
         if at < len(MAGIC) or source.at(source.size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise cut_short(source)

@@ -58,7 +58,7 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
     while 2 * n < len(imu):
         hop = max(1, n // OVERLAP)
         first = _starts(len(imu), n, hop, broken)
-        gyro, accel = (_spread(imu, t, R_wb, poses.v_w, first, n, hop, sensor) for sensor in ("gyro", "accel"))
+        gyro, accel = (_spread(imu, t, R_wb, poses.v_w, first, n, sensor) for sensor in ("gyro", "accel"))
         if gyro is None or accel is None:
             break
         found[0].append(gyro)
@@ -93,7 +93,6 @@ def _spread(
     v_w: Rows,
     first: Int64[np.ndarray, " m"],
     n: int,
-    hop: int,
     sensor: str,
 ) -> Float64[np.ndarray, "3"] | None:
     """Allan deviation of one sensor's error at one window length; None where too few windows can show it."""

@@ -102,7 +102,7 @@ class NonMonotonic(Rule):
                 away = (before[: end - first] - stamp[first:end])[behind]
                 self._furthest_s = max(self._furthest_s, float(away.max()) * 1e-9)
             self._note_set_backs(stamp[first:end], before[: end - first], behind)
-            self._extend(samples, first, end, ~behind)
+            self._extend(samples, first, ~behind)
             if end < len(stamp):
                 self.epochs.append(Epoch(int(samples.number[end]), 0, int(stamp[end]), int(stamp[end]), 0))
                 self._last = int(stamp[end]) - 1
@@ -135,7 +135,7 @@ class NonMonotonic(Rule):
                 return int(row) if row or self.epochs else len(stamp)
         return len(stamp)
 
-    def _extend(self, samples: Samples, first: int, end: int, kept: Bool[np.ndarray, " n"]) -> None:
+    def _extend(self, samples: Samples, first: int, kept: Bool[np.ndarray, " n"]) -> None:
         if not kept.any():
             return
         rows = np.flatnonzero(kept) + first

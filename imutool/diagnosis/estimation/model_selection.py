@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -86,9 +87,11 @@ def select_effects(
         answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
         other.end()
-    selections = (search.tested(search.simplified(found)) for search, found in answers)
+    several = [(search, found.chosen[: len(always) + 1]) for search, found in answers if len(found.chosen) > len(always) + 1]
+    alone = ((search, fit(logs, chosen)) for search, chosen in several)  # what came in later may have spoilt the first
+    selections = (search.tested(search.simplified(found)) for search, found in chain(answers, alone))
     best = next(selections)
-    return best if best.selected else next(selections, best)  # unseen time has refuted all of the best
+    return best if best.selected else next((one for one in selections if one.selected), best)  # unseen time refuted the best
 
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
@@ -194,14 +197,14 @@ class _Search:
 
     def simplified(self, now: Fit) -> Fit:
         """Fit with the simpler of two effects that the logs hardly tell apart."""
-        for key in [effect.key for effect, _ in now.chosen if effect.kind == "unknown"]:
-            rivals = self._rivals(now.keys.index(key), now).values()  # a name that leaves no more says more
-            now = next((trial for trial in rivals if trial.objective < now.objective), now)
+        for effect in [effect for effect, _ in now.chosen if effect.kind != "catalogue"]:
+            rivals = self._rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
+            left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
+            now = next((trial for trial in rivals if left(trial) < left(now)), now)
         now = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
-        log_p = self.candidates.log_p
         return with_common_arm(
-            self.logs, now, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < self.threshold
+            self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold
         )
 
     def pruned(self, now: Fit) -> Fit:

@@ -8,9 +8,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.signal import welch
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.significance import bic
@@ -244,7 +245,7 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
 
 
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
-    """Whether a fitted frequency lies beyond the poses' band, or is too slow.
+    """Whether a fitted frequency lies beyond the poses' band, is too slow, or rings too loud.
 
     Smoothed poses lose and delay motion there by themselves, which looks alike.
     """
@@ -253,4 +254,21 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
     reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
-    return bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
+    outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
+    return outside or (effect.name == "mount_resonance" and any(_rings_too_loud(effect, theta, log.pair) for log in logs))
+
+
+def _rings_too_loud(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
+    """Whether a mount that rings beyond the poses' band would be louder there than an axis reads.
+
+    Below its frequency a resonance is a gain, as smoothing is. The samples themselves show whether it rings.
+    """
+    (f0_hz, zeta), settings = theta[:2], pair.settings.search
+    if pair.band_hz is None or f0_hz <= pair.band_hz:
+        return False
+    accel, rate_hz = pair.signals["accel"], 1.0 / pair.period_s
+    size = min(len(pair.real), round(settings.ringing_segment_s * rate_hz))
+    f_hz, predicted = welch(expected(pair, ((effect, theta),))[:, accel], rate_hz, nperseg=size, axis=0)
+    _, read = welch(pair.real[:, accel], rate_hz, nperseg=size, axis=0)
+    near = np.abs(f_hz - f0_hz) <= max(zeta * f0_hz, 2.0 / settings.ringing_segment_s)
+    return bool((predicted[near].sum(axis=0) > settings.ringing_power * read[near].sum(axis=0)).any())

@@ -107,7 +107,7 @@ def paired(real: Location, sim: Location) -> Pairing:
     pairs = pairs[:MOST_COMPARED]
     compared = {name for pair in pairs for name in pair.names}
     remarks += _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
-    return Pairing(tuple(pairs), _drivers(own, compared, topics), tuple(remarks))
+    return Pairing(tuple(pairs), _drivers(own, compared), tuple(remarks))
 
 
 def _is_copy(pair: SignalPair) -> bool:
@@ -284,7 +284,7 @@ def _wheels(real: _Side, sim: _Side, topic: str, mine: Mapping[str, Fields], oth
     return _together(topic, SPEEDS, "wheels", ("m/s", "rad/s"), mine, other, states[0], states[1])
 
 
-def _drivers(side: _Side, compared: set[str], topics: Mapping[str, str]) -> dict[str, Fields]:
+def _drivers(side: _Side, compared: set[str]) -> dict[str, Fields]:
     """Numbers of the recording that may drive a misfit: no motion, and nothing that is compared itself."""
     found = {
         f"{topic}.{path}": values

@@ -20,7 +20,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.blocks import HEAD_BYTES, Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
-from imutool.mcap_io.index import LogIndex
+from imutool.mcap_io.index import CONVERT, LogIndex
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
 from imutool.mcap_io.recovery.definitions import map_channels, parsed, remap, renumber, renumber_counts, unproven_topics
 from imutool.mcap_io.recovery.gaps import counts_by_size, really_lost
@@ -290,7 +290,7 @@ class RecoveredIndex(LogIndex):
     def _set_header(self, scan: Scan) -> None:
         header = scan.header
         if not self.items and header is None and not self.channels:
-            raise LogError("this is not an MCAP log: no record of one is in it", expected="an MCAP log")
+            raise LogError("this is not an MCAP log: no record of one is in it", expected="an MCAP log", fix=CONVERT)
         if header is None:
             encodings = {channel.message_encoding for channel in self.channels.values()}
             profile = {"cdr": "ros2", "ros1": "ros1"}.get(next(iter(encodings)), "") if len(encodings) == 1 else ""

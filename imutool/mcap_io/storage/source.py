@@ -13,6 +13,7 @@ from imutool.mcap_io.codec.records import HEAD, crc32
 BLOCK_BYTES = 1 << 20
 SHORT_BYTES, AHEAD_BYTES = 512, 1 << 13  # a read of at most so many bytes of a local file takes as many at once
 CUT_SHORT = "Save the rest with `imutool repair`, or copy it again from where it was recorded"
+OF_A_FOLDER = "Name a log in it; `imutool fleet` takes a folder of logs, and `imutool convert` a recording that is a folder"
 
 
 class Source:
@@ -21,6 +22,8 @@ class Source:
     def __init__(self, path: Location, expected: str = "an MCAP log") -> None:
         try:
             self.file, self.size, self.identity = open_location(path)
+        except IsADirectoryError as error:
+            raise ConfigError("is a folder", where=path, expected=expected, fix=OF_A_FOLDER) from error
         except io_errors(path) as error:
             raise ConfigError(f"cannot be opened ({reason(error)})", where=path, expected=expected) from error
         self.path = path

@@ -50,7 +50,7 @@ def paths(data: RunData) -> Picture:
     notes = ["Circle: start" if data.truth is None else "Circle: start; square: end of the truth"]
     for trace in far:
         out_of = "the first two pictures" if models and not trace.is_raw else "every picture" if models else "the picture"
-        notes.append(f"{run_name(trace)} leaves {out_of} and ends {format_quantity(_end_m(data, trace), 'm')} from the {start}")
+        notes.append(f"{run_name(trace)} leaves {out_of} and ends {format_quantity(_end_m(trace), 'm')} from the {start}")
     return Picture("paths", "Paths", f"{'. '.join(notes)}.", panels)
 
 
@@ -185,7 +185,7 @@ def _near(data: RunData) -> tuple[list[Trace], list[Trace]]:
     return near, [trace for trace, fit in zip(data.traces, fits, strict=True) if not fit]
 
 
-def _end_m(data: RunData, trace: Trace) -> float:
+def _end_m(trace: Trace) -> float:
     """Distance of a path's end from the truth, or from its own start without truth."""
     if trace.errors is not None:
         known = trace.errors.position_total_m[np.isfinite(trace.errors.position_total_m)]

@@ -153,7 +153,7 @@ def _samples(data: RunData, name: str, title: str, caption: str, span_s: tuple[f
     return Picture(name, title, f"{caption}{lower}", tuple(panels))
 
 
-def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
+def _by_axis(figure: Any, title: str, unit: str) -> list[Any]:
     """Three panels for x, y and z in their colours."""
     panels: list[Any] = list(figure.subplots(3, 1, sharex=True))
     for axis, axes in enumerate(panels):
@@ -164,7 +164,7 @@ def _by_axis(figure: Any, sensor: str, title: str, unit: str) -> list[Any]:
 
 
 def _draw_samples(figure: Any, *, data: RunData, sensor: str, span_s: tuple[float, float]) -> None:
-    panels = _by_axis(figure, sensor, NOUNS[sensor], UNITS[sensor])
+    panels = _by_axis(figure, NOUNS[sensor], UNITS[sensor])
     lines, steps = [], np.zeros(3)
     for rank, trace in enumerate(data.traces):
         t = data.elapsed_s(trace.run.imu.t_ns)
@@ -190,7 +190,7 @@ def _steps(values: Vectors) -> Values:
 
 
 def _draw_bias(figure: Any, *, data: RunData, sensor: str) -> None:
-    panels = _by_axis(figure, sensor, f"{TITLES[sensor]} bias", UNITS[sensor])
+    panels = _by_axis(figure, f"{TITLES[sensor]} bias", UNITS[sensor])
     lines = []
     for trace in data.models():
         bias = trace.run.gyro_bias if sensor == "gyro" else trace.run.accel_bias
@@ -228,7 +228,7 @@ def _draw_spectrum(
     curves: Sequence[Any],
     subtracted: Sequence[tuple[Trace, Mapping[str, Spectrum]]],
 ) -> None:
-    panels = _by_axis(figure, sensor, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
+    panels = _by_axis(figure, f"{NOUNS[sensor]} ({UNITS[sensor]}/√Hz)", "")
     lines = []
     for trace, frequency_hz, density in curves:
         at, power = average_log_bins(frequency_hz, density, frequency_hz[0])
@@ -252,7 +252,7 @@ def _draw_spectrum(
 
 
 def _draw_allan(figure: Any, *, data: RunData, sensor: str, curves: Sequence[Any]) -> None:
-    panels = _by_axis(figure, sensor, f"{TITLES[sensor]}: Allan deviation", UNITS[sensor])
+    panels = _by_axis(figure, f"{TITLES[sensor]}: Allan deviation", UNITS[sensor])
     lines = []
     for trace, tau_s, deviation in curves:
         drawn = [_log_line(axes, tau_s, deviation[:, k], data, trace, k) for k, axes in enumerate(panels)]

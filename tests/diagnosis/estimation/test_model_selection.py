@@ -142,6 +142,23 @@ def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_nam
     assert short.selected[0].gain == whole.selected[0].gain
 
 
+def test_the_first_effect_is_tried_alone_where_unseen_time_refutes_all_that_came_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = {"gyro_scale": [0.02, -0.03, 0.01], "lever_arm": [0.2, -0.05, 0.1]}
+    log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
+    tested = list[tuple[str, ...]]()
+
+    def refuted(now: Fit, first: int) -> int:
+        tested.append(now.keys)
+        return first if len(tested) < 3 else len(now.chosen)
+
+    monkeypatch.setattr(model_selection, "first_refuted", refuted)
+    found = select_effects([log], planted.catalogue())
+    both, last, alone = tested
+    assert sorted(both) == sorted(truth)
+    assert (last, alone) == (both[1:], both[:1])
+    assert names(found) == list(alone)
+
+
 @pytest.mark.parametrize("model_error", [1e-9, 0.5])
 def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_could_hide_one(
     model_error: float, monkeypatch: pytest.MonkeyPatch

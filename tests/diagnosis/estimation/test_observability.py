@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.observability import FOLLOWING, below_model_error, unobservable
+from imutool.diagnosis.estimation.observability import FOLLOWING, below_model_error, beyond_the_band, unobservable
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor import catalogue
@@ -101,3 +101,20 @@ def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
 def test_an_effect_alone_is_told() -> None:
     assert not below_model_error({"clock_offset": 25.0}, SETTINGS, denoised=True, poses=False)
     assert not below_model_error({}, SETTINGS, denoised=False, poses=False)
+
+
+RINGS = [4.0, 0.02, 0.0, 0.0, 0.5]  # above the band of these poses, lightly damped, along z alone
+POSES_HZ, NEAR_HZ = 2.0, 6.0
+
+
+@pytest.mark.parametrize(
+    ("real", "band_hz", "beyond"), [({}, POSES_HZ, True), ({"mount_resonance": RINGS}, POSES_HZ, False), ({}, NEAR_HZ, False)]
+)
+def test_a_mount_beyond_the_poses_has_to_ring_in_the_samples(
+    real: dict[str, list[float]], band_hz: float, beyond: bool
+) -> None:
+    felt = planted.shaken(2)
+    felt = replace(felt, accel=felt.accel + 0.05 * np.sin(2.0 * np.pi * RINGS[0] * felt.t_s)[:, None])
+    log = planted.weighed(replace(planted.pair(felt, real, 1), against="true poses", band_hz=band_hz))
+    ((effect, theta),) = planted.acting({"mount_resonance": RINGS})
+    assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond

@@ -54,6 +54,12 @@ def test_a_ripple_up_to_the_end_of_the_band_leaves_spectrum_for_the_noise(tmp_pa
     assert finding.effect == "gear_ripple"
 
 
+def test_a_channel_that_drives_without_a_lag_gets_its_name_beside_a_slow_barometer(tmp_path: Path) -> None:
+    """What the temperature adds to a pressure is `pressure_temperature`, no drive without a name and with a lag of nothing."""
+    conceal_robot(tmp_path, 24032, "flight", "pair")
+    within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
+
+
 def test_an_arm_is_diagnosed_from_the_command_line_with_its_page(imutool: Run, tmp_path: Path) -> None:
     """A dry friction in MuJoCo: the command finds topics and fields by itself, and the page draws them.
 
