@@ -24,7 +24,8 @@ from imutool.errors import ConfigError
 from imutool.inertial.inertial_filter import STILL, VELOCITY, FilterSettings
 from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 
-EARLIER_S = np.array([0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 512.0])  # T; after the last the slowest state has settled
+# T: a few seconds also imitate what a model misses of a cold start; after the last the slowest state has settled
+EARLIER_S = np.array([0.0, 16.0, 32.0, 64.0, 128.0, 512.0])
 COLD = 0.5  # prior probability of T = 0; the others share the rest
 STUDENT = 7.0  # degrees of freedom of the innovations, so that one jolt does not decide
 

@@ -169,8 +169,10 @@ def smooth_motion(poses: Poses) -> SmoothMotion:
             stretches.append(stretch)
             glitches, steps = glitches + int((~sound).sum()), steps + count
     if not stretches:
+        step_s = np.diff(t_s)
+        rate = f" at {1.0 / np.median(step_s):.3g} Hz, with {int((step_s > MAX_GAP_S).sum())} holes," if len(step_s) else ""
         raise DataError(
-            f"no stretch of the {len(poses)} poses can be differentiated",
+            f"no stretch of the {len(poses)} poses{rate} can be differentiated",
             expected=f"{LEAST_POSES} poses over {LEAST_S:g} s and more, without a hole of {MAX_GAP_S:g} s",
         )
     return SmoothMotion(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
