@@ -6,7 +6,8 @@ block means scatter no more than that (or no more than the calmest windows of th
 neighbouring samples), within absolute caps for every log.
 
 Chosen on the 23 recordings of EuRoC, TUM-VI and FETCH against their true poses: the scatter of 0.1 s means over 1 s is
-at most 0.007 rad/s on the ground with motors running, and at least 0.008 in hovering flight, 0.03 in the hand.
+at most 0.007 rad/s on the ground with motors running, and at least 0.008 in hovering flight, 0.03 in the hand. Nor does the
+rate of a stop have a trend: a log that never rests has calmest windows, too.
 A steady turn about the vertical looks like a bias; only its difference from the other rest of the log shows it.
 """
 
@@ -27,6 +28,7 @@ from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import quantile, true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
+TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, a slow turn that changes 11
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
 FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
@@ -54,6 +56,7 @@ class StationarySettings(Settings, frozen=True, kw_only=True):
     accel_noise_m_s2: Positive = 1.5
     gyro_mean_rad_s: Positive = 0.2  # a larger mean is a turn, not a bias (11 degrees a second)
     gyro_agreement_rad_s: Positive = 0.02  # between a window's mean and the median of all that rest
+    gyro_trend_rad_s: Positive = 2e-3  # between the means of a window's halves, beside four deviations of their noise
 
 
 class Blocks(NamedTuple):
@@ -123,11 +126,15 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         return []
     gyro_scatter, gyro_noise, gyro_mean = _window_statistics(blocks.mean[:, :3], blocks.var[:, :3], width)
     accel_scatter, accel_noise, _ = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
+    half = width // 2
+    halves = np.lib.stride_tricks.sliding_window_view(blocks.mean[:, :3], half, axis=0).mean(axis=-1)
+    trend = np.linalg.norm(halves[width - half :] - halves[: len(gyro_scatter)], axis=1)
     calmest = np.sort(gyro_scatter)
     floor = calmest[min(FLOOR_RANK, len(calmest) // 10)]
     allowed = np.maximum(WHITE_MARGIN * gyro_noise / np.sqrt(k), FLOOR_MARGIN * floor)
     rests = (
         (gyro_scatter <= np.minimum(allowed, settings.gyro_scatter_rad_s))
+        & (trend <= settings.gyro_trend_rad_s + TREND_DEVIATIONS * gyro_noise * np.sqrt(2.0 / (half * k)))
         & (accel_scatter <= settings.accel_scatter_m_s2)
         & (gyro_noise <= settings.gyro_noise_rad_s)
         & (accel_noise <= settings.accel_noise_m_s2)
@@ -191,7 +198,10 @@ class OnlineRestDetector:
         allowed = min(max(WHITE_MARGIN * noise[0] / math.sqrt(k), FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
         calm = scatter[0] <= allowed and scatter[1] <= s.accel_scatter_m_s2
         quiet = noise[0] <= s.gyro_noise_rad_s and noise[1] <= s.accel_noise_m_s2
-        if not (calm and quiet and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
+        half = len(mean) // 2
+        trend = float(np.linalg.norm(mean[-half:, :3].sum(axis=0) - mean[:half, :3].sum(axis=0))) / half
+        steady = trend <= s.gyro_trend_rad_s + TREND_DEVIATIONS * noise[0] * math.sqrt(2.0 / (half * k))
+        if not (calm and quiet and steady and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
             return False
         self._means.append(centre)
         return bool(np.linalg.norm(centre - quantile(np.array(self._means), 0.5)) <= s.gyro_agreement_rad_s)

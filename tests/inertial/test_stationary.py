@@ -94,6 +94,15 @@ def test_a_steady_turn_too_fast_for_a_bias_is_not_rest():
     assert rest_stretches(Imu(t_ns, gyro + np.array([0.0, 0.0, 0.5]), accel)) == []
 
 
+def test_the_calmest_seconds_of_a_log_that_never_rests_are_no_rest():
+    """A slow turn to and fro, whose rate changes by 0.015 rad/s in a second."""
+    t_ns, gyro, accel = made(60.0)
+    gyro[:, 2] += 0.015 * np.abs((t_ns * 1e-9 + 2.0) % 8.0 - 4.0) - 0.03
+    assert rest_stretches(Imu(t_ns, gyro, accel)) == []
+    detector = OnlineRestDetector()
+    assert not any(detector(gyro[k : k + 100], accel[k : k + 100]) for k in range(0, len(gyro), 100))
+
+
 def test_a_gap_in_the_samples_breaks_a_stretch():
     t_ns, gyro, accel = made(10.0)
     late = t_ns + np.where(np.arange(len(t_ns)) >= 1000, 500_000_000, 0)
