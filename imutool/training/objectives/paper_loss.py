@@ -71,7 +71,7 @@ class PaperLoss(Objective):
         """Terms of some segments each, all from one log that is drawn for this step."""
         count = self.settings.paper.segments
         log_of = self.pool.log[self.first]
-        logs = log_of.unique()  # those that have a segment
+        logs = torch.nonzero(log_of.bincount())[:, 0]  # those that have a segment
         first = self.first[log_of == logs[torch.randint(len(logs), (1,), generator=generator)]]
         chosen = torch.randint(len(first), (count,), generator=generator).to(first.device)
         return [partial(self._term, some, len(some) / count) for some in torch.split(first[chosen], SEGMENTS)]
