@@ -27,13 +27,14 @@ from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 # T: a few seconds also imitate what a model misses of a cold start; after the last the slowest state has settled
 EARLIER_S = np.array([0.0, 16.0, 32.0, 64.0, 128.0, 512.0])
 COLD = 0.5  # prior probability of T = 0; the others share the rest
+LEAST_COLD = 0.2  # probability of T = 0, below which the start is not cold: a log that says nothing changes nothing
 STUDENT = 7.0  # degrees of freedom of the innovations, so that one jolt does not decide
 
 
 def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: int | None = None) -> BiasModel:
     """Model whose drift begins where the log shows the sensor.
 
-    The model itself where a cold start is likely, or its earlier load given. `batches` are seconds since the log's first
+    The model itself where a cold start is possible, or its earlier load given. `batches` are seconds since the log's first
     sample, gyro and accel; as many count as for the fitness.
     """
     if not model.follows_load() or model.load_before is not None:
@@ -47,7 +48,7 @@ def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: in
     prior = np.array([COLD, *[(1.0 - COLD) / (len(loads) - 1)] * (len(loads) - 1)])
     weights = prior * np.exp(log_likelihood - log_likelihood.max())
     weights /= weights.sum()
-    if weights[0] >= 0.5:
+    if weights[0] >= LEAST_COLD:
         return model
     return _after(model, np.einsum("t,tkl->kl", weights, loads))
 

@@ -115,3 +115,10 @@ def test_a_steady_turn_is_no_stop() -> None:
         filter_ = BiasFilter(prior, ahead=True)
         blocks = [*filter_.feed(t_s, gyro, still + 0.01 * rng.normal(size=(n, 3))), *filter_.finish()]
         assert {block.resting for block in blocks} == {rests}
+
+
+def test_a_log_that_says_nothing_is_taken_for_cold() -> None:
+    """A drift so small that its samples do not show it."""
+    model = warming()
+    model.tensors["theta_gyro"] *= 1e-3
+    assert bound_to(model, after(400.0, 50, 20.0)) is model
