@@ -15,7 +15,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
-from imutool.bias_start.prior_width import MOST_CHANGE, BiasPrior
+from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
 from imutool.inertial.preintegration import integrate
@@ -23,7 +23,6 @@ from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 from imutool.recording.columns import quantile
 
 BLOCK_S = 0.5
-FAR = 5.0  # standard deviations
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
 
@@ -135,7 +134,8 @@ class BiasFilter:
 
     def _pass(self, block: _Block, rests: bool) -> FilteredBlock:
         t, u, s, prior = block.t_s, block.u, self.settings, self._prior
-        rests = rests and bool((np.abs(u[:-1, :3].mean(axis=0) - prior.mean[:3]) < MOST_CHANGE[:3] + FAR * prior.std[:3]).all())
+        most = (MOST_CHANGE + MOST_DEVIATIONS * prior.std)[:3]
+        rests = rests and bool((np.abs(u[:-1, :3].mean(axis=0) - prior.mean[:3]) < most).all())
         if self.state is None:
             P = np.diag(np.concatenate([prior.std, prior.ground_std]) ** 2)
             self.state = inertial_filter.level(u[:, 3:].mean(axis=0), prior.mean, np.zeros(6), P, s)

@@ -11,24 +11,23 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
-from imutool.bias_start.fitness import head
+from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples
+from imutool.bias_start.fitness import head, innovations, student
 from imutool.bias_start.initial_bias import bias_prior
 from imutool.errors import ConfigError
-from imutool.inertial.inertial_filter import STILL, VELOCITY, FilterSettings
+from imutool.inertial.inertial_filter import STILL, FilterSettings
 from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 
 # T: a few seconds also imitate what a model misses of a cold start; after the last the slowest state has settled
 EARLIER_S = np.array([0.0, 16.0, 32.0, 64.0, 128.0, 512.0])
 COLD = 0.5  # prior probability of T = 0; the others share the rest
 LEAST_COLD = 0.2  # probability of T = 0, below which the start is not cold: a log that says nothing changes nothing
-STUDENT = 7.0  # degrees of freedom of the innovations, so that one jolt does not decide
 
 
 def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: int | None = None) -> BiasModel:
@@ -40,17 +39,17 @@ def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: in
     if not model.follows_load() or model.load_before is not None:
         return model
     samples = head(batches)
-    if len(samples[0]) < 2:
+    if len(samples[0]) < 2 or samples[0][-1] < BLOCK_S:
         return model
     mean = _mean_load(model.rate_hz, samples)
     loads = -np.expm1(-EARLIER_S[:, None] / LOAD_TAU_S)[..., None] * mean
-    log_likelihood = np.array([_log_likelihood(_after(model, load), samples, first_ns) for load in loads])
+    log_likelihood = np.array([_log_likelihood(after_load(model, load), samples, first_ns) for load in loads])
     prior = np.array([COLD, *[(1.0 - COLD) / (len(loads) - 1)] * (len(loads) - 1)])
     weights = prior * np.exp(log_likelihood - log_likelihood.max())
     weights /= weights.sum()
     if weights[0] >= LEAST_COLD:
         return model
-    return _after(model, np.einsum("t,tkl->kl", weights, loads))
+    return after_load(model, np.einsum("t,tkl->kl", weights, loads))
 
 
 def switched_on_before(model: BiasModel, on_s: float) -> BiasModel:
@@ -67,7 +66,7 @@ def switched_on_before(model: BiasModel, on_s: float) -> BiasModel:
         return model
     load = np.zeros((len(LOAD_TAU_S), LOADS))
     load[:, ON] = -np.expm1(-on_s / LOAD_TAU_S)
-    return _after(model, load)
+    return after_load(model, load)
 
 
 def _mean_load(rate_hz: float, samples: Samples) -> Float64[np.ndarray, "11"]:
@@ -77,8 +76,8 @@ def _mean_load(rate_hz: float, samples: Samples) -> Float64[np.ndarray, "11"]:
     return np.asarray(z.mean(axis=0) + z[-1] / (gain * len(z)))
 
 
-def _after(model: BiasModel, load: Load) -> BiasModel:
-    """The model after a load; a copy."""
+def after_load(model: BiasModel, load: Load | None) -> BiasModel:
+    """Model of a sensor that bore a load before its first sample, or none; a copy."""
     out = copy.copy(model)
     out.load_before = load
     return out
@@ -92,25 +91,15 @@ def _log_likelihood(model: BiasModel, samples: Samples, first_ns: int | None) ->
     gyro, accel = gyro - bias[:, :3], accel - bias[:, 3:]
     filter_ = BiasFilter(prior, ahead=True)
     blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
-    return sum(_velocity(block) + (_rate(block, t_s, gyro) if block.resting else 0.0) for block in blocks)
+    return float(innovations(blocks)[1].sum()) + _at_rest([block for block in blocks if block.resting], t_s, gyro)
 
 
-def _velocity(block: FilteredBlock) -> float:
-    """Log-likelihood of the velocity that a block ends with, which is bounded in motion and zero at rest."""
-    s, expected = FilterSettings(), block.step.expected
-    bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / (block.end_s - block.start_s)
-    noise = s.rest_m_s**2 if block.resting else bounded
-    return _student(expected.v_w, expected.P[VELOCITY, VELOCITY] + noise * np.eye(3))
-
-
-def _rate(block: FilteredBlock, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:
-    """Log-likelihood of a block's mean rate at rest, where the gyro reads its bias."""
-    own = gyro[np.searchsorted(t_s, block.start_s) : np.searchsorted(t_s, block.end_s)]
-    expected = block.step.expected
-    noise = own.var(axis=0) / len(own) + FilterSettings().rest_rad_s ** 2
-    return _student(own.mean(axis=0) - expected.rest_bias(True)[:3], STILL @ expected.P @ STILL.T + np.diag(noise))
-
-
-def _student(x: Float64[np.ndarray, "3"], S: Float64[np.ndarray, "3 3"]) -> float:
-    square = float(x @ np.linalg.solve(S, x))
-    return -0.5 * (STUDENT + 3.0) * math.log1p(square / STUDENT) - 0.5 * float(np.linalg.slogdet(S)[1])
+def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:
+    """Log-likelihood of the mean rates of blocks at rest, where the gyro reads its bias."""
+    missed, covariances = np.zeros((len(blocks), 3)), np.zeros((len(blocks), 3, 3))
+    for k, block in enumerate(blocks):
+        own, expected = gyro[np.searchsorted(t_s, block.start_s) : np.searchsorted(t_s, block.end_s)], block.step.expected
+        missed[k] = own.mean(axis=0) - expected.rest_bias(True)[:3]
+        noise = own.var(axis=0) / len(own) + FilterSettings().rest_rad_s ** 2
+        covariances[k] = STILL @ expected.P @ STILL.T + np.diag(noise)
+    return float(student(missed, covariances)[1].sum())

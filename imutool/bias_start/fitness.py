@@ -25,7 +25,7 @@ from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.bias_start.prior_width import MOST_CHANGE, BiasPrior, supported_std
+from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
@@ -35,7 +35,6 @@ CHECKED_S = 120.0  # of a log that the check reads
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds
 MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
-MOST_DEVIATIONS = 5.0  # between the log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
 MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
 TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
@@ -145,7 +144,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    chi_square, log_likelihood = _innovations(blocks)
+    chi_square, log_likelihood = innovations(blocks)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -157,15 +156,21 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     return _Evidence(float(log_likelihood.sum()), surprising, difference, variance)
 
 
-def _innovations(blocks: Sequence[FilteredBlock]) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
-    """Chi-square of each block's velocity, and its log-likelihood under Student's distribution."""
+def innovations(blocks: Sequence[FilteredBlock]) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+    """Chi-square and Student's log-likelihood of each block's velocity."""
     s = FilterSettings()
     v = np.array([block.step.expected.v_w for block in blocks])
     S = np.array([block.step.expected.P[VELOCITY, VELOCITY] for block in blocks])
     bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s
     noise = np.array([s.rest_m_s**2 if b.resting else bounded / (b.end_s - b.start_s) for b in blocks])
-    S += noise[:, None, None] * np.eye(3)
-    chi_square = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1)
+    return student(v, S + noise[:, None, None] * np.eye(3))
+
+
+def student(
+    e: Float64[np.ndarray, "m 3"], S: Float64[np.ndarray, "m 3 3"]
+) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+    """Chi-square and Student's log-likelihood of innovations e with covariances S."""
+    chi_square = (e * np.linalg.solve(S, e[..., None])[..., 0]).sum(axis=1)
     return chi_square, -0.5 * (STUDENT + 3.0) * np.log1p(chi_square / STUDENT) - 0.5 * np.linalg.slogdet(S)[1]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.drifting import Drifting, log
 
 import imutool
@@ -22,6 +23,8 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.log import Log
 from imutool.recording import Recording
 from imutool.sensor.signals import LOAD_TAU_S, ON
+from imutool.viewing.stream.samples import Malformed, Sample
+from imutool.viewing.stream.session import run
 
 RATE_HZ, LAG_S = 50.0, 20.0
 SENSOR = Drifting(kind="warm_up", lag_s=LAG_S, rate_hz=RATE_HZ, scale=0.0)
@@ -96,6 +99,18 @@ def test_a_live_node_says_since_when_the_sensor_is_on(tmp_path: Path) -> None:
     for wrong in (-1.0, math.nan, math.inf):
         with pytest.raises(ConfigError, match="on_s"):
             imutool.load_model(tmp_path / "warming.safetensors", on_s=wrong)
+
+
+def test_the_first_two_seconds_of_a_live_stream_tell() -> None:
+    """At rest; the same sensor without a warm-up is one that is warm."""
+    model, size = warming(), np.abs(warming().tensors["theta_gyro"]).max()
+    for kind, least, most in (("warm_up", 0.4, 0.7), ("none", 0.0, 0.1)):
+        imu, biases = log(50, replace(SENSOR, kind=kind), 20.0).imu, []
+        rows = zip(imu.t_ns.tolist(), imu.gyro.tolist(), imu.accel.tolist(), strict=True)
+        stream = (Sample(t_ns, tuple(gyro), tuple(accel), 0.0) for t_ns, gyro, accel in rows)
+        run(stream, model, Malformed(), show=lambda block: biases.append(block.bias[:, :3]))
+        moved = np.ptp(np.concatenate(biases), axis=0).max() / size
+        assert least < moved < most, kind
 
 
 def test_a_model_without_drift_and_a_log_without_samples_are_left_alone() -> None:

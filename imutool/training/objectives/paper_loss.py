@@ -49,7 +49,8 @@ class PaperLoss(Objective):
                 expected=f"1 for none, or {CUBIC + 1} and more",
             )
         self.n = chosen.samples
-        self.first = self._starts("train")
+        first = self._starts("train")
+        self.first_by_log = [own for i in range(len(self.pool.names)) if len(own := first[self.pool.log[first] == i])]
         self.start, _ = biases_from_poses(self.pool, chosen.smoothed_samples)
 
     def _starts(self, part: Part) -> Int[Tensor, " m"]:
@@ -70,9 +71,7 @@ class PaperLoss(Objective):
     def terms(self, generator: torch.Generator) -> Sequence[Callable[[], Float[Tensor, ""]]]:
         """Terms of some segments each, all from one log that is drawn for this step."""
         count = self.settings.paper.segments
-        log_of = self.pool.log[self.first]
-        logs = torch.nonzero(log_of.bincount())[:, 0]  # those that have a segment
-        first = self.first[log_of == logs[torch.randint(len(logs), (1,), generator=generator)]]
+        first = self.first_by_log[int(torch.randint(len(self.first_by_log), (1,), generator=generator))]
         chosen = torch.randint(len(first), (count,), generator=generator).to(first.device)
         return [partial(self._term, some, len(some) / count) for some in torch.split(first[chosen], SEGMENTS)]
 

@@ -17,7 +17,7 @@ from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.temperature_drift import started_at, without_drift
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.correction import OnlineDebiaser
-from imutool.bias_start.earlier_load import with_earlier_load
+from imutool.bias_start.earlier_load import after_load, with_earlier_load
 from imutool.bias_start.initial_bias import model_samples
 from imutool.bias_start.stretches import measured
 from imutool.debiasing import DebiasedBlock
@@ -186,16 +186,15 @@ class _Session:
         gyro, accel = (np.array([getattr(sample, name) for sample in ordered]) for name in ("gyro", "accel"))
         good = measured(gyro, accel)
         warm = [(sample.stamp_ns, float(sample.temperature)) for sample in ordered if sample.temperature is not None]
-        seen = Imu(t_ns[good], gyro[good], accel[good])
-        self._model = with_earlier_load(self._model, [model_samples(self._model, seen)], int(t_ns[0]))
-        model = started_at(self._model, warm, int(t_ns[0]), int(t_ns[-1]))
+        model, seen = started_at(self._model, warm, int(t_ns[0]), int(t_ns[-1])), Imu(t_ns[good], gyro[good], accel[good])
+        model = with_earlier_load(model, [model_samples(model, seen)], int(t_ns[0]))
         try:
             start = auto(model, without_drift(model, seen))
         except DataError as error:
             fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
             raise DataError(error.what, where="source", fix=fix) from error
         self._how, self._std = start.how, start.std
-        self._online = OnlineDebiaser(self._model, start)
+        self._online = OnlineDebiaser(after_load(self._model, model.load_before), start)
         for sample in self._first:
             self._correct(sample, batches)
         self._first = []

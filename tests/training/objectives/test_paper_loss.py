@@ -71,7 +71,7 @@ def test_a_segment_from_its_true_bias_misses_what_the_bias_changes(perfect: Make
     pool = Pool.of([biased(perfect)])
     for sensor in ("gyro", "accel"):
         loss = still(pool, sensor)
-        squares = loss.squares(loss.first).detach()
+        squares = loss.squares(loss.first_by_log[0]).detach()
         assert float(squares[0].max()) < FIRST_STEP[sensor]
         assert float(squares[-1].max()) < (LATE[sensor] * 16 * 0.005) ** 2 * 2
 
@@ -80,7 +80,7 @@ def test_a_wrong_bias_turns_by_itself_times_the_time(perfect: Make) -> None:
     pool = Pool.of([biased(perfect)])
     loss = still(pool, "gyro")
     loss.start = loss.start + torch.tensor([0.3, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    missed = loss.squares(loss.first).detach().sqrt().median(1).values
+    missed = loss.squares(loss.first_by_log[0]).detach().sqrt().median(1).values
     expected = 0.3 * 0.005 * torch.arange(1, 17, dtype=torch.float64)
     torch.testing.assert_close(missed, expected, rtol=0.1, atol=1e-4)
 
@@ -89,8 +89,8 @@ def test_a_steps_terms_are_the_mean_over_all_its_segments(perfect: Make) -> None
     loss, again = still(Pool.of([biased(perfect)]), "accel", segments=600), torch.Generator().manual_seed(3)
     terms = loss.terms(torch.Generator().manual_seed(3))
     torch.randint(1, (1,), generator=again)  # the log of the step
-    chosen = torch.randint(len(loss.first), (600,), generator=again)
-    whole = loss.squares(loss.first[chosen]).mean()
+    chosen = torch.randint(len(loss.first_by_log[0]), (600,), generator=again)
+    whole = loss.squares(loss.first_by_log[0][chosen]).mean()
     assert len(terms) > 1
     torch.testing.assert_close(torch.stack([term() for term in terms]).sum(), 1e6 * whole, rtol=1e-12, atol=0)
 
