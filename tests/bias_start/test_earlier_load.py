@@ -19,6 +19,7 @@ from imutool.bias_start.earlier_load import switched_on_before, with_earlier_loa
 from imutool.bias_start.initial_bias import model_samples
 from imutool.bias_start.model_choice import bound_to
 from imutool.bias_start.prior_width import BiasPrior
+from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError
 from imutool.mcap_io.log import Log
 from imutool.recording import Recording
@@ -105,11 +106,12 @@ def test_the_first_two_seconds_of_a_live_stream_tell() -> None:
     """At rest; the same sensor without a warm-up is one that is warm."""
     model, size = warming(), np.abs(warming().tensors["theta_gyro"]).max()
     for kind, least, most in (("warm_up", 0.4, 0.7), ("none", 0.0, 0.1)):
-        imu, biases = log(50, replace(SENSOR, kind=kind), 20.0).imu, []
+        imu = log(50, replace(SENSOR, kind=kind), 20.0).imu
+        blocks: list[DebiasedBlock] = []
         rows = zip(imu.t_ns.tolist(), imu.gyro.tolist(), imu.accel.tolist(), strict=True)
         stream = (Sample(t_ns, tuple(gyro), tuple(accel), 0.0) for t_ns, gyro, accel in rows)
-        run(stream, model, Malformed(), show=lambda block: biases.append(block.bias[:, :3]))
-        moved = np.ptp(np.concatenate(biases), axis=0).max() / size
+        run(stream, model, Malformed(), show=blocks.append)
+        moved = np.ptp(np.concatenate([block.bias[:, :3] for block in blocks]), axis=0).max() / size
         assert least < moved < most, kind
 
 
