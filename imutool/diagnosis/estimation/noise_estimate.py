@@ -19,6 +19,7 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
+from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect
 
 RIDGE = 1e-8
@@ -119,13 +120,16 @@ def _rich(pair: Pair, candidates: Sequence[Effect]) -> list[Float64[np.ndarray, 
     """Design columns by axis: a constant, and derivatives where fits begin."""
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
     ideal = ForwardPass(pair, ())
-    for effect in candidates:
+
+    def rows(effect: Effect) -> list[tuple[int, int, Float64[np.ndarray, " n"]]]:
         passes = [ideal]
         if effect.starts is not None and not effect.linear:
             passes = [ForwardPass(pair, ((effect, start),), ideal) for start in pair.starts(effect)] or passes
-        for forward in passes:
-            for axis, _, row in forward.derivatives(effect, onsets=False):
-                columns[axis].append(row)
+        return [row for forward in passes for row in forward.derivatives(effect, onsets=False)]
+
+    for found in of_each(rows, candidates):
+        for axis, _, row in found:
+            columns[axis].append(row)
     return [np.stack(rows) for rows in columns]
 
 
