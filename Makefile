@@ -32,7 +32,7 @@ check: lint  ## lint, types and the tests that a change touches (BASE=commit; el
 	@$(BIN)/python -m pytest -q -n $(WORKERS) --maxprocesses 4 --dist worksteal $$($(BIN)/python tests/changed.py $(BASE))
 
 docs: $(READY_TEST)  ## the documentation site, strict and without a network, into site/
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict  # with --quiet it counts no warnings
 	@echo "docs: open site/index.html"
 
 viewers: $(READY_TEST)  ## a browser and a software graphics driver for the tests that look, where apt-get may bring them
