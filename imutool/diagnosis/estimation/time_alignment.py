@@ -34,8 +34,12 @@ MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and powe
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
-def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT) -> Pair:
+def with_simulation(
+    real: Recording, sim: Recording, band_hz: float | None = None, settings: DiagnoseSettings = DEFAULT
+) -> Pair:
     """Align a recording with a simulation of the same motion.
+
+    The simulation is true up to `band_hz`; none: throughout.
 
     Raises:
         DataError: the two share too little time, or are not of one motion.
@@ -53,7 +57,7 @@ def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings 
     stamp_s = seconds(real.imu.t_ns, start_ns)
     ideal, noise = _simulated(t_sim, sim, shift_s, start_ns, real, settings)
     inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
-    return _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, settings)
+    return _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, band_hz, settings)
 
 
 def same_motion(real: Imu, sim: Imu, settings: AlignmentSettings = DEFAULT.alignment) -> bool:
@@ -74,8 +78,7 @@ def with_truth(
     stamp_s = seconds(real.imu.t_ns, start_ns)
     inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
     ideal = replace(ideal, channels=_channels(real, start_ns + np.round(ideal.t_s * 1e9).astype(np.int64)))
-    pair = _pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6), settings)
-    return replace(pair, band_hz=band_hz)
+    return _pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6), band_hz, settings)
 
 
 def _pair(
@@ -86,6 +89,7 @@ def _pair(
     against: str,
     aligned_s: float,
     sim_noise: Float64[np.ndarray, "6"],
+    band_hz: float | None,
     settings: DiagnoseSettings,
 ) -> Pair:
     rows = np.flatnonzero(inside)
@@ -116,7 +120,7 @@ def _pair(
         ideal=ideal,
         truth=truth,
         aligned_s=aligned_s,
-        against=against,
+        band_hz=band_hz,
         start_ns=int(t_ns[0]),
         sim_noise=sim_noise,
         settings=settings,

@@ -25,7 +25,7 @@ WITHOUT = planted.catalogue()
 
 def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarray | None = None) -> Pair:
     pair: Pair = planted.pair(FELT, effects, added=added)
-    return replace(pair, against="true poses", band_hz=BAND_HZ)
+    return replace(pair, band_hz=BAND_HZ)
 
 
 def noise(log: WhitenedImu) -> np.ndarray:

@@ -61,11 +61,11 @@ def test_noise_that_lasts_spreads_as_the_blocks_say_and_more_than_the_informatio
 
 def test_poses_that_err_make_a_scale_as_unsure_as_they_dilute_it() -> None:
     error = 0.2 * np.random.default_rng(3).normal(size=FELT.gyro.shape)  # rad/s, of the expectation
-    pair = replace(planted.pair(FELT), ideal=replace(FELT, gyro=FELT.gyro + error), against="poses")
+    pair = replace(planted.pair(FELT), ideal=replace(FELT, gyro=FELT.gyro + error), band_hz=40.0)
     log = WhitenedLog(pair, Whitener(np.ones((6, 1)), np.array([0.2] * 3 + [0.03] * 3)))
     found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
     diluted, stated = found.chosen[0][1], scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
-    simulated = WhitenedLog(replace(pair, against="simulation"), log.whiten)
+    simulated = WhitenedLog(replace(pair, band_hz=None), log.whiten)
     blocks = scatter([simulated], replace(found, logs=(simulated,)), "all", BLOCK_S).std["gyro_scale"]
     assert (diluted < -5.0 * blocks).all()  # there is no scale
     assert (np.abs(diluted) < 1.5 * stated).all()
