@@ -95,9 +95,9 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 
 
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
-    """The recording aligned with the simulation, or each interval of it with its own poses."""
+    """Each interval of the recording that the simulation, or its own poses, cover without a hole."""
     if sim is not None:
-        yield with_simulation(real, sim, _shared_band_hz(real, sim, settings.reference), settings)
+        yield from with_simulation(real, sim, _shared_band_hz(real, sim, settings.reference), settings)
         return
     if not real.truths:
         raise real.no_truth("no simulation and no true poses", "`sim`, or poses in the log")
