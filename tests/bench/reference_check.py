@@ -19,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.signal import butter, sosfiltfilt
@@ -41,7 +42,7 @@ SLOW_HZ, FAST_HZ = 0.3, 4.0
 END_S = 3.0  # left out at either end, where a filter that runs both ways has not settled
 WINDOW_S = 8.0
 LAG_BANDS_HZ = ((0.3, 0.6), (0.6, 1.0), (1.0, 1.5), (1.5, 2.5))
-ARM_BANDS_HZ = (3.0, 6.0, 25.0)
+ARM_BANDS_HZ = (3.0, 6.0, 15.0)
 
 Signal = Float64[np.ndarray, "n 3"]
 
@@ -102,13 +103,16 @@ def position_lags_s(pair: Pair) -> Iterator[tuple[float, float]]:
 
 
 def arms_mm(recording: Recording) -> Iterator[str]:
-    """Height of the lever arm as it is fitted up to some frequencies, beside what every unit has a little of."""
+    """Height of the lever arm as it is fitted up to some frequencies, whatever the poses know, and as far as they do.
+
+    It is fitted beside what every unit has a little of.
+    """
     settings = DiagnoseSettings()
     pairs = [without_unusable(pair, settings.reference) for pair in align(recording, None, None, settings)]
-    for most_hz in ARM_BANDS_HZ:
+    candidates, trusting = candidates_for(pairs), msgspec.structs.replace(settings.band, diluted_share=1.0)
+    for most_hz, band in (*((hz, trusting) for hz in ARM_BANDS_HZ), (np.inf, settings.band)):
         limited = [replace(pair, band_hz=min(pair.band_hz or most_hz, most_hz)) for pair in pairs]
-        candidates = candidates_for(limited)
-        logs = [whitened(pair, candidates, settings.band) for pair in limited]
+        logs = [whitened(pair, candidates, band) for pair in limited]
         left_in = (*EVERY_UNIT, "clock_wander", "reference_smoothing")
         chosen = tuple((one, one.null_value.astype(float)) for one in candidates if one.name in left_in)
         found = fit(logs, chosen, part="all")
@@ -152,6 +156,7 @@ def main() -> None:
     if options.by_frequency:
         head = ["log", *(f"positions late, {slow:g}–{fast:g} Hz (ms)" for slow, fast in LAG_BANDS_HZ)]
         head += [f"arm z up to {most_hz:g} Hz (mm)" for most_hz in ARM_BANDS_HZ]
+        head += ["as diagnosed"]
         print(markdown(head, (row_by_frequency(log, options.truth) for log in options.logs)))
         return
     head = ["log", "s", "turning, rms (mrad/s)", "gyro less poses (mrad/s)", "gyro scale x, y, z between (%)"]

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imutool.array_types import Float, Float64, Int64
-from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit, priors
-from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian
-from imutool.diagnosis.estimation.observability import WANDER, finer_curve, with_free
+from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit
+from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian, priors
+from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, finer_curve, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Stage, Theta
 
 RIDGE = 1e-9
@@ -22,7 +23,6 @@ FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
 CLOCK = "clock_skew", "clock_jump"
-REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
 KEPT = 2  # sets of derivatives: with an effect, and without it
 
 
@@ -153,13 +153,6 @@ class CandidateScore:
         return float(self.left - total + g_a @ solved[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
 
 
-def _exclude(a: Effect, b: Effect) -> bool:
-    """Whether two effects never act together: variants of one effect on one sensor, or one replaces the other."""
-    one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
-    variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
-    return a.key == b.key or variants or a.name in REPLACES.get(b.name, ()) or b.name in REPLACES.get(a.name, ())
-
-
 class Scored(NamedTuple):
     """Candidate with the log p-value of its best start, and the gain in squares."""
 
@@ -216,16 +209,15 @@ class Candidates:
         if self.score is None or self.score.now is not now:
             self.score, self.scores = CandidateScore(self.logs, now), {}
         derived = self._derived(now)
-        allowed = [effect for effect in candidates if not any(_exclude(effect, other) for other, _ in now.chosen)]
+        allowed = [effect for effect in candidates if not any(exclude_each_other(effect, other) for other, _ in now.chosen)]
+        self._derive(self.score, [effect for effect in allowed if effect.key not in {**derived, **self.scores}], derived)
         guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
         best, enough = list[Scored](), max(count or 0, 1)
         for guess, effect in sorted(guesses, key=lambda entry: entry[0]):
             if count is not None and len(best) >= enough and guess > min(UNSURE * best[enough - 1].log_p, UNLIKELY):
                 break
             if effect.key not in self.scores:
-                linear = [self.score.linear(effect, start) for start in self.starts[effect.key]]
-                derived[effect.key] = [each.short() for each in linear]
-                self.scores[effect.key] = self._best(self.score, effect, linear)
+                self._derive(self.score, [effect], derived)
             best = sorted([*best, self.scores[effect.key]], key=lambda entry: entry.log_p)
         return best
 
@@ -253,13 +245,22 @@ class Candidates:
         self.linear[filters] = derived
         return derived
 
+    def _derive(self, score: CandidateScore, effects: Sequence[Effect], derived: dict[str, list[_Linear]]) -> None:
+        """Derive candidates beside the fit, and score them; of the first stages, which take longest, each process gets half."""
+        slowest = sorted(effects, key=lambda effect: effect.stage)
+        order = [*slowest[::2], *slowest[1::2]]
+
+        def scored(effect: Effect) -> tuple[float, Theta, float, list[_Linear]]:
+            linear = [score.linear(effect, start) for start in self.starts[effect.key]]
+            best = self._best(score, effect, linear)
+            return best.log_p, best.start, best.gain, [each.short() for each in linear]
+
+        for effect, (log_p, start, gain, short) in zip(order, of_each(scored, order), strict=True):
+            derived[effect.key], self.scores[effect.key] = short, Scored(log_p, effect, start, gain)
+
     def _guess(self, score: CandidateScore, effect: Effect, derived: Mapping[str, Sequence[_Linear]]) -> Scored:
-        """Score with derivatives beside an earlier fit; the best of all without any."""
-        if effect.key in self.scores:
-            return self.scores[effect.key]
-        if effect.key not in derived:
-            return Scored(-np.inf, effect, self.starts[effect.key][0], np.inf)
-        return self._best(score, effect, derived[effect.key])
+        """Score with derivatives beside an earlier fit."""
+        return self.scores[effect.key] if effect.key in self.scores else self._best(score, effect, derived[effect.key])
 
     def _best(self, score: CandidateScore, effect: Effect, linear: Sequence[_Linear]) -> Scored:
         gains = [(score.gain(effect, each), each.start) for each in linear]

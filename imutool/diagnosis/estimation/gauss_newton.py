@@ -17,22 +17,23 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, bound, free, step_of, with_value
+from imutool.diagnosis.estimation.jacobians import (
+    Chosen,
+    ForwardPass,
+    Jacobians,
+    bound,
+    free_of,
+    parameters_of,
+    priors,
+    step_of,
+    with_value,
+)
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import FitSettings
-from imutool.sensor.effect import Parameter, Theta
+from imutool.sensor.effect import Theta
 
+ONSET_TAKES = 4.0  # over the limit: an onset, which moves after the first step, takes most of some predictions (8 at most)
 _objective = attrgetter("objective")
-
-
-def parameters_of(chosen: Chosen) -> list[Parameter]:
-    """All parameters in order."""
-    return [parameter for effect, _ in chosen for parameter in effect.parameters]
-
-
-def free_of(chosen: Chosen) -> Theta:
-    """All free parameters in order."""
-    return np.concatenate([np.zeros(0), *(free(effect, theta) for effect, theta in chosen)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,20 +103,6 @@ class Fit:
         return out
 
 
-def priors(begun: Chosen, settings: FitSettings) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
-    """Prior mean and standard deviation of the free parameters.
-
-    The mean is the null value, or the start where the null value is infinite or the parameter positive.
-    """
-    mean, std = [], []
-    for parameter, x in zip(parameters_of(begun), free_of(begun), strict=True):
-        at_start = parameter.positive or not np.isfinite(parameter.null_value)
-        mean.append(x if at_start else parameter.null_value)
-        free_std = settings.prior_std * parameter.plausible
-        std.append(settings.log_prior_std if parameter.positive else free_std)
-    return np.array(mean), np.array(std)
-
-
 def fit(
     logs: Sequence[WhitenedLog],
     begun: Chosen,
@@ -127,7 +114,8 @@ def fit(
     """Fit effects together from where they begin, and a bias for each log.
 
     `near` is a fit of the same logs: its forward passes and the Jacobians of the effects that both share serve for the first
-    step. A fit whose objective is not below `give_up_above` after a few steps goes no further.
+    step. A fit whose objective is not below `give_up_above` after a few steps goes no further, nor does one that only leaves
+    effects out of `near` and whose first step predicts no less: the others hardly move.
     """
     problem = _Problem(logs, begun, part)
     iterations = problem.settings.iterations if iterations is None else iterations
@@ -175,8 +163,8 @@ class _Problem:
                 total += float(r @ r + (b / prior) ** 2)
         return _State(chosen, passes, residuals, bias, total)
 
-    def step(self, jacobians: Jacobians, now: _State) -> Theta:
-        """Gauss-Newton step of the free parameters.
+    def step(self, jacobians: Jacobians, now: _State) -> tuple[Theta, float]:
+        """Gauss-Newton step of the free parameters, and the squares that the whole step should gain.
 
         No positive parameter changes by more than a factor of e; onsets stay.
         """
@@ -188,9 +176,9 @@ class _Problem:
         moves = np.concatenate([~begins, np.ones(len(g) - len(begins), bool)])
         delta = np.zeros(len(g))
         delta[moves] = np.linalg.solve(N[np.ix_(moves, moves)], g[moves])
-        delta = delta[: len(begins)]
+        gain, delta = float(g @ delta), delta[: len(begins)]
         positive = np.array([parameter.positive for parameter in parameters])
-        return delta / max(1.0, float(np.abs(delta[positive]).max(initial=0.0)))
+        return delta / max(1.0, float(np.abs(delta[positive]).max(initial=0.0))), gain
 
     def as_predicted(self, jacobians: Jacobians, before: _State, after: _State, step: Theta) -> bool:
         """Whether a step changed the residuals as the Jacobians predict, so that they are kept."""
@@ -207,14 +195,17 @@ class _Problem:
 def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
     """State after Gauss-Newton steps, each shortened until the objective falls."""
     settings = problem.settings
-    steps, kept = 0, None if near is None or not len(problem.mean) else near.jacobians
+    steps, kept = 0, None if near is None or not len(problem.mean) or not iterations else near.jacobians
     whiteners = [log.whiten for log in problem.logs]
+    hopeless = np.inf if near is None else _hopeless(now.chosen, near, give_up_above)
     while len(problem.mean) and steps < iterations:
         before = now.objective
         for moved in _onsets(problem, now) if steps else ():  # where it begins is best known until all else has moved once
             now = min(now, problem.state(moved, now), key=_objective)
         jacobians = Jacobians(whiteners, now.passes, now.chosen, kept)
-        x, whole = free_of(now.chosen), problem.step(jacobians, now)
+        x, (whole, gain) = free_of(now.chosen), problem.step(jacobians, now)
+        if not steps and before - gain >= hopeless:
+            break
         tries = (
             (step, problem.state(_bound(now.chosen, x + step), now))
             for step in (whole * 0.5**k for k in range(settings.backtracks))
@@ -232,6 +223,15 @@ def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None
             break
         kept = jacobians if predicted else jacobians.linear()
     return now
+
+
+def _hopeless(begun: Chosen, near: Fit, give_up_above: float) -> float:
+    """Objective from which on a fit that only leaves effects out of `near` gives up, if its first step predicts so much."""
+    known = {id(effect) for effect, _ in near.chosen}
+    if any(effect.jumps or id(effect) not in known for effect, _ in begun):
+        return np.inf
+    begins = any(parameter.begins for parameter in parameters_of(begun))
+    return near.objective + (give_up_above - near.objective) * (ONSET_TAKES if begins else 1.0)
 
 
 def _polished(problem: _Problem, now: _State) -> _State:

@@ -17,6 +17,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog
 from imutool.diagnosis.estimation.whitening import Whitener
+from imutool.diagnosis.settings import FitSettings
 from imutool.sensor.effect import Effect, Parameter, SignalState, Stage, Theta, in_stage_order, stage_order
 from imutool.sensor.samples import SensorSamples
 
@@ -139,6 +140,30 @@ def step_of(parameter: Parameter) -> float:
     if parameter.step is not None:
         return parameter.step
     return LOG_STEP if parameter.positive else STEP * parameter.plausible
+
+
+def parameters_of(chosen: Chosen) -> list[Parameter]:
+    """All parameters in order."""
+    return [parameter for effect, _ in chosen for parameter in effect.parameters]
+
+
+def free_of(chosen: Chosen) -> Theta:
+    """All free parameters in order."""
+    return np.concatenate([np.zeros(0), *(free(effect, theta) for effect, theta in chosen)])
+
+
+def priors(begun: Chosen, settings: FitSettings) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
+    """Prior mean and standard deviation of the free parameters.
+
+    The mean is the null value, or the start where the null value is infinite or the parameter positive.
+    """
+    mean, std = [], []
+    for parameter, x in zip(parameters_of(begun), free_of(begun), strict=True):
+        at_start = parameter.positive or not np.isfinite(parameter.null_value)
+        mean.append(x if at_start else parameter.null_value)
+        free_std = settings.prior_std * parameter.plausible
+        std.append(settings.log_prior_std if parameter.positive else free_std)
+    return np.array(mean), np.array(std)
 
 
 class EffectJacobian(NamedTuple):

@@ -66,8 +66,7 @@ def select_effects(
     Groups of `later` are tried in turn, once the candidates before explain nothing more. Effects of `always` are in every fit
     and are no findings. `progress` is called with what is being tried.
     """
-    unnamed = tuple(effect for group in later for effect in group)
-    settings = logs[0].pair.settings.search
+    unnamed, settings = tuple(effect for group in later for effect in group), logs[0].pair.settings.search
     start = fit(logs, always)
     known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
@@ -225,19 +224,17 @@ class _Search:
 
     def tested(self, now: Fit) -> Selection:
         """Selection of the effects that pass on all rows and on held-out blocks."""
-        first = len(self.always)
-        while len(now.chosen) > first:
+        while len(now.chosen) > (first := len(self.always)):
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
             unseen = Forked(partial(first_refuted, now, first))
             whole = fit(self.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
-                unseen.end()
                 now = fit(self.logs, reduced)
+                unseen.end()
                 continue
-            refuted, verdicts = unseen.result(), list[SelectedEffect]()
-            if refuted > first:
-                whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
-                verdicts = self._verdicts(whole, range(first, refuted))
+            whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            verdicts = self._verdicts(whole, first, unseen)
+            unseen.end()
             rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
             worst = max(range(len(rates)), key=lambda k: rates[k])
             if rates[worst] <= self.settings.false_discovery_rate:
@@ -263,12 +260,14 @@ class _Search:
                     found.setdefault(effect.name, trial)
         return found
 
-    def _verdicts(self, whole: Fit, passed: range) -> list[SelectedEffect]:
-        """Verdicts on effects that passed on unseen time, up to the first that goes, with no trust in model errors."""
+    def _verdicts(self, whole: Fit, first: int, unseen: Forked[int]) -> list[SelectedEffect]:
+        """Verdicts on effects that pass on unseen time too, up to the first that goes, with no trust in model errors."""
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
-        denoised = any(log.pair.denoised for log in self.logs)
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
         scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
+        if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
+            return verdicts
+        passed = range(first, unseen.result())
         for k, gain in zip(passed, of_each(partial(gain_of, whole), passed), strict=True):
             verdict = self._verdict(k, gain, whole, scattered)
             if verdict is None:
@@ -279,6 +278,7 @@ class _Search:
 
         def hidden(iterations: int | None) -> frozenset[str]:
             more = {key: gain_of(whole, k, iterations) for key, k in left.items()} if FOLLOWING & gains.keys() else {}
+            denoised = any(log.pair.denoised for log in self.logs)
             return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
 
         below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start

@@ -19,10 +19,12 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
+from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect
 
 RIDGE = 1e-8
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
+Axes = Float64[np.ndarray, " _"]
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
 
@@ -31,14 +33,10 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     if pair.exact:
         return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, pair.settings.noise))
     assert pair.band_hz is not None
-    columns, misfit = _rich(pair, candidates), pair.real - expected(pair, ())
-    whiten, residual = _in_band(pair, columns, misfit, pair.band_hz)
-    assert whiten.band is not None
-    rate_hz = 1.0 / (pair.period_s * whiten.every)
-    band_hz = known_band_hz(whiten.band(pair.real), residual, rate_hz, pair.band_hz, settings)
-    if band_hz < pair.band_hz:
-        pair = replace(pair, band_hz=band_hz)
-        whiten, _ = _in_band(pair, columns, misfit, band_hz)
+    ideal, works = expected(pair, ()), pair.axes
+    band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)
+    pair = replace(pair, band_hz=band_hz)
+    whiten = _in_band(pair, _rich(pair, candidates), pair.real - ideal, band_hz)
     return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
 
 
@@ -49,8 +47,8 @@ def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
 
 def _in_band(
     pair: Pair, wide: Sequence[Float64[np.ndarray, "_ _"]], wide_misfit: Float64[np.ndarray, "n 6"], band_hz: float
-) -> tuple[Whitener, Float64[np.ndarray, "m 6"]]:
-    """The noise of rows up to a frequency, and the residual of a rich model there."""
+) -> Whitener:
+    """The noise of rows up to a frequency, from the residual of a rich model there."""
     band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
     columns, misfit = [band.rows(rows) for rows in wide], band(wide_misfit)
     usable = pair.usable[:: band.every]
@@ -66,7 +64,7 @@ def _in_band(
         whiten = whitener(residual, usable, pair.settings.noise.order)
         count = np.maximum(usable.sum(axis=0), 1.0)  # the noise before so many parameters were fitted to it
         whiten = Whitener(whiten.filters, whiten.std * np.sqrt(count / np.maximum(count - fitted, 0.5 * count)))
-    return Whitener(whiten.filters, whiten.std, band), residual
+    return Whitener(whiten.filters, whiten.std, band)
 
 
 def limited_to_quiet_axes(whiten: Whitener, most: float) -> Whitener:
@@ -119,13 +117,16 @@ def _rich(pair: Pair, candidates: Sequence[Effect]) -> list[Float64[np.ndarray, 
     """Design columns by axis: a constant, and derivatives where fits begin."""
     columns = [[np.ones(len(pair.real))] for _ in range(6)]
     ideal = ForwardPass(pair, ())
-    for effect in candidates:
+
+    def rows(effect: Effect) -> list[tuple[int, int, Float64[np.ndarray, " n"]]]:
         passes = [ideal]
         if effect.starts is not None and not effect.linear:
             passes = [ForwardPass(pair, ((effect, start),), ideal) for start in pair.starts(effect)] or passes
-        for forward in passes:
-            for axis, _, row in forward.derivatives(effect, onsets=False):
-                columns[axis].append(row)
+        return [row for forward in passes for row in forward.derivatives(effect, onsets=False)]
+
+    for found in of_each(rows, candidates):
+        for axis, _, row in found:
+            columns[axis].append(row)
     return [np.stack(rows) for rows in columns]
 
 
@@ -139,8 +140,8 @@ def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tupl
 
 
 def known_band_hz(
-    real: Float64[np.ndarray, "m 6"],
-    residual: Float64[np.ndarray, "m 6"],
+    real: Float64[np.ndarray, "n k"],
+    expectation: Float64[np.ndarray, "n k"],
     rate_hz: float,
     most_hz: float,
     settings: BandSettings,
@@ -149,27 +150,34 @@ def known_band_hz(
 
     An error of the expectation does two things together: the recording shares less of it (coherence), and follows it with a
     gain that is too small by as much (regression dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7: gain = true gain
-    x reliability), which passes for a scale. Noise of the sensor lowers the coherence alone, a slow sensor the gain alone.
-    The standard deviation of the gain is Bendat and Piersol's (Random Data, 4th ed., eq. 9.89).
+    x reliability). Noise of the sensor lowers the coherence alone, a slow sensor the gain alone. A scale is the same at every
+    frequency, so the gain is compared with that of slower motion. No model of the sensor is fitted first, for it would fit
+    these errors: a scale takes the dilution, and a lever arm the motion that the poses lack.
 
-    `residual` is that of a rich model of the sensor; the rest of the recording `real` is the expectation.
+    The standard deviation of the gain is Bendat and Piersol's (Random Data, 4th ed., eq. 9.89).
     """
-    expectation, size = real - residual, min(int(settings.segment_s * rate_hz), len(residual))
+    size = min(int(settings.segment_s * rate_hz), len(real))
     f_hz, power = welch(expectation, rate_hz, nperseg=size, axis=0)
     _, recorded = welch(real, rate_hz, nperseg=size, axis=0)
     _, cross = csd(expectation, real, rate_hz, nperseg=size, axis=0)
-    duration_s = len(residual) / rate_hz
-    for low, high in pairwise(EDGES_HZ):
-        if low >= most_hz:
-            break
+    moves = power.any(axis=0) & recorded.any(axis=0)
+    duration_s = len(real) / rate_hz
+
+    def follows(low: float, high: float) -> Float64[np.ndarray, "3 _"]:
+        """Gain, its relative standard deviation, and coherence, by axis."""
         band = (f_hz >= low) & (f_hz < high)
-        for axis in range(real.shape[1]):  # a lively axis must not hide a quiet one, which follows poorly
-            e, r, x = (float(abs(density[band, axis].sum())) for density in (power, recorded, cross))
-            if not e * r:  # an axis that never moves
-                continue
-            gain, coherence = x / e, min(1.0, x * x / (e * r))
-            std = np.sqrt((1.0 - coherence) / (2.0 * duration_s * (high - low))) * np.sqrt(r / e)
-            diluted = min(1.0 - gain - settings.sigma * std, 1.0 - coherence) > settings.diluted_share
-            if low >= settings.least_hz and diluted:
-                return low
+        e, r, x = (np.abs(density[band][:, moves].sum(axis=0)) for density in (power, recorded, cross))
+        coherence = np.minimum(1.0, x**2 / (e * r))
+        return np.stack([x / e, np.sqrt((1.0 / coherence - 1.0) / (2.0 * duration_s * (high - low))), coherence])
+
+    def is_diluted(gain: Axes, std: Axes, coherence: Axes) -> Bool[np.ndarray, " _"]:
+        lost = 1.0 - gain * (1.0 + settings.sigma * std)
+        return np.asarray(np.minimum(lost, 1.0 - coherence) > settings.diluted_share)
+
+    known = ~is_diluted(*follows(EDGES_HZ[0], settings.least_hz))  # no band helps an axis whose slow motion is not known
+    for low, high in pairwise([*(hz for hz in EDGES_HZ if hz + 1.0 / settings.segment_s <= most_hz), most_hz]):
+        if low >= settings.least_hz:
+            (slow, slow_std, _), (fast, fast_std, coherence) = follows(EDGES_HZ[0], low), follows(low, high)
+            if (known & is_diluted(fast / slow, np.hypot(slow_std, fast_std), coherence)).any():
+                return low  # a lively axis must not hide a quiet one
     return most_hz

@@ -29,6 +29,7 @@ STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
 UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
 CLOCKS = (*STEADY, WANDER)
 FILTERS = ("low_pass", "mount_resonance")
+REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 
 
@@ -226,6 +227,16 @@ def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, d
         for key, gain in gains.items()
         if key in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
     )
+
+
+def exclude_each_other(a: Effect, b: Effect) -> bool:
+    """Whether two effects never act together.
+
+    Variants of one effect on one sensor do not, nor what replaces another.
+    """
+    one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
+    variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
+    return a.key == b.key or variants or a.name in REPLACES.get(b.name, ()) or b.name in REPLACES.get(a.name, ())
 
 
 def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:

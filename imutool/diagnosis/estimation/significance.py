@@ -21,8 +21,8 @@ from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit, parameters_of, priors
-from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, with_value
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, parameters_of, priors, with_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.gauss_newton import ONSET_TAKES, Fit, fit
 from imutool.diagnosis.estimation.jacobians import Jacobians, bound, expected, free
 from imutool.diagnosis.settings import DiagnoseSettings, FitSettings
 from imutool.sensor import catalogue
@@ -204,3 +204,26 @@ def test_a_fit_that_falls_short_of_what_was_hoped_for_goes_no_further() -> None:
     assert whole.objective < short.objective - 1.0
     np.testing.assert_array_equal(fit([log], begun, give_up_above=0.0).chosen[0][1], short.chosen[0][1])
     np.testing.assert_array_equal(fit([log], begun, give_up_above=np.inf).chosen[0][1], whole.chosen[0][1])
+
+
+def test_a_fit_that_leaves_an_effect_out_gives_up_before_its_first_step_where_that_foretells_too_much() -> None:
+    log = planted.weighed(planted.pair(planted.rich(4), {"gyro_scale": [0.02, -0.03, 0.01], "lever_arm": [0.2, -0.05, 0.1]}, 4))
+    now = fit([log], planted.acting({"gyro_scale": [0.0] * 3, "lever_arm": [0.0] * 3}))
+    begun = now.chosen[1:]
+    without = fit([log], begun, near=now)
+    at_once = fit([log], begun, near=now, give_up_above=0.5 * (now.objective + without.objective))
+    np.testing.assert_array_equal(at_once.chosen[0][1], begun[0][1])  # no step was taken
+    assert at_once.objective >= without.objective > now.objective
+    hoped = fit([log], begun, near=now, give_up_above=without.objective + 1.0)  # less than this is foretold
+    np.testing.assert_array_equal(hoped.chosen[0][1], without.chosen[0][1])
+
+
+def test_of_an_onset_which_moves_later_a_first_step_foretells_less() -> None:
+    truth = {"clock_jump": [25.0, 0.004], "gyro_scale": [0.02, -0.03, 0.01]}
+    log = planted.weighed(planted.pair(planted.rich(4), truth, 4))
+    now = fit([log], planted.acting(truth))
+    without = fit([log], now.chosen[:1], near=now)
+    gain = without.objective - now.objective
+    for share, stepped in ((0.5, True), (0.5 / ONSET_TAKES, False)):
+        limited = fit([log], now.chosen[:1], near=now, give_up_above=now.objective + share * gain)
+        assert (limited.objective <= without.objective + 1.0) == stepped

@@ -20,6 +20,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
+from imutool.processes.forked import Forked
 from imutool.sensor.effects import clock_wander
 
 SURE = 4.0
@@ -178,10 +179,26 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
     monkeypatch.setattr(model_selection, "gain_of", recorded)
     known = Candidates([log], candidates)
     search = model_selection._Search([log], candidates, (), (), 0.0, settings, lambda word: None, known)
-    offset, *_ = search._verdicts(now, range(1))
+    offset, *_ = search._verdicts(now, 0, Forked(lambda: 1))
     assert (offset.false_discovery_rate == 1.0) == (model_error == 0.5)
-    assert asked_of == [(0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
+    assert asked_of == [(0, 1), (0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
     assert all(gain_of(now, k) <= gain_of(now, k, 0) for k in range(3))
+
+
+def test_unseen_time_is_not_waited_for_where_chance_explains_the_first_effect() -> None:
+    truth = {"gyro_scale": [0.02, 0.0, 0.01]}
+    log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
+    candidates, settings = planted.catalogue(), log.pair.settings.search
+    known = Candidates([log], candidates)
+    search = model_selection._Search([log], candidates, (), (), 0.0, settings, lambda word: None, known)
+
+    def unseen() -> int:
+        raise AssertionError("nobody needs it")
+
+    chance = fit([log], planted.acting({"accel_scale": [0.0] * 3, **truth}), part="all")
+    assert search._verdicts(chance, 0, Forked(unseen)) == []
+    with pytest.raises(AssertionError, match="nobody needs it"):
+        search._verdicts(fit([log], planted.acting(truth), part="all"), 0, Forked(unseen))
 
 
 # ── one, two ──
