@@ -115,7 +115,7 @@ def follows_in_slow_motion(seed: int) -> Pair:
     lost = np.zeros((len(felt.t_s), 6))
     lost[:, 3:] = np.cross(alpha, [0.0, 0.0, 0.02])
     known = replace(felt, accel=felt.accel + 0.15 * noise)
-    return replace(planted.pair(felt, added=lost), ideal=known, against="true poses", band_hz=12.0)
+    return replace(planted.pair(felt, added=lost), ideal=known, band_hz=12.0)
 
 
 def fast(seed: int, count: int) -> np.ndarray:
