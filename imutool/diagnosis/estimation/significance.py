@@ -89,7 +89,7 @@ def first_refuted(fitted: Fit, first: int) -> int:
 
 
 def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
-    """p-value of the held-out improvement under H0, by Student's t or by ranks, which one outlier does not decide."""
+    """p-value of the held-out improvement under H0, by Student's t or by robust ranks."""
     if len(gained) < 3 or not gained.std():
         return 1.0
     z = gained.mean() / (gained.std(ddof=1) / np.sqrt(len(gained)))
