@@ -95,7 +95,7 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 
 
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
-    """Each interval of the recording that the simulation, or its own poses, cover without a hole."""
+    """Intervals of the recording that the simulation or its own poses cover without a hole."""
     if sim is not None:
         yield from with_simulation(real, sim, _shared_band_hz(real, sim, settings.reference), settings)
         return
