@@ -150,17 +150,34 @@ for cell in json.load(open(sys.argv[1], encoding="utf-8"))["cells"]:
 """
 
 
-def test_a_notebook_shows_the_viewer_and_the_page(tmp_path: Path, logs: Path) -> None:
-    """Its cells are run one after the other as a notebook's server runs them; what a browser makes of it is not seen here."""
-    shutil.copy(logs / "flight_1.mcap", tmp_path / "log.mcap")
-    line = [sys.executable, "-c", CELLS, str(EXAMPLES / "notebook.ipynb")]
-    env = {**os.environ, "IPYTHONDIR": str(tmp_path / "ipython")}
-    done = subprocess.run(line, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=240, check=False)
+def run_cells(name: str, folder: Path) -> str:
+    """What the cells of a notebook print, run one after the other as a server runs them; no browser sees it."""
+    line = [sys.executable, "-c", CELLS, str(EXAMPLES / name)]
+    env = {**os.environ, "IPYTHONDIR": str(folder / "ipython"), "MPLBACKEND": "agg"}
+    done = subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert re.findall(r"^SHOWN (\w+)", done.stdout, re.MULTILINE) == ["NoneType", "NoneType", "Viewer", "Page"]
-    assert re.search(r"aoe_deg +[\d.]+ +[\d.]+", done.stdout)
-    notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text(encoding="utf-8"))
+    notebook = json.loads((EXAMPLES / name).read_text(encoding="utf-8"))
     assert not any(cell.get("outputs") for cell in notebook["cells"])  # what was seen on one machine is no part of it
+    return done.stdout
+
+
+def test_a_notebook_shows_the_viewer_and_the_page(tmp_path: Path, logs: Path) -> None:
+    shutil.copy(logs / "flight_1.mcap", tmp_path / "log.mcap")
+    printed = run_cells("notebook.ipynb", tmp_path)
+    assert re.findall(r"^SHOWN (\w+)", printed, re.MULTILINE) == ["NoneType", "NoneType", "Viewer", "Page"]
+    assert re.search(r"aoe_deg +[\d.]+ +[\d.]+", printed)
+
+
+def test_a_notebook_leads_from_a_wrong_simulation_of_a_real_recording_to_a_right_one(tmp_path: Path, data: Path) -> None:
+    """The scales it finds are those that the authors of the data set published, and the simulation comes five times closer."""
+    (tmp_path / "dataset-room1.tar.gz").symlink_to(data / "tumvi" / "dataset-room1.tar.gz")
+    done = run_cells("simulation_to_recording.ipynb", tmp_path)
+    scales = re.findall(r"^[xyz]: found +([-\d.]+) ± [\d.]+ %, published +([-\d.]+) %$", done, re.MULTILINE)
+    assert len(scales) == 3
+    assert all(float(own) == pytest.approx(float(published), abs=0.5) for own, published in scales)
+    before, after = (float(angle) for angle in re.findall(r"([\d.]+)° in the median", done))
+    assert after < before / 5.0
+    assert re.search(r"^accel_scale +accel +removes +\d+%$", done, re.MULTILINE)
 
 
 def test_every_example_is_run_here() -> None:

@@ -35,6 +35,7 @@ from imutool.diagnosis.reference_coverage import (
     align_all,
     check_without_reference,
     is_another_motion,
+    own_poses_sentence,
     with_unique_names,
     without_unusable,
 )
@@ -141,8 +142,10 @@ def _beside_reference(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     diagnosis = replace(diagnosis, findings=summarize.with_similar(diagnosis.findings, selection, similar.result()))
-    caveat = reference_caveat(recordings) if simulated is None else ""
-    remarks = (*another, *left_out, *diagnosis.remarks, *dict.fromkeys(told))
+    poses = any(not pair.exact for pair in pairs)
+    caveat = reference_caveat(recordings) if poses else ""
+    follows = [own_poses_sentence(pairs)] if poses and simulated is not None else []
+    remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
     diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
@@ -210,7 +213,7 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     def thinkable(effect: Effect) -> bool:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in effect.needs)
 
-    exact = all(pair.against == "simulation" for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
+    exact = all(pair.exact for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     left_out = {*SHOWN_BY_SAMPLES, *([clock_wander.EFFECT.name] if exact else ())}  # one clock cannot wander against itself
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
     effects = _until_the_end(effects, pairs)

@@ -226,11 +226,13 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
         on_its_clock = [_on_clock_of(one, motion.start_ns, log.pair) for one in ideals]
         plain, simulated = (_read(log.pair, on_its_clock, effects) for effects in ((), acting))
         finite = np.isfinite(plain).all(axis=1) & np.isfinite(simulated).all(axis=1)
+        given = expected(log.pair, ())
+        plain, simulated = (np.where(finite[:, None], read, given) for read in (plain, simulated))  # a filter spreads NaN
         pair = replace(log.pair, fitted=log.pair.fitted & finite, held_out=log.pair.held_out & finite)
         if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():
             raise DataError("its poses cover too little of the recording", where=sim.name)
         covered.append(WhitenedImu(pair, log.whiten))
-        before.append(with_constant(pair, expected(pair, ())))
+        before.append(with_constant(pair, given))
         after.append(with_constant(pair, simulated))
         _refuse_unlike(covered[-1], before[-1], with_constant(pair, plain), sim)
     return {
@@ -263,7 +265,8 @@ def _refuse_unlike(
     Raises:
         DataError: so it is here.
     """
-    rows = log.pair.held_out
-    off = np.sqrt(((given - plain)[rows] ** 2).mean(axis=0))
-    if (off > AS_GOOD * noise_floor([log])).any():
+    rows, off = log.pair.held_out[:: log.whiten.every], given - plain
+    if log.whiten.band is not None:
+        off = log.whiten.band(off)
+    if (np.sqrt((off[rows] ** 2).mean(axis=0)) > AS_GOOD * noise_floor([log])).any():
         raise DataError("a simulation along its poses is not the simulation that was given", where=sim.name)

@@ -38,11 +38,11 @@ def imu_relation(first: Recording, other: Recording, effects: Sequence[str], set
     R = Rotation.identity() if len(t_ns) < 2 else Rotation.align_vectors(_vectors(b, t_ns), _vectors(a, t_ns))[0]
     back = R.inv().as_matrix()
     turned = replace(first, imu=replace(a, gyro=a.gyro @ back, accel=a.accel @ back), truths={})
-    pair = with_simulation(replace(other, truths={}), turned, settings)
+    pairs = with_simulation(replace(other, truths={}), turned, settings=settings)
     chosen = tuple((effect, effect.null_value.astype(float)) for effect in catalogue.diagnosed(effects))
-    log = whitened(pair, [effect for effect, _ in chosen], settings.band)
-    fitted = fit([log], chosen, part="all")
-    stds = scatter([log], fitted, "all", settings.search.robust_block_s).std
+    logs = [whitened(pair, [effect for effect, _ in chosen], settings.band) for pair in pairs]
+    fitted = fit(logs, chosen, part="all")
+    stds = scatter(logs, fitted, "all", settings.search.robust_block_s).std
     theta = {effect.name: values for effect, values in fitted.chosen}
     phi, arm = theta["mount_rotation"], theta["lever_arm"]
 

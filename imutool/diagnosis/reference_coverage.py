@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -19,10 +20,12 @@ from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.samples import IdealMotion
-from imutool.sensor.trajectory import smooth_motion
+from imutool.sensor.simulate import MOTION_TOPIC
+from imutool.sensor.trajectory import Stretch, smooth_motion
 from imutool.units import AXES, SENSORS, UNITS
 
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
+COPIED = 0.5  # of a simulation's poses that the recording has, too, from which it follows them
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 
@@ -92,9 +95,9 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 
 
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
-    """The recording aligned with the simulation, or each interval of it with its own poses."""
+    """Intervals of the recording that the simulation or its own poses cover without a hole."""
     if sim is not None:
-        yield with_simulation(real, sim, settings)
+        yield from with_simulation(real, sim, _shared_band_hz(real, sim, settings.reference), settings)
         return
     if not real.truths:
         raise real.no_truth("no simulation and no true poses", "`sim`, or poses in the log")
@@ -112,8 +115,34 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
         stretch = next(part for part in motion.stretches if part.start_s <= ideal.t_s[0] <= part.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
         since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
-        band_hz = max(settings.reference.band_share * min(stretch.cutoff_hz), settings.reference.least_band_hz)
-        yield with_truth(chosen, since, started_ns, band_hz, settings)
+        yield with_truth(chosen, since, started_ns, _band_hz(stretch, settings.reference), settings)
+
+
+def _shared_band_hz(real: Recording, sim: Recording, settings: ReferenceSettings) -> float | None:
+    """Band of the poses that a simulation follows, if they are the recording's own and were measured; else none.
+
+    Such a simulation shares the errors of the poses, and is no better a reference than they are.
+    """
+    if MOTION_TOPIC in real.truths:  # itself simulated, from exactly this motion
+        return None
+    for poses, other in product(real.truths.values(), sim.truths.values()):
+        _, mine, theirs = np.intersect1d(poses.t_ns, other.t_ns, return_indices=True)
+        if len(mine) > COPIED * len(other.t_ns) and np.array_equal(poses.p_wb[mine], other.p_wb[theirs]):
+            stretches = [stretch for stretch in smooth_motion(poses).stretches if stretch.measured]
+            return min((_band_hz(stretch, settings) for stretch in stretches), default=None)
+    return None
+
+
+def _band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
+    return max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz)
+
+
+def own_poses_sentence(pairs: Sequence[Pair]) -> str:
+    """Remark on a simulation along the recording's own poses."""
+    band_hz = min(pair.band_hz for pair in pairs if pair.band_hz is not None)
+    return (
+        f"The simulation follows the recording's own poses, and is compared as far as they are trusted, up to {band_hz:.2g} Hz"
+    )
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:

@@ -249,8 +249,8 @@ class Diagnosis:
     unexplained: Mapping[str, Unexplained]
     remarks: tuple[str, ...] = ()
     closer: Mapping[str, Closer] = field(default_factory=dict)  # by signal
-    traces: tuple[Traces, ...] = ()
-    signals: Mapping[str, SignalTraces] = field(default_factory=dict)  # by TOPIC.field
+    traces: tuple[Traces, ...] = field(default=(), repr=False)
+    signals: Mapping[str, SignalTraces] = field(default_factory=dict, repr=False)  # by TOPIC.field
     caveat: str = ""
     closed: ClosedLoop | None = None
     imus: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)  # other IMUs of the log, by topic

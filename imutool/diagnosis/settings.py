@@ -97,6 +97,7 @@ class AlignmentSettings(Settings, frozen=True):
     """Alignment of two IMUs in time: by experience on blind cases and logs without an epoch."""
 
     least_s: Positive = 8.0  # of shared time: below, nothing can be fitted and tested
+    hole_s: Positive = 0.1  # without samples of a simulation, from which on it is not interpolated
     align_hz: Positive = 100.0  # of the clock on which angular rates are correlated
     farthest_s: Positive = 5.0  # by which clocks of one epoch may differ
     least_correlation: Share = 0.6  # of the angular rates, below which two motions differ
@@ -114,6 +115,7 @@ class SignalSettings(Settings, frozen=True):
     least_s: Positive = 15.0  # two blocks to fit and one to test
     least_samples: Count = 300  # of a spectrum
     oversampling: Positive = 4.0  # so that a straight line between fine samples is the signal
+    hole_s: Positive = 0.1  # without samples of a simulation, from which on it is not interpolated
     align_hz: Positive = 100.0  # of the clock on which recording and simulation are correlated
     least_correlation: Share = 0.3  # below which nothing says that the two are one motion
     noise_band: Share = 0.4  # of the rate: from here to `noise_band_end` a simulation's spectrum is its noise

@@ -63,7 +63,7 @@ def summarize(
     selection, named, idle = _worthwhile(logs, selection, noise)
     after = [with_effects(pair, selection.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     all_findings = list(named)
-    exact = all(pair.against == "simulation" for pair in pairs)
+    exact = all(pair.exact for pair in pairs)
     # digits are a sample's, and a row beside poses is the mean of many
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
     all_findings += (

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +50,8 @@ class Simulation:
     """Simulated recording, its smooth motion, settings and remarks."""
 
     recording: Recording
-    motion: SmoothMotion
-    settings: Mapping[str, Any]
+    motion: SmoothMotion = field(repr=False)
+    settings: Mapping[str, Any] = field(repr=False)
     remarks: tuple[str, ...]
 
     def plain(self) -> dict[str, Any]:

@@ -77,6 +77,11 @@ class Stretch:
         """Trusted time (s)."""
         return self.end_s - self.start_s
 
+    @property
+    def measured(self) -> bool:
+        """Whether poses have more noise than rounding."""
+        return bool(self.noise_m > LEAST_NOISE or self.noise_rad > 2.0 * LEAST_NOISE)
+
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotion:

@@ -56,7 +56,7 @@ def test_smoothed_poses_are_told_from_a_scale_by_the_frequency(scale: dict[str, 
     pair = planted.pair(felt, scale, 1)
     spread = SMOOTHED_S * felt.rate_hz
     gyro, accel = (gaussian_filter1d(column, spread, axis=0) for column in (felt.gyro, felt.accel))
-    beside = replace(pair, against="true poses", band_hz=7.0, ideal=replace(felt, gyro=gyro, accel=accel))
+    beside = replace(pair, band_hz=7.0, ideal=replace(felt, gyro=gyro, accel=accel))
     found = select_effects([planted.weighed(beside)], (*planted.catalogue(), SMOOTHED)).selected
     assert {one.effect.name for one in found} == {"reference_smoothing", *scale}
     told = {one.effect.name: one for one in found}
@@ -68,7 +68,7 @@ def test_smoothed_poses_are_told_from_a_scale_by_the_frequency(scale: dict[str, 
 
 
 def test_poses_as_they_are_have_no_smoothing() -> None:
-    pair = replace(planted.pair(planted.shaken(2, DURATION_S), {}, 1), against="true poses", band_hz=7.0)
+    pair = replace(planted.pair(planted.shaken(2, DURATION_S), {}, 1), band_hz=7.0)
     assert select_effects([planted.weighed(pair)], (*planted.catalogue(), SMOOTHED)).selected == ()
 
 

@@ -74,10 +74,10 @@ def test_of_many_findings_the_three_strongest_are_named() -> None:
     assert "driven by /motor.current (accel) and 2 smaller ones; together they remove" in said
 
 
-def test_poses_made_with_the_gyro_are_a_caveat_of_the_headline_and_of_no_simulation() -> None:
+def test_poses_made_with_the_gyro_are_a_caveat_of_the_headline() -> None:
     caveat = "its poses were estimated with this IMU, and hide errors of the gyro"
     assert headline(replace(diagnoses.BOTH, caveat=caveat)).endswith(f"; {caveat}.")
-    assert caveat not in headline(replace(diagnoses.LATE, caveat=caveat))
+    assert caveat not in headline(diagnoses.BOTH)
 
 
 def test_a_parameter_smaller_than_its_deviation_is_no_value() -> None:

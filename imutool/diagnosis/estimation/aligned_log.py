@@ -127,7 +127,6 @@ class Pair(AlignedLog):
 
     ideal: IdealMotion = field(kw_only=True)
     truth: Poses | None = field(default=None, kw_only=True)
-    against: str = field(default="simulation", kw_only=True)
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING, kw_only=True)
 
@@ -139,8 +138,8 @@ class Pair(AlignedLog):
 
     @property
     def exact(self) -> bool:
-        """Whether the expectation is a simulation."""
-        return self.against == "simulation"
+        """Whether the expectation is a simulation along other poses than the recording's own."""
+        return self.band_hz is None
 
     @property
     def denoised(self) -> bool:

@@ -70,22 +70,26 @@ def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:
 def first_refuted(fitted: Fit, first: int) -> int:
     """Index of the first effect that unseen blocks refute; the number of effects if none is.
 
-    Blocks that this fit has not seen, and those that a fit of the others has not.
+    Blocks that this fit has not seen, and those that a fit of the others has not. Beside poses effects without a name have to
+    stand together, too: two that cancel gain much beside each other.
     """
     other, exact = fit(fitted.logs, fitted.chosen, part="held_out", near=fitted), all(log.pair.exact for log in fitted.logs)
+    nameless = [k for k, (effect, _) in enumerate(fitted.chosen) if effect.kind != "catalogue" and not exact]
+
+    def p_value(left_out: Sequence[int]) -> float:
+        both = ((fitted, other), (other, fitted))
+        blocks = np.concatenate([held_out_gains(one, left_out, unseen.part) for one, unseen in both])
+        return min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if exact else 1.0)
+
     for k in range(first, len(fitted.chosen)):
-        blocks = np.concatenate([held_out_gains(fitted, k, other.part), held_out_gains(other, k, fitted.part)])
-        p_value = min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if exact else 1.0)
-        if p_value > fitted.logs[0].pair.settings.search.held_out_p_value:
+        tested = [[k], nameless] if k in nameless and len(nameless) > 1 else [[k]]
+        if max(map(p_value, tested)) > fitted.logs[0].pair.settings.search.held_out_p_value:
             return k
     return len(fitted.chosen)
 
 
 def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
-    """p-value of the held-out improvement under H0, by Student's t or by ranks.
-
-    One outlying block does not decide the ranks.
-    """
+    """p-value of the held-out improvement under H0, by Student's t or by robust ranks."""
     if len(gained) < 3 or not gained.std():
         return 1.0
     z = gained.mean() / (gained.std(ddof=1) / np.sqrt(len(gained)))
@@ -102,9 +106,9 @@ def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
     return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
 
 
-def held_out_gains(fitted: Fit, k: int, part: str) -> Float64[np.ndarray, "b 2"]:
-    """Gain in squares by an effect, and squares of its prediction, on held-out blocks."""
-    others, out = (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), []
+def held_out_gains(fitted: Fit, left_out: Sequence[int], part: str) -> Float64[np.ndarray, "b 2"]:
+    """Gain in squares by some effects, and squares of their prediction, on held-out blocks."""
+    others, out = tuple(one for k, one in enumerate(fitted.chosen) if k not in left_out), []
     block_s = fitted.logs[0].pair.settings.search.held_out_block_s
     for log, forward, residual in zip(fitted.logs, fitted.passes, fitted.residuals, strict=True):
         other = log.residual(ForwardPass(log.pair, others, forward).blocks, (forward.blocks, residual))

@@ -34,8 +34,12 @@ MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and powe
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
-def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT) -> Pair:
-    """Align a recording with a simulation of the same motion.
+def with_simulation(
+    real: Recording, sim: Recording, band_hz: float | None = None, settings: DiagnoseSettings = DEFAULT
+) -> list[Pair]:
+    """Align a recording with each stretch of a simulation of the same motion.
+
+    The simulation is true up to `band_hz`; none: throughout.
 
     Raises:
         DataError: the two share too little time, or are not of one motion.
@@ -49,11 +53,28 @@ def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings 
             fix="Leave --sim out to compare the recording with its own true poses",
         )
     start_ns = int(real.imu.t_ns[0])
-    t_sim = seconds(sim.imu.t_ns, start_ns) - shift_s  # on the recording's clock
     stamp_s = seconds(real.imu.t_ns, start_ns)
-    ideal, noise = _simulated(t_sim, sim, shift_s, start_ns, real, settings)
-    inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
-    return _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, settings)
+    found: list[tuple[IdealMotion, Float64[np.ndarray, "6"], Bool[np.ndarray, " n"]]] = []
+    for part in _stretches(sim, settings.alignment):
+        t_sim = seconds(part.imu.t_ns, start_ns) - shift_s  # on the recording's clock
+        ideal, noise = _simulated(t_sim, part, shift_s, start_ns, real, settings)
+        found.append((ideal, noise, (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])))
+    shared_s = [_shared_s(stamp_s, inside) for _, _, inside in found]
+    least_s = min(settings.alignment.least_s, max(shared_s))
+    return [
+        _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, band_hz, settings)
+        for (ideal, noise, inside), shared in zip(found, shared_s, strict=True)
+        if shared >= least_s
+    ]
+
+
+def _stretches(sim: Recording, settings: AlignmentSettings) -> list[Recording]:
+    """Stretches of a simulation between holes, those that are long enough; else the longest."""
+    t_ns = sim.imu.t_ns
+    holes = np.flatnonzero(np.diff(t_ns) > 1e9 * settings.hole_s)
+    parts = [sim.between(int(t_ns[a]), int(t_ns[b])) for a, b in zip([0, *(holes + 1)], [*holes, len(t_ns) - 1], strict=True)]
+    long = [part for part in parts if part.imu.duration_s >= settings.least_s]
+    return (long or [max(parts, key=lambda part: part.imu.duration_s)]) if len(holes) else [sim]
 
 
 def same_motion(real: Imu, sim: Imu, settings: AlignmentSettings = DEFAULT.alignment) -> bool:
@@ -74,8 +95,7 @@ def with_truth(
     stamp_s = seconds(real.imu.t_ns, start_ns)
     inside = (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])
     ideal = replace(ideal, channels=_channels(real, start_ns + np.round(ideal.t_s * 1e9).astype(np.int64)))
-    pair = _pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6), settings)
-    return replace(pair, band_hz=band_hz)
+    return _pair(real, ideal, stamp_s, inside, "true poses", 0.0, np.zeros(6), band_hz, settings)
 
 
 def _pair(
@@ -86,10 +106,10 @@ def _pair(
     against: str,
     aligned_s: float,
     sim_noise: Float64[np.ndarray, "6"],
+    band_hz: float | None,
     settings: DiagnoseSettings,
 ) -> Pair:
-    rows = np.flatnonzero(inside)
-    shared_s = float(stamp_s[rows[-1]] - stamp_s[rows[0]]) if len(rows) > 1 else 0.0
+    rows, shared_s = np.flatnonzero(inside), _shared_s(stamp_s, inside)
     least_s = settings.alignment.least_s
     if shared_s < least_s:
         raise DataError(
@@ -116,12 +136,17 @@ def _pair(
         ideal=ideal,
         truth=truth,
         aligned_s=aligned_s,
-        against=against,
+        band_hz=band_hz,
         start_ns=int(t_ns[0]),
         sim_noise=sim_noise,
         settings=settings,
         channels={name: values for name, values in _channels(real, t_ns).items() if np.ptp(values) > 0},
     )
+
+
+def _shared_s(stamp_s: Float64[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]) -> float:
+    shared = stamp_s[inside]
+    return float(shared[-1] - shared[0]) if len(shared) > 1 else 0.0
 
 
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:

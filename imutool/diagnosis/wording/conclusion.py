@@ -50,7 +50,7 @@ def headline(d: Diagnosis) -> str:
         parts += (
             [f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name"] if left else []
         )
-    if d.caveat and d.sim is None:
+    if d.caveat:
         parts.append(d.caveat)
     return f"{_upper('; '.join(parts))}." if parts else NULL
 

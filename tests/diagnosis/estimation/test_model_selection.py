@@ -353,7 +353,7 @@ def test_a_clock_wanders_beside_poses_only_where_offset_skew_and_jump_do_not_say
     duration_s = 90.0
     pair = planted.pair(planted.shaken(2, duration_s), {**truth, "gyro_scale": [0.02, -0.03, 0.01]}, 4)
     candidates = (*planted.catalogue(), clock_wander.until(duration_s))
-    found = select_effects([planted.weighed(replace(pair, against="true poses", band_hz=7.0))], candidates)
+    found = select_effects([planted.weighed(replace(pair, band_hz=7.0))], candidates)
     assert sorted(names(found)) == sorted([*truth, "gyro_scale"])
     for name, theta in truth.items():
         knots = len(clock_wander.until(duration_s).parameters)
@@ -372,12 +372,12 @@ def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
     found = asked(pair, beyond=False)
     assert names(found) == ["low_pass"]
     assert sure(found, "low_pass", [48.0])
-    assert names(asked(replace(pair, against="true poses", band_hz=7.0), beyond=False)) == ["clock_offset"]
+    assert names(asked(replace(pair, band_hz=7.0), beyond=False)) == ["clock_offset"]
 
 
 def test_a_low_pass_that_replaced_its_delay_beside_a_scale_gives_way_to_it_again() -> None:
     pair = planted.pair(planted.shaken(), {"low_pass": [20.0], "gyro_scale": [0.05, -0.05, 0.05]})
-    found = names(asked(replace(pair, against="true poses", band_hz=3.0), beyond=False))
+    found = names(asked(replace(pair, band_hz=3.0), beyond=False))
     assert sorted(found) == ["clock_offset", "gyro_scale"]
 
 

@@ -28,7 +28,7 @@ WITHOUT = planted.catalogue()
 
 def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarray | None = None) -> Pair:
     pair: Pair = planted.pair(FELT, effects, added=added)
-    return replace(pair, against="true poses", band_hz=BAND_HZ)
+    return replace(pair, band_hz=BAND_HZ)
 
 
 def noise(log: WhitenedImu) -> np.ndarray:
@@ -115,7 +115,7 @@ def follows_in_slow_motion(seed: int) -> Pair:
     lost = np.zeros((len(felt.t_s), 6))
     lost[:, 3:] = np.cross(alpha, [0.0, 0.0, 0.02])
     known = replace(felt, accel=felt.accel + 0.15 * noise)
-    return replace(planted.pair(felt, added=lost), ideal=known, against="true poses", band_hz=12.0)
+    return replace(planted.pair(felt, added=lost), ideal=known, band_hz=12.0)
 
 
 def fast(seed: int, count: int) -> np.ndarray:

@@ -115,6 +115,6 @@ def test_a_mount_beyond_the_poses_has_to_ring_in_the_samples(
 ) -> None:
     felt = planted.shaken(2)
     felt = replace(felt, accel=felt.accel + 0.05 * np.sin(2.0 * np.pi * RINGS[0] * felt.t_s)[:, None])
-    log = planted.weighed(replace(planted.pair(felt, real, 1), against="true poses", band_hz=band_hz))
+    log = planted.weighed(replace(planted.pair(felt, real, 1), band_hz=band_hz))
     ((effect, theta),) = planted.acting({"mount_resonance": RINGS})
     assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond

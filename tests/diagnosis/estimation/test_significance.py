@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 from support import planted
 
+from imutool.diagnosis.estimation import significance
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.significance import Scatter, log_p_value, scatter
+from imutool.diagnosis.estimation.significance import Scatter, first_refuted, log_p_value, scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
 FELT = planted.shaken(duration_s=45.0)
@@ -61,14 +64,37 @@ def test_noise_that_lasts_spreads_as_the_blocks_say_and_more_than_the_informatio
 
 def test_poses_that_err_make_a_scale_as_unsure_as_they_dilute_it() -> None:
     error = 0.2 * np.random.default_rng(3).normal(size=FELT.gyro.shape)  # rad/s, of the expectation
-    pair = replace(planted.pair(FELT), ideal=replace(FELT, gyro=FELT.gyro + error), against="poses")
+    pair = replace(planted.pair(FELT), ideal=replace(FELT, gyro=FELT.gyro + error), band_hz=40.0)
     log = WhitenedLog(pair, Whitener(np.ones((6, 1)), np.array([0.2] * 3 + [0.03] * 3)))
     found = fit([log], planted.acting({"gyro_scale": [0.0] * 3}), part="all")
     diluted, stated = found.chosen[0][1], scatter([log], found, "all", BLOCK_S).std["gyro_scale"]
-    simulated = WhitenedLog(replace(pair, against="simulation"), log.whiten)
+    simulated = WhitenedLog(replace(pair, band_hz=None), log.whiten)
     blocks = scatter([simulated], replace(found, logs=(simulated,)), "all", BLOCK_S).std["gyro_scale"]
     assert (diluted < -5.0 * blocks).all()  # there is no scale
     assert (np.abs(diluted) < 1.5 * stated).all()
+
+
+def test_beside_poses_effects_without_a_name_must_not_cancel_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each gains much beside the other, and both together lose; a named effect is no part of it."""
+    names = ("gyro_scale", "accel_scale", "gyro_quadratic")
+    pair = planted.pair(FELT)
+    beside = fit(
+        [planted.weighed(replace(pair, band_hz=7.0))], planted.acting({name: [0.0] * 3 for name in names}), part="fitted"
+    )
+    chosen = tuple(
+        (replace(effect, kind="catalogue" if effect.name == "gyro_scale" else "unknown"), x) for effect, x in beside.chosen
+    )
+    exact = replace(beside, chosen=chosen, logs=(planted.weighed(pair),))
+
+    def gains(now: Fit, left_out: Sequence[int], part: str) -> np.ndarray:
+        sign = -1.0 if len(left_out) > 1 else 1.0
+        return np.stack([sign * np.arange(9.0, 13.0), np.ones(4)], axis=1)
+
+    monkeypatch.setattr(significance, "held_out_gains", gains)
+    monkeypatch.setattr(significance, "fit", lambda logs, *rest, **options: beside)
+    assert first_refuted(replace(beside, chosen=chosen), 0) == 1
+    assert first_refuted(replace(beside, chosen=chosen[:2]), 0) == 2, "one alone cancels nothing"
+    assert first_refuted(exact, 0) == 3
 
 
 def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:

@@ -1,0 +1,70 @@
+"""A simulation along the recording's own measured poses is no better a reference than these poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.reference_coverage import align
+from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.mcap_io.write import write
+from imutool.noise import datasheet
+from imutool.recording import Recording
+from imutool.sensor.made_up_flight import flight
+from imutool.sensor.simulate import TRUTH_TOPIC, simulated
+
+DURATION_S, RATE_HZ = 40.0, 100.0
+MEASURED, EXACT = 1e-4, 0.0  # rad and m of a pose
+
+
+def made(noise: float) -> Recording:
+    """Flight whose poses have some noise."""
+    return flight(4, duration_s=DURATION_S, rate_hz=RATE_HZ, truth_noise_rad=noise, truth_noise_m=noise)
+
+
+def along(real: Recording, seed: int = 0) -> Recording:
+    """Simulation along its poses."""
+    return simulated(real, (), datasheet.read("adis16448"), RATE_HZ, seed).recording
+
+
+def band_hz(real: Recording, sim: Recording) -> float | None:
+    (pair,) = align(real, sim, None, DiagnoseSettings())
+    assert pair.exact == (pair.band_hz is None)
+    return pair.band_hz
+
+
+def test_it_is_trusted_as_far_as_the_poses_are() -> None:
+    real = made(MEASURED)
+    (alone,) = align(real, None, None, DiagnoseSettings())
+    assert alone.band_hz is not None
+    assert band_hz(real, along(real)) == pytest.approx(alone.band_hz)
+    assert band_hz(real, along(replace(real, truths={"/vicon": real.truth}))) == pytest.approx(alone.band_hz)
+
+
+def test_one_along_other_or_exact_poses_is_trusted_throughout() -> None:
+    real = made(MEASURED)
+    sim = along(real)
+    moved = replace(sim.truth, p_wb=sim.truth.p_wb + MEASURED * np.random.default_rng(1).normal(size=sim.truth.p_wb.shape))
+    assert band_hz(real, replace(sim, truths={TRUTH_TOPIC: moved})) is None
+    exact = made(EXACT)
+    assert band_hz(exact, along(exact)) is None
+    assert band_hz(along(real, seed=1), sim) is None, "two simulations along one path"
+    assert band_hz(replace(real, truths={}), sim) is None
+
+
+def test_errors_of_its_poses_are_no_physics(tmp_path: Path) -> None:
+    """In full band the poses' noise was a resonance of the mount at 4.6 Hz, and hid the accelerometer's scale."""
+    real, sim = tmp_path / "real.mcap", tmp_path / "sim.mcap"
+    recording = flight(2, duration_s=60.0)
+    write(recording, real)
+    write(simulated(recording, (), datasheet.read("none"), 200.0, 1).recording, sim)
+    found, alone = diagnose([real], sim), diagnose([real])
+    assert {one.effect for one in found.findings} == {one.effect for one in alone.findings}
+    assert {"gyro_scale", "gyro_misalignment", "accel_scale"} <= {one.effect for one in found.findings}
+    assert {one.effect for one in found.findings}.isdisjoint({"mount_resonance", "lever_arm", "size_effect"})
+    assert any("follows the recording's own poses" in remark for remark in found.remarks)
+    assert all(closer.by == "second simulation" for closer in found.closer.values())
