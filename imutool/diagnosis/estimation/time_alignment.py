@@ -55,7 +55,7 @@ def with_simulation(
     start_ns = int(real.imu.t_ns[0])
     stamp_s = seconds(real.imu.t_ns, start_ns)
     found: list[tuple[IdealMotion, Float64[np.ndarray, "6"], Bool[np.ndarray, " n"]]] = []
-    for part in _stretches(sim, settings.alignment):
+    for part in _stretches(sim, settings):
         t_sim = seconds(part.imu.t_ns, start_ns) - shift_s  # on the recording's clock
         ideal, noise = _simulated(t_sim, part, shift_s, start_ns, real, settings)
         found.append((ideal, noise, (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])))
@@ -68,12 +68,13 @@ def with_simulation(
     ]
 
 
-def _stretches(sim: Recording, settings: AlignmentSettings) -> list[Recording]:
+def _stretches(sim: Recording, settings: DiagnoseSettings) -> list[Recording]:
     """Stretches of a simulation between holes, those that are long enough; else the longest."""
     t_ns = sim.imu.t_ns
-    holes = np.flatnonzero(np.diff(t_ns) > 1e9 * settings.hole_s)
+    hole_s = max(settings.alignment.hole_s, settings.split.gap_periods * sim.imu.period_s)
+    holes = np.flatnonzero(np.diff(t_ns) > 1e9 * hole_s)
     parts = [sim.between(int(t_ns[a]), int(t_ns[b])) for a, b in zip([0, *(holes + 1)], [*holes, len(t_ns) - 1], strict=True)]
-    long = [part for part in parts if part.imu.duration_s >= settings.least_s]
+    long = [part for part in parts if part.imu.duration_s >= settings.alignment.least_s]
     return (long or [max(parts, key=lambda part: part.imu.duration_s)]) if len(holes) else [sim]
 
 

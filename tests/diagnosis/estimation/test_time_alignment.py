@@ -266,3 +266,9 @@ def test_a_simulation_with_a_hole_is_compared_stretch_by_stretch() -> None:
         assert np.abs((expected(pair, ()) - expected(one, ())[rows])[amid]).max() < SLACK * planted.NOISE.max()
     short = replace(sim, imu=sim.imu.rows((t_s < 0.9 * whole) | (t_s > 0.95 * whole)))
     assert len(with_simulation(real, short)) == 1, "what is left after the second hole is too short to be judged"
+
+
+def test_a_slow_simulation_is_no_row_of_holes() -> None:
+    real, sim = logs()
+    slow = replace(sim, imu=sim.imu.rows(slice(0, None, 50)))
+    assert len(with_simulation(real, slow)) == 1
