@@ -141,7 +141,7 @@ def own_poses_sentence(pairs: Sequence[Pair]) -> str:
     """Remark on a simulation along the recording's own poses."""
     band_hz = min(pair.band_hz for pair in pairs if pair.band_hz is not None)
     return (
-        f"The simulation follows the recording's own poses, and is compared as far as they are trusted, up to {band_hz:.2g} Hz"
+        f"The simulation follows the recording's own poses, and is compared as far as they are trusted, up to {band_hz:.2g} Hz."
     )
 
 

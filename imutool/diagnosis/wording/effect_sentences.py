@@ -73,7 +73,7 @@ def _mount_resonance(w: Words) -> str:
 def _reference_error(w: Words) -> str:
     """Short wrong intervals, or an attitude that is turned throughout."""
     if any(name.startswith("turned_") for name in w.finding.parameters):
-        return f"the attitude of {w.other} is wrong, not the sensor: it is turned by {w.main} against gyro and gravity"
+        return f"the attitude of the true poses is wrong, not the sensor: it is turned by {w.main} against gyro and gravity"
     return f"the reference is wrong, not the sensor, {w.main.labelled}"
 
 
@@ -109,7 +109,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "dropped_samples": "samples are missing, {w.main.labelled}",
     "timestamp_jitter": "samples are late by turns, {w.main.labelled}",
     "reference_error": _reference_error,
-    "reference_smoothing": "{w.other} are smoothed, and slower than the body, by {w.main.labelled}",
+    "reference_smoothing": "the true poses are smoothed, and slower than the body, by {w.main.labelled}",
     "gain": "its gain is off by {w.main}",
     "offset": "{w.it} reads a constant {w.main} too much",
     "delay": _delay,
