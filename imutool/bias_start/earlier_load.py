@@ -33,8 +33,8 @@ LEAST_COLD = 0.2  # probability of T = 0, below which the start is not cold: a l
 def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: int | None = None) -> BiasModel:
     """Model whose drift begins where the log shows the sensor.
 
-    The model itself where a cold start is possible, or its earlier load given. `batches` are seconds since the log's first
-    sample, gyro and accel; as many count as for the fitness.
+    It is the model itself if a cold start is likely enough (`LEAST_COLD`), or if its earlier load is given. `batches` are
+    seconds since the log's first sample, gyro and accel; as many count as for the fitness.
     """
     if not model.follows_load() or model.load_before is not None:
         return model

@@ -25,7 +25,7 @@ from imutool.sensor.trajectory import Stretch, smooth_motion
 from imutool.units import AXES, SENSORS, UNITS
 
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
-COPIED = 0.5  # of a simulation's poses that the recording has, too, from which it follows them
+COPIED = 0.5  # share of a simulation's poses whose stamps the recording has, too: above, it may follow them
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 

@@ -115,7 +115,6 @@ class SignalSettings(Settings, frozen=True):
     least_s: Positive = 15.0  # two blocks to fit and one to test
     least_samples: Count = 300  # of a spectrum
     oversampling: Positive = 4.0  # so that a straight line between fine samples is the signal
-    hole_s: Positive = 0.1  # without samples of a simulation, from which on it is not interpolated
     align_hz: Positive = 100.0  # of the clock on which recording and simulation are correlated
     least_correlation: Share = 0.3  # below which nothing says that the two are one motion
     noise_band: Share = 0.4  # of the rate: from here to `noise_band_end` a simulation's spectrum is its noise

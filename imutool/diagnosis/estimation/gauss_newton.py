@@ -32,7 +32,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import FitSettings
 from imutool.sensor.effect import Theta
 
-ONSET_TAKES = 4.0  # over the limit: an onset, which moves after the first step, takes most of some predictions (8 at most)
+ONSET_TAKES = 4.0  # times the limit: an onset moves after the first step, and regains most of some predicted losses
 _objective = attrgetter("objective")
 
 
