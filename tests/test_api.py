@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.in_process import run_script
 
 import imutool
 from imutool.cli.demo import write_asl
@@ -86,8 +87,8 @@ def test_importing_takes_a_tenth_of_importing_torch(torch_import_s: float) -> No
     def seconds() -> float:
         return float(subprocess.run([sys.executable, "-c", clock], check=True, capture_output=True, text=True).stdout)
 
-    ours = min(seconds() for _ in range(ROUNDS))
-    assert ours < IMPORT_SHARE * torch_import_s, f"import imutool took {ours:.3f} s, import torch {torch_import_s:.2f} s"
+    limit_s = IMPORT_SHARE * torch_import_s
+    assert any(seconds() < limit_s for _ in range(ROUNDS)), f"import imutool took over {limit_s:.3f} s each time"
 
 
 # ── documentation ──
@@ -139,10 +140,8 @@ def test_help_shows_the_way_from_a_raw_folder_to_a_debiased_log_in_ten_lines() -
 def test_the_lines_of_help_run(tmp_path: Path) -> None:
     for seed in (1, 2):
         write_asl(imutool.example_recording(seed, duration_s=20.0), tmp_path / "raw" / f"flight_{seed}")
-    (tmp_path / "way.py").write_text("\n".join(["if True:", *(f"    {line}" for line in lines_of_help())]))
-    code = "import runpy\nif __name__ == '__main__': runpy.run_path('way.py')"
-    (tmp_path / "run.py").write_text(code)
-    done = subprocess.run([sys.executable, "run.py"], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    (tmp_path / "way.py").write_text("\n".join(lines_of_help()))
+    done = run_script(["way.py"], tmp_path)
     assert done.returncode == 0, done.stderr
     errors = {name: float(value) for name, value in re.findall(r"^(\w+) ([\d.]+)$", done.stdout, re.MULTILINE)}
     assert errors["sensor"] < errors["raw"]

@@ -91,12 +91,11 @@ def test_raw_orientation_error_is_the_published_one(converted: Callable[[str], P
 
 
 def test_what_evo_says_of_the_written_trajectories(converted: Callable[[str], Path], tmp_path: Path) -> None:
-    log = converted("euroc/MH_04_difficult.zip")
-    results = evaluate(log, models=["static"], init="truth", trajectories=tmp_path)
+    results = evaluate(converted("fetch/05_random"), models=["static"], init="truth", trajectories=tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "MH_04_difficult_raw.tum",
-        "MH_04_difficult_static.tum",
-        "MH_04_difficult_truth.tum",
+        "05_random_raw.tum",
+        "05_random_static.tum",
+        "05_random_truth.tum",
     ]
     raw, static = results
     runs = (
@@ -105,8 +104,8 @@ def test_what_evo_says_of_the_written_trajectories(converted: Callable[[str], Pa
         (raw, "aoe_aligned_deg", ("--align", "-r", "angle_deg")),
         (static, "aoe_aligned_deg", ("--align", "-r", "angle_deg")),
     )
-    truth = "MH_04_difficult_truth.tum"
-    found = statistics(tmp_path, [("ape", truth, f"MH_04_difficult_{one['model']}.tum", *words) for one, _, words in runs])
+    truth = "05_random_truth.tum"
+    found = statistics(tmp_path, [("ape", truth, f"05_random_{one['model']}.tum", *words) for one, _, words in runs])
     for (result, figure, _), evos in zip(runs, found, strict=True):
         assert result[figure] == pytest.approx(evos["rmse"], rel=EVO_TOLERANCE), (result["model"], figure)
 

@@ -142,8 +142,8 @@ def test_help_is_quick(command: str, torch_import_s: float) -> None:
         subprocess.run([command, "--help"], check=True, stdout=subprocess.DEVNULL)
         return time.perf_counter() - began
 
-    ours = min(seconds() for _ in range(ROUNDS))
-    assert ours < HELP_SHARE * torch_import_s, f"imutool --help took {ours:.2f} s, import torch {torch_import_s:.2f} s"
+    limit_s = HELP_SHARE * torch_import_s
+    assert any(seconds() < limit_s for _ in range(ROUNDS)), f"imutool --help took over {limit_s:.2f} s each time"
 
 
 # ── the wheel ──

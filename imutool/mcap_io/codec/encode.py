@@ -6,6 +6,7 @@ Quaternions are wxyz in memory and xyzw in messages; here they change.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -34,6 +35,11 @@ from imutool.mcap_io.codec.schemas import (
 
 NO_ORIENTATION = -1.0  # sensor_msgs/Imu: element 0 of a covariance of something that was not measured
 _XYZW_FROM_WXYZ = [1, 2, 3, 0]
+
+
+@lru_cache  # a live stream is written message by message, in few frames
+def _layout(kind: str, *texts: str) -> Layout:
+    return layout_of(kind, "cdr", texts=texts)
 
 
 def _blank(count: int, layout: Layout) -> UInt8[np.ndarray, "n L"]:
@@ -65,7 +71,7 @@ def _stamped(
     kind: str, stamp_ns: Int64[np.ndarray, " n"], frame_id: str
 ) -> tuple[UInt8[np.ndarray, "n L"], Float64[np.ndarray, "n k"]]:
     """Messages of one frame with their stamps, and their numbers as a view."""
-    layout = layout_of(kind, "cdr", texts=[frame_id])
+    layout = _layout(kind, frame_id)
     rows = _blank(len(stamp_ns), layout)
     _put_stamp(rows, layout, stamp_ns)
     return rows, _numbers_of(rows, layout)
@@ -201,7 +207,7 @@ def _places(layout: Layout) -> list[tuple[int, int]]:
 
 def encode_float(values: Float64[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]:
     """One Float64 message per row, without a stamp: the log time carries it."""
-    layout = layout_of(FLOAT, "cdr")
+    layout = _layout(FLOAT)
     rows = _blank(len(values), layout)
     _numbers_of(rows, layout)[:, 0] = values
     return rows

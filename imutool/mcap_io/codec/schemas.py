@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -70,6 +71,7 @@ TYPE_HASHES = {
 }
 
 
+@cache
 def definition(schema_name: str) -> str:
     """The `ros2msg` text of a message and of its nested messages."""
     order: list[str] = []
