@@ -82,7 +82,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     none = None
     most = np.full(6, MOST_DEVIATIONS) if prior.least_std is None else MOST_OF_GUESS
     if (_deviations(found, prior) > most).any() or found.surprising > MOST_SURPRISING:
-        none = _evidence(samples, BiasPrior(np.zeros(6), UNKNOWN_STD, prior.ground_std, prior.walk))
+        none = _evidence(samples, replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least_std=None))
     contradictions = [] if none is None else _contradictions(found, prior, none, most)
     if none is not None and contradictions:
         used = _started(start, prior)
@@ -144,7 +144,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    chi_square, log_likelihood = innovations(blocks)
+    chi_square, log_likelihood = innovations(blocks, prior.settings)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -156,9 +156,10 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     return _Evidence(float(log_likelihood.sum()), surprising, difference, variance)
 
 
-def innovations(blocks: Sequence[FilteredBlock]) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+def innovations(
+    blocks: Sequence[FilteredBlock], s: FilterSettings
+) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
     """Chi-square and Student's log-likelihood of each block's velocity."""
-    s = FilterSettings()
     v = np.array([block.step.expected.v_w for block in blocks])
     S = np.array([block.step.expected.P[VELOCITY, VELOCITY] for block in blocks])
     bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s
