@@ -131,8 +131,8 @@ def _shared_stretches(real: Recording, sim: Recording) -> list[tuple[int, int, S
         _, mine, theirs = np.intersect1d(poses.t_ns, other.t_ns, return_indices=True)
         if len(mine) > COPIED * len(other.t_ns) and np.array_equal(poses.p_wb[mine], other.p_wb[theirs]):
             motion = smooth_motion(poses)
-            ends_ns = [[motion.start_ns + round(1e9 * s) for s in (part.start_s, part.end_s)] for part in motion.stretches]
-            return [(*ends, part) for ends, part in zip(ends_ns, motion.stretches, strict=True) if part.measured]
+            start_ns, measured = motion.start_ns, [part for part in motion.stretches if part.measured]
+            return [(start_ns + round(1e9 * p.start_s), start_ns + round(1e9 * p.end_s), p) for p in measured]
     return []
 
 

@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
-from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, level
+from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, WhitenedLog, level
 from imutool.diagnosis.held_out import (
     gains,
     held_out_rms,
@@ -101,22 +101,25 @@ def summarize(
         remarks=(*_remarks(pairs), *_resting(pairs, hidden), *remarks(all_findings, sim_findings)),
         closer=gains(logs, before, after),
         traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
+        start_ns=pairs[0].log_start_ns + round(1e9 * pairs[0].aligned_s),
     )
 
 
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise.
+    No body moves in a line for minutes, so that a line needs no reference: what the body does there is its noise, and what the
+    poses do there is not known to be motion (those of a camera have lines of their own, at its rate).
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
-    unbanded = replace(pair, real=pair.real - expected(pair, chosen) + expected(pair, ()), band_hz=None)
     noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
-    residual = unbanded.real - expected(unbanded, ())
+    slow = replace(Band.below(pair.band_hz, 1.0 / pair.period_s, noise), every=1)
+    residual = pair.real - slow(expected(pair, chosen))
+    unbanded = replace(pair, real=residual + expected(pair, ()), band_hz=None)
     log = WhitenedImu(unbanded, level(residual, pair.usable, 1.0 / pair.period_s, noise))
     found = select_effects([log], [vibration])
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
