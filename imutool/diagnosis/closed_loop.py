@@ -120,7 +120,7 @@ def _rms(x: Float64[np.ndarray, "n 3"]) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def _by_band(misfits: Sequence[tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]]) -> Mapping[str, float]:
+def _by_band(misfits: Sequence[tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"]]]) -> Mapping[str, float]:
     """Root mean square of a misfit in bands of its spectrum, over stretches."""
     squares: dict[str, list[tuple[int, float]]] = {}
     for t_s, x in misfits:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 import msgspec
@@ -19,7 +20,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.timestamps import late_stamps
 from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
-from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, WhitenedLog, level
+from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, level
 from imutool.diagnosis.held_out import (
     gains,
     held_out_rms,
@@ -36,6 +37,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
+from imutool.sensor.effects.vibration import line_power
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS, UNITS
 
@@ -108,29 +110,28 @@ def summarize(
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    No body moves in a line for minutes, so that a line needs no reference: what the body does there is its noise, and what the
-    poses do there is not known to be motion (those of a camera have lines of their own, at its rate).
+    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise. A line that
+    is stronger in the poses is theirs: those of a camera may have one at its rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
+    by_poses = expected(pair, ())
+    unbanded = replace(pair, real=pair.real - expected(pair, chosen) + by_poses, band_hz=None)
     noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
-    slow = replace(Band.below(pair.band_hz, 1.0 / pair.period_s, noise), every=1)
-    residual = pair.real - slow(expected(pair, chosen))
-    unbanded = replace(pair, real=residual + expected(pair, ()), band_hz=None)
-    log = WhitenedImu(unbanded, level(residual, pair.usable, 1.0 / pair.period_s, noise))
+    log = WhitenedImu(unbanded, level(unbanded.real - by_poses, pair.usable, 1.0 / pair.period_s, noise))
     found = select_effects([log], [vibration])
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
-    return [finding_of([log], found, one, noise_floor([log])) for one in faster]
+    power = partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
+    own = [one for one in faster if power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
+    return [finding_of([log], found, one, noise_floor([log])) for one in own]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
-    ideal = expected(pair, ())
-    return Traces(
-        pair.name, pair.stamp_s, pair.real, before, after, pair.held_out, pair.truth, ideal, band_hz=pair.band_hz, path=path
-    )
+    ideal, held_out = expected(pair, ()), pair.held_out
+    return Traces(pair.name, pair.stamp_s, pair.real, before, after, held_out, pair.truth, ideal, pair.band_hz, path)
 
 
 def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d: Diagnosis) -> PhysicsFile:

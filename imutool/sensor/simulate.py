@@ -140,8 +140,8 @@ def simulated(
 
     Samples cover every trusted stretch. Stamps are whole periods after the first pose, on the poses' clock. Samples that an
     effect of the clock takes outside a stretch are left out. The true poses in a stretch are copied as they are;
-    `/motion/pose` holds the motion itself. Effects count time from `start_ns`; from the first sample if that is further away than
-    the motion is long, so that it is another one.
+    `/motion/pose` holds the motion itself. Effects count time from `start_ns`, or from the first sample where the two lie
+    further apart than the motion lasts, so that it is another one.
 
     Raises:
         ConfigError: the rate or the seed.
