@@ -112,7 +112,10 @@ class Term(Settings, frozen=True, kw_only=True):
 
 
 class PhysicsFile(Settings, frozen=True, kw_only=True):
-    """Contents of a physics.toml; `start_ns` is the stamp from which its times count, on the clock of the simulation."""
+    """Contents of a physics.toml.
+
+    `start_ns` is the stamp from which its times count, on the clock of the log to simulate along.
+    """
 
     schema: Literal["imutool.physics/1"] = "imutool.physics/1"
     start_ns: int | None = None

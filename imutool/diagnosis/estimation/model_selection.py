@@ -183,11 +183,9 @@ class _Search:
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
-                if effect.key == mine.key:
-                    if effect.linear:  # its score is its gain
-                        break
-                    continue
-                if log_p > own_log_p and not mine.linear:
+                if effect.key == mine.key and effect.linear:  # its score is its gain
+                    break
+                if effect.key == mine.key or (log_p > own_log_p and not mine.linear):
                     continue
                 limit = without.objective - self.settings.rival_share * (without.objective - now.objective)
                 trial = self.tried_with(others, effect, start, without, limit)
