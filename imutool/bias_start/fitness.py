@@ -51,13 +51,14 @@ GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor 
 class _Evidence:
     """Evidence of some samples about a prior: log-likelihood, share of surprising innovations, and the bias shown.
 
-    `difference` is that bias minus the prior's mean, `variance` its variance without the prior.
+    `difference` is that bias minus the prior's mean, `variance` its variance without the prior. `stops` begin and end (s).
     """
 
     log_likelihood: float
     surprising: float
     difference: Vector6
     variance: Vector6
+    stops: tuple[tuple[float, float], ...] = ()
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
@@ -90,7 +91,13 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
         if worse:
             return Fitness("unfit", (*contradictions, *worse))
-    doubts = [*contradictions, *model.remarks, *_other_conditions(model, samples), *_other_unit(model, about)]
+    doubts = [
+        *contradictions,
+        *_changed_at_rest(corrected, found.stops, prior),
+        *model.remarks,
+        *_other_conditions(model, samples),
+        *_other_unit(model, about),
+    ]
     if not doubts and not _same_unit(model, about) and not _telling(found, prior):
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:
@@ -153,7 +160,31 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((chi_square > SURPRISING).mean())
-    return _Evidence(float(log_likelihood.sum()), surprising, difference, variance)
+    return _Evidence(float(log_likelihood.sum()), surprising, difference, variance, _stops(blocks))
+
+
+def _stops(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
+    """Beginning and end of each row of blocks at rest."""
+    rows = [list(row) for resting, row in itertools.groupby(blocks, lambda block: block.resting) if resting]
+    return tuple((row[0].start_s, row[-1].end_s) for row in rows)
+
+
+def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
+    """Sentence on a gyro whose mean at rest moves further from stop to stop than the walk of the training runs."""
+    t_s, gyro, _ = samples
+    within = [gyro[slice(*np.searchsorted(t_s, stop))] for stop in stops]
+    for (stop, first), (later, last) in itertools.pairwise(zip(stops, within, strict=True)):
+        noise = sum(part.var(axis=0) / len(part) for part in (first, last))
+        apart_s = 0.5 * (sum(later) - sum(stop))
+        std = np.sqrt(prior.walk[:3] ** 2 * apart_s + 2.0 * prior.ground_std[:3] ** 2 + noise)
+        change = last.mean(axis=0) - first.mean(axis=0)
+        axis = int(np.argmax(np.abs(change) / std))
+        if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
+            yield (
+                f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
+                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
+            )
+            return
 
 
 def innovations(
