@@ -39,9 +39,9 @@ TIME_WORDS = (
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed|sample_?time_?fine)"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/s²|mps2|ms2|m s\^?-2",
+    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
     "mg": r"mg",
     "g": r"g",
     "ns": r"ns|nanoseconds?|nsec",
@@ -133,7 +133,8 @@ class Proposal(msgspec.Struct):
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
         )
         lines.append(
-            '# poses in the table: position = [x, y, z], quaternion_wxyz = [w, x, y, z] (m), pose_kind = "truth" or "estimate"'
+            '# poses: truth_time, position = [x, y, z], quaternion_wxyz = [w, x, y, z] (m), pose_kind = "truth" or "estimate";'
+            " truth_file if they are in another table"
         )
         return "\n".join(lines)
 
@@ -164,7 +165,7 @@ def split_name(column: str) -> tuple[str, str]:
     if bracket:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
-    if not unit and (end := re.search(r"_(dps|rads|degs|mps2|ms2|mg|g|ns|us|ms|s|sec)$", name)):
+    if not unit and (end := re.search(r"_(dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]
     return name, unit

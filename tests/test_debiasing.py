@@ -443,10 +443,11 @@ def test_no_model_and_no_rest_is_a_refusal_that_says_what_to_do(tmp_path: Path) 
     log = moving(tmp_path)
     for model in (None, "static", Path("static")):
         with pytest.raises(
-            ModelError, match=r"moving.mcap: no model given.*expected `model`, or at least 1.5 s without motion"
+            ModelError,
+            match=r"moving.mcap: the log holds no stretch at rest.*expected a trained `model`, or at least 1.5 s",
         ):
             debias(log, tmp_path / "out.mcap", model=model)
-        with pytest.raises(ModelError, match=r"moving.mcap: no model given"):
+        with pytest.raises(ModelError, match=r"moving.mcap: the log holds no stretch at rest"):
             debias(log, tmp_path / "out.mcap", model=model, smooth=True)
     assert ModelError.exit_code == 6
     assert [path.name for path in tmp_path.iterdir()] == ["moving.mcap"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -271,11 +271,17 @@ class _Session(msgspec.Struct):
     std: tuple[float, float, float, float, float, float]
 
 
+class _Speed(msgspec.Struct, forbid_unknown_fields=True):
+    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=1e4)]
+    speed_correlation_s: Annotated[float, msgspec.Meta(gt=0, le=1e4)]
+
+
 class _Priors(msgspec.Struct):
     """Entries of a card from which the start of a log is computed."""
 
     sessions: list[_Session] = []
     turn_on_least_std: tuple[float, float, float, float, float, float] | None = None
+    speed: _Speed | None = None
 
 
 def check_card(card: Mapping[str, Any]) -> None:

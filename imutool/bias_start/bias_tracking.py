@@ -85,7 +85,7 @@ class BiasFilter:
     def __init__(
         self, prior: BiasPrior, settings: FilterSettings | None = None, *, ahead: bool = False, aiding: Aiding | None = None
     ) -> None:
-        self.settings = settings or FilterSettings()
+        self.settings = settings or prior.settings
         self.state: State | None = None
         self._aiding = aiding
         self._walk = prior.walk if aiding is None else np.concatenate([prior.walk, aiding.walk])

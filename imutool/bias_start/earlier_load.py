@@ -27,6 +27,7 @@ from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 # T: a few seconds also imitate what a model misses of a cold start; after the last the slowest state has settled
 EARLIER_S = np.array([0.0, 16.0, 32.0, 64.0, 128.0, 512.0])
 COLD = 0.5  # prior probability of T = 0; the others share the rest
+PRIOR = np.array([COLD, *[(1.0 - COLD) / (len(EARLIER_S) - 1)] * (len(EARLIER_S) - 1)])
 LEAST_COLD = 0.2  # probability of T = 0, below which the start is not cold: a log that says nothing changes nothing
 
 
@@ -41,11 +42,9 @@ def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: in
     samples = head(batches)
     if len(samples[0]) < 2 or samples[0][-1] < BLOCK_S:
         return model
-    mean = _mean_load(model.rate_hz, samples)
-    loads = -np.expm1(-EARLIER_S[:, None] / LOAD_TAU_S)[..., None] * mean
+    loads = loads_after(model.rate_hz, samples)
     log_likelihood = np.array([_log_likelihood(after_load(model, load), samples, first_ns) for load in loads])
-    prior = np.array([COLD, *[(1.0 - COLD) / (len(loads) - 1)] * (len(loads) - 1)])
-    weights = prior * np.exp(log_likelihood - log_likelihood.max())
+    weights = PRIOR * np.exp(log_likelihood - log_likelihood.max())
     weights /= weights.sum()
     if weights[0] >= LEAST_COLD:
         return model
@@ -69,11 +68,15 @@ def switched_on_before(model: BiasModel, on_s: float) -> BiasModel:
     return after_load(model, load)
 
 
-def _mean_load(rate_hz: float, samples: Samples) -> Float64[np.ndarray, "11"]:
-    """Mean load, from the state z of its fastest filter: a step of z is its gain times the load without z."""
+def loads_after(rate_hz: float, samples: Samples) -> Float64[np.ndarray, "t 3 11"]:
+    """Load after each of the times `EARLIER_S`, under the mean load of some samples.
+
+    The mean load follows from the state z of its fastest filter: a step of z is its gain times the load without z.
+    """
     z = SignalFilter(rate_hz)(*samples).load[:, 0]
     gain = -math.expm1(-1.0 / (rate_hz * LOAD_TAU_S[0]))
-    return np.asarray(z.mean(axis=0) + z[-1] / (gain * len(z)))
+    mean = z.mean(axis=0) + z[-1] / (gain * len(z))
+    return np.asarray(-np.expm1(-EARLIER_S[:, None] / LOAD_TAU_S)[..., None] * mean)
 
 
 def after_load(model: BiasModel, load: Load | None) -> BiasModel:
@@ -91,7 +94,9 @@ def _log_likelihood(model: BiasModel, samples: Samples, first_ns: int | None) ->
     gyro, accel = gyro - bias[:, :3], accel - bias[:, 3:]
     filter_ = BiasFilter(prior, ahead=True)
     blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
-    return float(innovations(blocks)[1].sum()) + _at_rest([block for block in blocks if block.resting], t_s, gyro)
+    return float(innovations(blocks, prior.settings)[1].sum()) + _at_rest(
+        [block for block in blocks if block.resting], t_s, gyro
+    )
 
 
 def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:

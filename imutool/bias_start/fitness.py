@@ -51,13 +51,14 @@ GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor 
 class _Evidence:
     """Evidence of some samples about a prior: log-likelihood, share of surprising innovations, and the bias shown.
 
-    `difference` is that bias minus the prior's mean, `variance` its variance without the prior.
+    `difference` is that bias minus the prior's mean, `variance` its variance without the prior. `stops` begin and end (s).
     """
 
     log_likelihood: float
     surprising: float
     difference: Vector6
     variance: Vector6
+    stops: tuple[tuple[float, float], ...] = ()
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
@@ -82,7 +83,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     none = None
     most = np.full(6, MOST_DEVIATIONS) if prior.least_std is None else MOST_OF_GUESS
     if (_deviations(found, prior) > most).any() or found.surprising > MOST_SURPRISING:
-        none = _evidence(samples, BiasPrior(np.zeros(6), UNKNOWN_STD, prior.ground_std, prior.walk))
+        none = _evidence(samples, replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least_std=None))
     contradictions = [] if none is None else _contradictions(found, prior, none, most)
     if none is not None and contradictions:
         used = _started(start, prior)
@@ -90,7 +91,13 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
         if worse:
             return Fitness("unfit", (*contradictions, *worse))
-    doubts = [*contradictions, *model.remarks, *_other_conditions(model, samples), *_other_unit(model, about)]
+    doubts = [
+        *contradictions,
+        *_changed_at_rest(corrected, found.stops, prior),
+        *model.remarks,
+        *_other_conditions(model, samples),
+        *_other_unit(model, about),
+    ]
     if not doubts and not _same_unit(model, about) and not _telling(found, prior):
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:
@@ -144,7 +151,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    chi_square, log_likelihood = innovations(blocks)
+    chi_square, log_likelihood = innovations(blocks, prior.settings)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -153,12 +160,37 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((chi_square > SURPRISING).mean())
-    return _Evidence(float(log_likelihood.sum()), surprising, difference, variance)
+    return _Evidence(float(log_likelihood.sum()), surprising, difference, variance, _stops(blocks))
 
 
-def innovations(blocks: Sequence[FilteredBlock]) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+def _stops(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
+    """Beginning and end of each row of blocks at rest."""
+    rows = [list(row) for resting, row in itertools.groupby(blocks, lambda block: block.resting) if resting]
+    return tuple((row[0].start_s, row[-1].end_s) for row in rows)
+
+
+def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
+    """Sentence on a gyro whose mean at rest moves further from stop to stop than the walk of the training runs."""
+    t_s, gyro, _ = samples
+    within = [gyro[slice(*np.searchsorted(t_s, stop))] for stop in stops]
+    for (stop, first), (later, last) in itertools.pairwise(zip(stops, within, strict=True)):
+        noise = sum(part.var(axis=0) / len(part) for part in (first, last))
+        apart_s = 0.5 * (sum(later) - sum(stop))
+        std = np.sqrt(prior.walk[:3] ** 2 * apart_s + 2.0 * prior.ground_std[:3] ** 2 + noise)
+        change = last.mean(axis=0) - first.mean(axis=0)
+        axis = int(np.argmax(np.abs(change) / std))
+        if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
+            yield (
+                f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
+                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
+            )
+            return
+
+
+def innovations(
+    blocks: Sequence[FilteredBlock], s: FilterSettings
+) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
     """Chi-square and Student's log-likelihood of each block's velocity."""
-    s = FilterSettings()
     v = np.array([block.step.expected.v_w for block in blocks])
     S = np.array([block.step.expected.P[VELOCITY, VELOCITY] for block in blocks])
     bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s

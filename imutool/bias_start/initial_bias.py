@@ -42,6 +42,7 @@ from imutool.bias_start.bias_tracking import (
 from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, shown_bias, supported_std
 from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
+from imutool.inertial.inertial_filter import FilterSettings
 from imutool.recording import Imu, seconds
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
@@ -174,7 +175,8 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
     least = None if start.least_std is None else np.maximum(start.least_std, LEAST_STD)
-    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least)
+    settings = FilterSettings(**model.card.get("speed", {}))
+    return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least, settings)
 
 
 def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:

@@ -283,8 +283,8 @@ def _estimate(blocks: Blocks, where: str | Location) -> tuple[BiasModel, Initial
 
 def _no_start(where: str | Location) -> ModelError:
     return ModelError(
-        "no model given, and the log holds no stretch at rest to measure a static bias on",
+        "the log holds no stretch at rest to measure a static bias on",
         where=where,
-        expected="`model`, or at least 1.5 s without motion",
+        expected="a trained `model`, or at least 1.5 s without motion",
         fix="Give `model` (imutool models lists those that ship), or train one with imutool train",
     )

@@ -10,7 +10,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import COLUMNS, Vector6
 from imutool.inertial import inertial_filter
-from imutool.inertial.inertial_filter import State
+from imutool.inertial.inertial_filter import FilterSettings, State
 
 MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
 MOST_DEVIATIONS = 5.0  # between a log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
@@ -32,8 +32,8 @@ class BiasPrior:
 
     Bias b in motion, offset at rest (mean zero), and random walk of b.
 
-    `walk` is in rad/s and m/s² per second^1/2. With `least_std` the standard deviation of b is only known to lie between that
-    and `std`: the log decides (`supported_std`).
+    `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `least_std` the standard deviation of b
+    is only known to lie between that and `std`: the log decides (`supported_std`).
     """
 
     mean: Vector6
@@ -41,6 +41,7 @@ class BiasPrior:
     ground_std: Vector6
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
     least_std: Vector6 | None = None
+    settings: FilterSettings = field(default_factory=FilterSettings)
 
     def supported(
         self, states: Sequence[State], elapsed_s: Float64[np.ndarray, " m"], resting: Bool[np.ndarray, " m"]

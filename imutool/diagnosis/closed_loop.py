@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from itertools import pairwise
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise, product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis, Traces
+from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis
+from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.diagnosis.wording.quantity import symbol
 from imutool.errors import ConfigError
 from imutool.units import ASCII_UNITS, SENSORS
@@ -25,7 +27,7 @@ LOG = "closed.mcap"
 WINDOW_S = 5.0  # over which samples are integrated
 EDGES_HZ = (0.0, 1.0, 5.0, 20.0, np.inf)  # of the bands of the spectrum
 LATE_PARTS = 4  # of a log, for the error over time
-BY_RECORDING = {"quantization"}  # seen in the recording alone, also where the new simulation has it by its physics
+STAYS = NO_EFFECT | {"quantization"}  # seen in the recording or its poses alone, whatever the simulation
 METRIC_S = 600.0  # that a metric may take
 
 
@@ -36,12 +38,14 @@ def closed_loop(
 
     `metric` maps a simulation's log to the user's figure.
     """
-    compared = [*_compared(first.traces[0], again.traces[0])]
+    compared = [*_compared(_shared(first, again))]
     if metric is not None and before is not None:
         compared.append(Compared("metric", metric(before), metric(log), "-"))
-    given = {finding.effect for finding in first.findings} & BY_RECORDING
+    given = {finding.effect for finding in first.findings} & STAYS
     missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
-    return ClosedLoop(str(log), bool(missing or again.located), missing, tuple(compared))
+    white = all(residual.white for residual in again.unexplained.values())
+    nameless = bool(again.located) and not (again.findings and white)  # the misfit of what stays is located, too
+    return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared))
 
 
 def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
@@ -74,46 +78,70 @@ def table(loop: ClosedLoop) -> list[list[str]]:
     return rows + [[one.figure, f"{one.before:.3g}", f"{one.after:.3g}", symbol(one.unit) or "–"] for one in loop.compared]
 
 
-def _compared(before: Traces, after: Traces) -> Iterator[Compared]:
-    """Figures of the expected samples with the best constant, over samples that both have."""
-    misfits = [trace.real - trace.before for trace in (before, after)]
+class _Stretch(NamedTuple):
+    """Samples of which both diagnoses have an expectation."""
+
+    t_s: Float64[np.ndarray, " n"]
+    real: Float64[np.ndarray, "n 6"]
+    expected: tuple[Float64[np.ndarray, "n 6"], Float64[np.ndarray, "n 6"]]  # before and after, with the best constant
+
+    def misfits(self, part: slice) -> list[Float64[np.ndarray, "n 3"]]:
+        """Of a sensor, before and after."""
+        return [(self.real - one)[:, part] for one in self.expected]
+
+
+def _shared(first: Diagnosis, again: Diagnosis) -> list[_Stretch]:
+    out = []
+    for before, after in product(first.traces, again.traces):
+        t_s, rows, later = np.intersect1d(before.t_s, after.t_s, return_indices=True)
+        if len(t_s) > 1:
+            out.append(_Stretch(t_s, before.real[rows], (before.before[rows], after.before[later])))
+    return out
+
+
+def _compared(stretches: Sequence[_Stretch]) -> Iterator[Compared]:
+    """Figures of the expected samples over all stretches."""
     for k, sensor in enumerate(SENSORS):
         part, unit = slice(3 * k, 3 * k + 3), ASCII_UNITS[sensor]
-        yield Compared(f"{sensor} rms", _rms(misfits[0][:, part]), _rms(misfits[1][:, part]), unit)
-        bands = [_by_band(misfit[:, part], trace.t_s) for misfit, trace in zip(misfits, (before, after), strict=True)]
+        misfits = [np.concatenate(all_of) for all_of in zip(*(one.misfits(part) for one in stretches), strict=True)]
+        yield Compared(f"{sensor} rms", _rms(misfits[0]), _rms(misfits[1]), unit)
+        bands = [_by_band([(one.t_s, one.misfits(part)[k]) for one in stretches]) for k in range(2)]
         for name in bands[0]:
-            if name in bands[1]:
-                yield Compared(f"{sensor} rms, {name}", bands[0][name], bands[1][name], unit)
-        parts = [np.array_split(misfit[:, part], LATE_PARTS) for misfit in misfits]
+            yield Compared(f"{sensor} rms, {name}", bands[0][name], bands[1][name], unit)
+        parts = [np.array_split(misfit, LATE_PARTS) for misfit in misfits]
         for quarter, (a, b) in enumerate(zip(*parts, strict=True), start=1):
             yield Compared(f"{sensor} rms, quarter {quarter}", _rms(a), _rms(b), unit)
-    drifts = [_integrated(trace) for trace in (before, after)]
-    yield Compared(f"rotation over {WINDOW_S:g} s", drifts[0][0], drifts[1][0], "rad")
-    yield Compared(f"path over {WINDOW_S:g} s", drifts[0][1], drifts[1][1], "m")
+    before, after = (_integrated([(one.t_s, one.real, one.expected[k]) for one in stretches]) for k in range(2))
+    for name, was, is_now, unit in zip(("rotation", "path"), before, after, ("rad", "m"), strict=True):
+        yield Compared(f"{name} over {WINDOW_S:g} s", was, is_now, unit)
 
 
 def _rms(x: Float64[np.ndarray, "n 3"]) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def _by_band(x: Float64[np.ndarray, "n 3"], t_s: Float64[np.ndarray, " n"]) -> Mapping[str, float]:
-    """Root mean square of a misfit in bands of its spectrum."""
-    rate_hz = 1.0 / float(np.median(np.diff(t_s)))
-    f_hz, power = welch(x, rate_hz, nperseg=min(len(x), round(8.0 * rate_hz)), axis=0)
-    out = {}
-    for low, high in pairwise(EDGES_HZ):
-        band = (f_hz >= low) & (f_hz < high)
-        if band.any():
-            name = f"{low:g} to {high:g} Hz" if np.isfinite(high) else f"above {low:g} Hz"
-            out[name] = float(np.sqrt(power[band].sum() * (f_hz[1] - f_hz[0]) / 3.0))
-    return out
+def _by_band(misfits: Sequence[tuple[Float64[np.ndarray, " _"], Float64[np.ndarray, "_ 3"]]]) -> Mapping[str, float]:
+    """Root mean square of a misfit in bands of its spectrum, over stretches."""
+    squares: dict[str, list[tuple[int, float]]] = {}
+    for t_s, x in misfits:
+        rate_hz = 1.0 / float(np.median(np.diff(t_s)))
+        f_hz, power = welch(x, rate_hz, nperseg=min(len(x), round(8.0 * rate_hz)), axis=0)
+        for low, high in pairwise(EDGES_HZ):
+            band = (f_hz >= low) & (f_hz < high)
+            if band.any():
+                name = f"{low:g} to {high:g} Hz" if np.isfinite(high) else f"above {low:g} Hz"
+                squares.setdefault(name, []).append((len(x), float(power[band].sum() * (f_hz[1] - f_hz[0]) / 3.0)))
+    return {name: float(np.sqrt(np.average([x for _, x in own], weights=[n for n, _ in own]))) for name, own in squares.items()}
 
 
-def _integrated(trace: Traces) -> tuple[float, float]:
+def _integrated(stretches: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[float, float]:
     """Rotation (rad) and displacement (m) by which recorded and expected samples part within windows; root mean squares."""
-    (R_real, p_real), (R_sim, p_sim) = (_window_ends(samples, trace.t_s) for samples in (trace.real, trace.before))
-    angle = (R_real.inv() * R_sim).magnitude()
-    return float(np.sqrt(np.mean(angle**2))), float(np.sqrt(((p_real - p_sim) ** 2).sum(axis=1).mean()))
+    angle, apart = [], []
+    for t_s, real, simulated in stretches:
+        (R_real, p_real), (R_sim, p_sim) = (_window_ends(samples, t_s) for samples in (real, simulated))
+        angle.append((R_real.inv() * R_sim).magnitude())
+        apart.append(((p_real - p_sim) ** 2).sum(axis=1))
+    return float(np.sqrt(np.mean(np.concatenate(angle) ** 2))), float(np.sqrt(np.concatenate(apart).mean()))
 
 
 def _window_ends(

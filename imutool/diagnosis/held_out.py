@@ -242,8 +242,7 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
 
 def _on_clock_of(ideal: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
     """On the recording's clock, with its channels."""
-    first_ns = pair.start_ns - round(float(pair.stamp_s[0]) * 1e9)
-    t_s = ideal.t_s + (start_ns - first_ns) * 1e-9 - pair.aligned_s
+    t_s = ideal.t_s + (start_ns - pair.log_start_ns) * 1e-9 - pair.aligned_s
     channels = {name: np.interp(t_s, pair.ideal.t_s, values) for name, values in pair.ideal.channels.items()}
     return replace(ideal, t_s=t_s, channels=channels)
 

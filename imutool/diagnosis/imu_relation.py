@@ -38,7 +38,7 @@ def imu_relation(first: Recording, other: Recording, effects: Sequence[str], set
     R = Rotation.identity() if len(t_ns) < 2 else Rotation.align_vectors(_vectors(b, t_ns), _vectors(a, t_ns))[0]
     back = R.inv().as_matrix()
     turned = replace(first, imu=replace(a, gyro=a.gyro @ back, accel=a.accel @ back), truths={})
-    pairs = with_simulation(replace(other, truths={}), turned, settings=settings)
+    pairs = with_simulation(replace(other, truths={}), turned, settings)
     chosen = tuple((effect, effect.null_value.astype(float)) for effect in catalogue.diagnosed(effects))
     logs = [whitened(pair, [effect for effect, _ in chosen], settings.band) for pair in pairs]
     fitted = fit(logs, chosen, part="all")

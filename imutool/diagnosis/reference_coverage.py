@@ -97,7 +97,9 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """Intervals of the recording that the simulation or its own poses cover without a hole."""
     if sim is not None:
-        yield from with_simulation(real, sim, _shared_band_hz(real, sim, settings.reference), settings)
+        shared = _shared_stretches(real, sim)
+        for pair in with_simulation(real, sim, settings):
+            yield replace(pair, band_hz=_shared_band_hz(pair, shared)) if shared else pair
         return
     if not real.truths:
         raise real.no_truth("no simulation and no true poses", "`sim`, or poses in the log")
@@ -118,19 +120,28 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
         yield with_truth(chosen, since, started_ns, _band_hz(stretch, settings.reference), settings)
 
 
-def _shared_band_hz(real: Recording, sim: Recording, settings: ReferenceSettings) -> float | None:
-    """Band of the poses that a simulation follows, if they are the recording's own and were measured; else none.
+def _shared_stretches(real: Recording, sim: Recording) -> list[tuple[int, int, Stretch]]:
+    """Stretches of the poses that a simulation follows, from time to time (ns), if they are the recording's own and measured.
 
     Such a simulation shares the errors of the poses, and is no better a reference than they are.
     """
     if MOTION_TOPIC in real.truths:  # itself simulated, from exactly this motion
-        return None
+        return []
     for poses, other in product(real.truths.values(), sim.truths.values()):
         _, mine, theirs = np.intersect1d(poses.t_ns, other.t_ns, return_indices=True)
         if len(mine) > COPIED * len(other.t_ns) and np.array_equal(poses.p_wb[mine], other.p_wb[theirs]):
-            stretches = [stretch for stretch in smooth_motion(poses).stretches if stretch.measured]
-            return min((_band_hz(stretch, settings) for stretch in stretches), default=None)
-    return None
+            motion = smooth_motion(poses)
+            start_ns, measured = motion.start_ns, [part for part in motion.stretches if part.measured]
+            return [(start_ns + round(1e9 * p.start_s), start_ns + round(1e9 * p.end_s), p) for p in measured]
+    return []
+
+
+def _shared_band_hz(pair: Pair, stretches: Sequence[tuple[int, int, Stretch]]) -> float:
+    """Band of the stretches of poses that a simulation follows while it is compared; of all if none lasts."""
+    end_ns = pair.start_ns + 1e9 * (pair.stamp_s[-1] - pair.stamp_s[0])
+    least_ns = 1e9 * pair.settings.alignment.least_s
+    last = [stretch for a, b, stretch in stretches if min(b, end_ns) - max(a, pair.start_ns) >= least_ns]
+    return min(_band_hz(stretch, pair.settings.reference) for stretch in last or [stretch for _, _, stretch in stretches])
 
 
 def _band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:

@@ -254,12 +254,12 @@ class Diagnosis:
     caveat: str = ""
     closed: ClosedLoop | None = None
     imus: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)  # other IMUs of the log, by topic
+    start_ns: int | None = None  # of the first log, on the clock of the simulation: times count from it
 
     @classmethod
     def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:
         """A diagnosis to which only other signals are added."""
-        bias = np.full((len(reals), 6), np.nan)
-        return cls(tuple(map(str, reals)), str(sim), (), (), bias, (), {})
+        return cls(tuple(map(str, reals)), str(sim), (), (), np.full((len(reals), 6), np.nan), (), {})
 
     @property
     def mismatch(self) -> bool:

@@ -148,7 +148,8 @@ class SearchSettings(Settings, frozen=True):
     clearly_better: Positive = 10.0  # squares by which an answer has to be better, as in BIC (Kass and Raftery 1995)
     unnamed_penalty: float = 15.0  # squares that an effect outside the catalogue costs
     explained_chi_square: Positive = 1.03  # reduced: below, everything is explained
-    hopeless_chi_square: Positive = 2.0  # reduced: above, with many effects, more of the same is no answer
+    hopeless_chi_square: Positive = 2.0  # reduced: above, with many effects of which the last did little, more is no answer
+    hopeless_share: Share = 0.05  # of the misfit that was left: less is little
     most_unnamed: Annotated[int, msgspec.Meta(ge=0)] = 2  # effects outside the catalogue
     unnamed_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03  # of the misfit: each removes more, a wander too
     beyond_band: Positive = 3.0  # over the poses' band: there their smoothing looks like a mount that rings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 import msgspec
@@ -36,6 +37,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
+from imutool.sensor.effects.vibration import line_power
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS, UNITS
 
@@ -101,33 +103,35 @@ def summarize(
         remarks=(*_remarks(pairs), *_resting(pairs, hidden), *remarks(all_findings, sim_findings)),
         closer=gains(logs, before, after),
         traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
+        start_ns=pairs[0].log_start_ns + round(1e9 * pairs[0].aligned_s),
     )
 
 
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise.
+    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise. A line that
+    is stronger in the poses is theirs: those of a camera may have one at its rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
-    unbanded = replace(pair, real=pair.real - expected(pair, chosen) + expected(pair, ()), band_hz=None)
+    by_poses = expected(pair, ())
+    unbanded = replace(pair, real=pair.real - expected(pair, chosen) + by_poses, band_hz=None)
     noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
-    residual = unbanded.real - expected(unbanded, ())
-    log = WhitenedImu(unbanded, level(residual, pair.usable, 1.0 / pair.period_s, noise))
+    log = WhitenedImu(unbanded, level(unbanded.real - by_poses, pair.usable, 1.0 / pair.period_s, noise))
     found = select_effects([log], [vibration])
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
-    return [finding_of([log], found, one, noise_floor([log])) for one in faster]
+    power = partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
+    own = [one for one in faster if power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
+    return [finding_of([log], found, one, noise_floor([log])) for one in own]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
-    ideal = expected(pair, ())
-    return Traces(
-        pair.name, pair.stamp_s, pair.real, before, after, pair.held_out, pair.truth, ideal, band_hz=pair.band_hz, path=path
-    )
+    ideal, held_out = expected(pair, ()), pair.held_out
+    return Traces(pair.name, pair.stamp_s, pair.real, before, after, held_out, pair.truth, ideal, pair.band_hz, path)
 
 
 def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d: Diagnosis) -> PhysicsFile:

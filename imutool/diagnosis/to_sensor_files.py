@@ -53,6 +53,7 @@ def to_physics_file(d: Diagnosis) -> PhysicsFile:
                 )
             )
     return PhysicsFile(
+        start_ns=d.start_ns,
         effect=tuple(entries),
         bias=Bias(gyro=three(bias[:3]), accel=three(bias[3:])) if np.isfinite(bias).all() else None,
         unknown=tuple(curves),

@@ -2,6 +2,8 @@
 
 ::
 
+    start_ns = 1403715524907143168     # may be left out: stamp of the recording's first sample
+
     [[effect]]
     name = "lever_arm"                 # of the catalogue, or "driven"
     signal = "accel"                   # where it was seen
@@ -28,7 +30,8 @@
     value = [0.02, 0.0, 0.0]
     std = [0.001, 0.001, 0.001]
 
-A parameter that is left out does nothing. `driven` has parameters x, y, z (the gain on each axis) and lag (s): the signal gains
+Times count from `start_ns` along the log that was diagnosed, else from the first simulated sample. A parameter that is left
+out does nothing. `driven` has parameters x, y, z (the gain on each axis) and lag (s): the signal gains
 gain (c(t - lag) - mean of c), c the channel named by `driver`.
 """
 
@@ -109,9 +112,13 @@ class Term(Settings, frozen=True, kw_only=True):
 
 
 class PhysicsFile(Settings, frozen=True, kw_only=True):
-    """Contents of a physics.toml."""
+    """Contents of a physics.toml.
+
+    `start_ns` is the stamp from which its times count, on the clock of the log to simulate along.
+    """
 
     schema: Literal["imutool.physics/1"] = "imutool.physics/1"
+    start_ns: int | None = None
     effect: tuple[Entry, ...] = ()
     bias: Bias | None = None
     unknown: tuple[Curve, ...] = ()
@@ -173,6 +180,7 @@ def write(file: PhysicsFile, path: Path, *, overwrite: bool = False) -> None:
 def to_toml(file: PhysicsFile) -> str:
     """Text of the file."""
     lines = ["# Physics of an IMU, as `imutool simulate --physics FILE` takes it", f"schema = {_text(file.schema)}"]
+    lines += [] if file.start_ns is None else [f"start_ns = {file.start_ns}"]
     for entry in file.effect:
         lines += ["", *([OTHER] if entry.column else []), "[[effect]]", f"name = {_text(entry.name)}"]
         keys = ("signal", "driver", "column", "equation")

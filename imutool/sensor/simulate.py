@@ -109,7 +109,8 @@ def simulate(
     own_rate = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
     report(1, 4, "smoothing")
     try:
-        simulation = simulated(source, acting, sheet, _rounded(own_rate) if rate_hz is None else rate_hz, seed)
+        rate_hz = _rounded(own_rate) if rate_hz is None else rate_hz
+        simulation = simulated(source, acting, sheet, rate_hz, seed, start_ns=file.start_ns)
     except ImutoolError as error:
         raise error.at(trajectory) from error
     report(2, 4, "writing")
@@ -132,12 +133,15 @@ def simulate(
     return replace(simulation, recording=recording, settings=settings | {"output": str(out)}, remarks=remarks)
 
 
-def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int) -> Simulation:
+def simulated(
+    source: Recording, acting: Acting, noise: noises.Noise, rate_hz: float, seed: int, *, start_ns: int | None = None
+) -> Simulation:
     """Simulated IMU along the (first) true poses of a recording, on a regular clock.
 
     Samples cover every trusted stretch. Stamps are whole periods after the first pose, on the poses' clock. Samples that an
     effect of the clock takes outside a stretch are left out. The true poses in a stretch are copied as they are;
-    `/motion/pose` holds the motion itself.
+    `/motion/pose` holds the motion itself. Effects count time from `start_ns`, or from the first sample where the two lie
+    further apart than the motion lasts, so that it is another one.
 
     Raises:
         ConfigError: the rate or the seed.
@@ -160,7 +164,8 @@ def simulated(source: Recording, acting: Acting, noise: noises.Noise, rate_hz: f
     if needed:
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
     stamps = [_stamps(ideal, rate_hz) for ideal in ideals]
-    begins_s = float(stamps[0][0])  # effects count time from the first sample that is written
+    begins_s, started_s = float(stamps[0][0]), np.inf if start_ns is None else (start_ns - motion.start_ns) * 1e-9
+    begins_s = started_s if abs(started_s - begins_s) < stamps[-1][-1] - begins_s else begins_s
     since = [replace(ideal, t_s=ideal.t_s - begins_s) for ideal in ideals]
     out = simulate_stretches(
         since, [part - begins_s for part in stamps], [*acting, (_noise(noise, rate_hz, seed), np.zeros(0))]

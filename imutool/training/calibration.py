@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
-import numpy as np
 import torch
 from scipy.stats import chi2
 from torch import Tensor
@@ -26,13 +25,14 @@ from imutool.bias.hybrid import Config
 from imutool.bias.networks import hybrid
 from imutool.bias.networks import neural_ode as ode_network
 from imutool.bias.networks.network import BiasNetwork
-from imutool.bias.networks.temperature import log_signals, online_signals, temperature_scale, temperature_tensors
+from imutool.bias.networks.temperature import log_signals, temperature_scale, temperature_tensors
 from imutool.config import build, plain
 from imutool.recording import Imu, Recording
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
-from imutool.sensor.signals import SignalFilter, Signals
+from imutool.sensor.signals import Load, Signals
 from imutool.training.closed_form import widest
+from imutool.training.earlier_load import loaded_signals, signals_of
 from imutool.training.fit import Epoch, note
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Part, Pool
@@ -65,16 +65,6 @@ class Calibration:
     forms: tuple[LinearForm, ...]  # candidates
     problem: Problem  # of all candidates, on the part that they were chosen on
     named: bool  # by the settings
-
-
-def signals_of(pool: Pool) -> Signals:
-    """Signals of all logs, end to end; filters start at each log's first sample in the pool."""
-    parts = []
-    for log in range(len(pool.names)):
-        rows = pool.log == log
-        t, gyro, accel = (x[rows].cpu().double().numpy() for x in (pool.t, pool.gyro, pool.accel))
-        parts.append(SignalFilter(pool.rate_hz)(t, gyro, accel))
-    return Signals(np.concatenate([part.t_s for part in parts]), np.concatenate([part.columns for part in parts]))
 
 
 def calibrate(
@@ -208,12 +198,16 @@ def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[T
 
 @dataclass(frozen=True)
 class PhysicsFirst:
-    """Hybrid model with fitted effects, and the recordings corrected for them."""
+    """Hybrid model with fitted effects, and the recordings corrected for them.
+
+    `loads` are those before each recording.
+    """
 
     model: hybrid.Network
     fits: dict[Sensor, Calibration]
     recordings: list[Recording]
-    scale: temperature.Scale | None = None
+    scale: temperature.Scale | None
+    loads: Sequence[Load | None]
 
     @classmethod
     def of(
@@ -230,8 +224,8 @@ class PhysicsFirst:
         config = config_of(settings)
         scale = temperature_scale(recordings, config.temperature or "", wanted=bool(_warm(config)))
         model = hybrid.Network(msgspec.structs.replace(config, temperature=msgspec.UNSET), pool.rate_hz).double()
-        signals, fits = online_signals(recordings, torch.bincount(pool.log).tolist(), pool.rate_hz, scale), {}
-        gyro = pool.gyro
+        signals, loads = loaded_signals(recordings, pool, scale, config.effects("gyro"), settings.sensors)
+        gyro, fits = pool.gyro, {}
         for sensor in SENSORS:
             report(note(f"looking for effects on the {sensor}"))
             chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals, None, settings.sensors)
@@ -245,7 +239,7 @@ class PhysicsFirst:
                 gyro = pool.gyro - error - fits[sensor].rest[pool.log]
         if scale is not None and _warm(model.config):
             model.take_temperature(scale.channel, temperature_tensors(scale, recordings, model.temperature_theta()))
-        return cls(model, fits, [_corrected(model, recording, scale) for recording in recordings], scale)
+        return cls(model, fits, _corrected(model, recordings, scale, loads), scale, loads)
 
     def with_gyro_effects(self, recordings: Sequence[Recording], names: Sequence[str]) -> PhysicsFirst:
         """The same with some effects of the gyro alone, and recordings corrected for these."""
@@ -253,7 +247,7 @@ class PhysicsFirst:
         chosen = parameter_columns(temperature.forms("gyro", fit.effects), names)
         own = replace(fit, effects=tuple(names), theta=fit.theta[chosen], covariance=fit.covariance[chosen][:, chosen])
         self.model.take("gyro", names, own.theta, own.covariance)
-        corrected = [_corrected(self.model, recording, self.scale) for recording in recordings]
+        corrected = _corrected(self.model, recordings, self.scale, self.loads)
         return replace(self, fits=self.fits | {"gyro": own}, recordings=corrected)
 
     def ode_settings(self, settings: TrainSettings) -> TrainSettings:
@@ -291,7 +285,14 @@ def _warm(config: Config) -> tuple[str, ...]:
     return tuple(name for sensor in SENSORS for name in config.effects(sensor) or () if name in temperature.EFFECTS)
 
 
-def _corrected(model: hybrid.Network, recording: Recording, scale: temperature.Scale | None) -> Recording:
-    imu, signals = recording.imu, log_signals(recording, model.rate_hz, scale)
-    gyro, accel = imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals)
-    return replace(recording, imu=Imu(imu.t_ns, gyro, accel))
+def _corrected(
+    model: hybrid.Network, recordings: Sequence[Recording], scale: temperature.Scale | None, loads: Sequence[Load | None]
+) -> list[Recording]:
+    """Recordings without what the effects add, of sensors that bore some loads before."""
+
+    def corrected(recording: Recording, load: Load | None) -> Recording:
+        imu, signals = recording.imu, log_signals(recording, model.rate_hz, scale, load)
+        gyro, accel = imu.gyro - model.error("gyro", signals), imu.accel - model.error("accel", signals)
+        return replace(recording, imu=Imu(imu.t_ns, gyro, accel))
+
+    return [corrected(*pair) for pair in zip(recordings, loads, strict=True)]

@@ -194,12 +194,12 @@ def shown_by_logs(
             for narrower in NARROWER if part.start < part.stop else ():
                 other = own_prior.clone()
                 other[part] = widest(sensor, theta)[part] * narrower**2
-                tried.append((_minus_log_likelihood(H, g, theta, own, prior, other), len(tried), other))
+                tried.append((minus_log_likelihood(H, g, theta, own, prior, other), len(tried), other))
             own_prior = min(tried)[2] if tried else own_prior
     return own_prior
 
 
-def _minus_log_likelihood(
+def minus_log_likelihood(
     H: Float[Tensor, "logs k k"],
     g: Float[Tensor, "logs k"],
     theta: Float[Tensor, " p"],

@@ -36,7 +36,7 @@ from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 from imutool.training.calibration import LINEAR, Calibration, effects_beyond_chance, parameter_columns
 from imutool.training.segments import Pool
-from imutool.training.statistics import turn_on_prior
+from imutool.training.statistics import speed_of, turn_on_prior
 from imutool.units import SENSORS, Sensor
 
 STARTS = ("auto", "smooth", "truth")
@@ -191,7 +191,7 @@ def left_out_model(
     network.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     network.prior_std.copy_(torch.from_numpy(turn_on.std))
     model = network.frozen()
-    model.card = {"logs": [{}] * (len(spans) - 1), **turn_on.card()}
+    model.card = {"logs": [{}] * (len(spans) - 1), **turn_on.card(), **speed_of(pool)}
     return model
 
 

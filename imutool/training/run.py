@@ -33,6 +33,7 @@ from imutool.training.left_out import compare, simpler_effects
 from imutool.training.paper_scheme import PaperTraining
 from imutool.training.segments import Pool, check_trainable
 from imutool.training.settings import TrainSettings, settings_for
+from imutool.training.statistics import speed_of
 from imutool.units import SENSORS, Sensor
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
@@ -89,12 +90,15 @@ def train(
     warn_of_recordings(recordings)
     for recording in (recording for recording in recordings if recording.truth_caveat):
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
-    check_trainable(recordings, Pool.of(recordings))
+    pool = Pool.of(recordings)
+    check_trainable(recordings, pool)
     descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
     trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():
         model, about = trainer(recordings, chosen, descent)
-    model.card = _card(method, chosen, parts) | about | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
+    model.card = (
+        _card(method, chosen, parts) | about | speed_of(pool) | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
+    )
     io.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
     return io.load(out)

@@ -3,8 +3,8 @@
     python tests/bench/drift.py [--kind rate] [--method hybrid --set model.remainder=false] [--start truth]
 
 Six training logs of 60 to 120 s, four test logs of other motions (100 s, one of five minutes); every log is a switching-on of
-its own, cold (`tests/support/drifting.py`). With `--cut-s` the test logs begin later: warm and in motion. AOE in degrees, mean
-over the test logs.
+its own, cold (`tests/support/drifting.py`). With `--cut-s` the test logs begin later: warm and in motion; with `--warm-s` the
+training logs do, each by another of the times. AOE in degrees, mean over the test logs.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -36,6 +37,7 @@ def main() -> None:
     parser.add_argument("--start", action="append")
     parser.add_argument("--sensor", type=int, default=0)
     parser.add_argument("--cut-s", type=float, default=0.0, help="Seconds cut off at the start of each test log.")
+    parser.add_argument("--warm-s", type=float, nargs="+", default=[0.0], help="The same of the training logs, in turn.")
     options = parser.parse_args()
     methods = options.method or ["linear", "neural_ode", "hybrid"]
     columns = ["raw", *["static"] * (not options.cut_s), *methods]
@@ -43,7 +45,7 @@ def main() -> None:
     for kind in options.kind or KINDS:
         with tempfile.TemporaryDirectory() as folder:
             sensor = Drifting(kind=kind, sensor_seed=options.sensor)
-            score(Path(folder), sensor, methods, options.set, options.start or STARTS, options.cut_s)
+            score(Path(folder), sensor, methods, options.set, options.start or STARTS, options.cut_s, options.warm_s)
 
 
 def score(
@@ -53,9 +55,11 @@ def score(
     words: list[str],
     starts: list[str] | tuple[str, ...],
     cut_s: float,
+    warm_s: Sequence[float],
 ) -> None:
     """Trains every method, and prints its mean AOE for each start."""
-    training = [save(folder, seed, sensor, duration_s) for seed, duration_s in enumerate(TRAINING_S)]
+    begin_s = [warm_s[seed % len(warm_s)] for seed in range(len(TRAINING_S))]
+    training = [save(folder, seed, sensor, TRAINING_S[seed], cut) for seed, cut in enumerate(begin_s)]
     tests = [save(folder, seed, sensor, duration_s, cut_s) for seed, duration_s in enumerate(TEST_S, start=50)]
     models = ["static"] * (not cut_s)  # what is left does not begin at rest
     for method in methods:

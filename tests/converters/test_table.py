@@ -48,6 +48,7 @@ HEADERS = {
         G,
     ),
     "units at the end": (["t_ns", *(f"w{a}_dps" for a in "xyz"), *(f"acc_{a}_mg" for a in "xyz")], np.pi / 180, G / 1000),
+    "units of two words": (["t_ns", *(f"gyro_{a}_rad_s" for a in "xyz"), *(f"accel_{a}_m_s2" for a in "xyz")], 1.0, 1.0),
     "fields of ROS": (
         [
             "rosbagTimestamp",

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support import planted
 
 from imutool.diagnosis.diagnose import diagnose
@@ -17,7 +18,11 @@ from imutool.diagnosis.result import Diagnosis
 from imutool.errors import DataError, LogError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
+from imutool.noise import datasheet
 from imutool.report import json_values
+from imutool.sensor import catalogue
+from imutool.sensor.made_up_flight import flight
+from imutool.sensor.simulate import simulated
 
 SURE = 4.0
 ARM = [0.2, -0.05, 0.1]
@@ -224,6 +229,38 @@ def test_what_separates_the_two_is_never_denied(made: Made) -> None:
     found = diagnose([real], sim)
     assert found.mismatch
     assert not {one.effect for one in found.findings} - {"unknown"}
+
+
+UNCALIBRATED = {
+    "gyro_scale": [0.06, -0.08, -0.02],
+    "gyro_misalignment": [0.02, -0.03, 0.01, 0.015, -0.02, 0.02],
+    "accel_scale": [-0.02, -0.03, 0.05],
+    "accel_misalignment": [0.03, 0.02, -0.02, 0.03, -0.02, 0.015],
+    "lever_arm": [0.1, -0.05, 0.08],
+    "gravity": [0.0, 0.02, -0.015],
+}
+
+
+def test_a_sensor_that_was_never_calibrated_has_many_errors_and_each_is_named(tmp_path: Path) -> None:
+    """After four of them the misfit is still more than the noise; each takes a good part of what is left."""
+    path = flight(3, duration_s=60.0, rate_hz=100.0)
+    acting = [(catalogue.effects([name])[0], np.array(values)) for name, values in UNCALIBRATED.items()]
+    made, rng, poses = (
+        simulated(path, acting, datasheet.read("bmi160"), 100.0, 3).recording,
+        np.random.default_rng(3),
+        path.truth,
+    )
+    p_wb, turn = (
+        poses.p_wb + 1e-4 * rng.normal(size=poses.p_wb.shape),
+        Rotation.from_rotvec(1e-4 * rng.normal(size=poses.p_wb.shape)),
+    )
+    q_wb = (Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * turn).as_quat(scalar_first=True)
+    write(
+        replace(made, truths={"/pose": replace(poses, p_wb=p_wb, q_wb_wxyz=np.ascontiguousarray(q_wb))}), tmp_path / "log.mcap"
+    )
+    found = diagnose([tmp_path / "log.mcap"])
+    assert sorted(effects(found)) == sorted(UNCALIBRATED)
+    assert near(found, "gyro_scale", dict(zip("xyz", UNCALIBRATED["gyro_scale"], strict=True)))
 
 
 # ── what stamps and digits show ──

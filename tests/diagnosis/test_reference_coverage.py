@@ -45,6 +45,19 @@ def test_it_is_trusted_as_far_as_the_poses_are() -> None:
     assert band_hz(real, along(replace(real, truths={"/vicon": real.truth}))) == pytest.approx(alone.band_hz)
 
 
+def test_a_bad_stretch_of_the_poses_says_nothing_of_the_others() -> None:
+    real = made(MEASURED)
+    poses = real.truth
+    since_s = (poses.t_ns - poses.t_ns[0]) * 1e-9
+    short = (since_s > 18.0) & (since_s < 20.0)
+    shaken = poses.p_wb + short[:, None] * 0.05 * np.random.default_rng(2).normal(size=poses.p_wb.shape)
+    seen = (since_s < 16.0) | short | (since_s > 22.0)
+    real = replace(real, truths={TRUTH_TOPIC: replace(poses, p_wb=shaken).rows(seen)})
+    bands = [[pair.band_hz for pair in align(real, sim, None, DiagnoseSettings())] for sim in (None, along(real))]
+    assert len(bands[0]) == 2
+    assert bands[1] == pytest.approx(bands[0])
+
+
 def test_one_along_other_or_exact_poses_is_trusted_throughout() -> None:
     real = made(MEASURED)
     sim = along(real)

@@ -11,16 +11,20 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 from support import planted
 
+from imutool.diagnosis.diagnose import candidates_for
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.reference_coverage import align
 from imutool.diagnosis.reference_errors import SMOOTHED, turned_reference
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.recording import Poses
+from imutool.diagnosis.summarize import vibration_above_band
+from imutool.recording import Poses, seconds
 from imutool.sensor import catalogue
+from imutool.sensor.made_up_flight import flight
 
 DURATION_S, SLOW_S = 90.0, 1.0
+LINE_HZ, LINE_M = 20.0, 5e-5
 TURNED = np.array([-0.01, 0.02, 0.045])
 SETTINGS = DiagnoseSettings()
 
@@ -83,3 +87,17 @@ def test_poses_that_are_turned_against_slow_motion_alone_are_wrong_by_that_rotat
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_right_poses_and_a_mount_that_is_turned_are_no_error_of_the_reference(share: float) -> None:
     assert found(share, share) == []
+
+
+@pytest.mark.parametrize(("in_poses", "in_samples", "named"), [(LINE_M, 0.0, False), (0.0, 0.2, True)], ids=["poses", "sensor"])
+def test_a_line_of_the_poses_is_no_vibration_of_the_sensor(in_poses: float, in_samples: float, named: bool) -> None:
+    """At 20 Hz, as of a camera: above the band in which poses are trusted."""
+    real = flight(3, duration_s=40.0, rate_hz=100.0, truth_noise_rad=1e-5, truth_noise_m=1e-5)
+    since_s, pose_s = (seconds(t_ns, int(real.imu.t_ns[0])) for t_ns in (real.imu.t_ns, real.truth.t_ns))
+    line, shaken = (np.sin(2.0 * np.pi * LINE_HZ * t_s)[:, None] * [1.0, -0.5, 0.7] for t_s in (since_s, pose_s))
+    poses = replace(real.truth, p_wb=real.truth.p_wb + in_poses * shaken)
+    real = replace(real, imu=replace(real.imu, accel=real.imu.accel + in_samples * line), truths={"/pose": poses})
+    logs = [whitened(pair, candidates_for([pair]), SETTINGS.band) for pair in align(real, None, None, SETTINGS)]
+    found = vibration_above_band(logs, ())
+    assert [one.effect for one in found] == (["vibration"] if named else [])
+    assert all(one.parameters["f"].value == pytest.approx(LINE_HZ, abs=0.01) for one in found)

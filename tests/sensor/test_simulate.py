@@ -168,6 +168,14 @@ def test_the_clock_and_the_sensor_know_of_no_holes() -> None:
     assert len(out.truth) < (~hole).sum()
 
 
+def test_times_count_from_the_recordings_first_sample_where_that_is_of_this_motion() -> None:
+    drift = planted("drift", Stage.SENSOR, lambda read, _: read.with_readings(gyro=read.stamp_s[:, None] * np.ones(3)))
+    for start_ns, begins_s in ((START_NS - 700_000_000, -0.7), (START_NS - 10**18, None), (None, None)):
+        imu = simulated(recording(resting()), [drift], NONE, RATE_HZ, 0, start_ns=start_ns).recording.imu
+        since_s = elapsed(imu) - (elapsed(imu)[0] if begins_s is None else begins_s)
+        np.testing.assert_allclose(imu.gyro[:, 0], since_s, atol=1e-6)
+
+
 def test_a_temperature_comes_from_the_log_and_goes_into_the_new_one() -> None:
     (temperature,) = catalogue.effects(["temperature"])
     truth = resting()

@@ -43,13 +43,15 @@ class Drive:
     turn: np.ndarray
 
 
-def drive(seed: int = 0, duration_s: float = 60.0, lever_b: np.ndarray = LEVER_B, mount: Rotation = R_VB) -> Drive:
+def drive(
+    seed: int = 0, duration_s: float = 60.0, lever_b: np.ndarray = LEVER_B, mount: Rotation = R_VB, usual_m_s: float = 1.0
+) -> Drive:
     """Drive that rests, then accelerates, brakes and turns."""
     rng = np.random.default_rng(seed)
     t = np.arange(round(duration_s * 500) + 1) / 500.0
     moving = np.clip((t - STILL_S) / 1.0, 0.0, 1.0) ** 3
     waves = [np.sin(2 * np.pi * rng.uniform(0.05, 0.25, 4)[:, None] * t + rng.uniform(0, 6, (4, 1))).sum(axis=0) for _ in "vw"]
-    speed, turn = moving * (1.0 + 0.4 * waves[0]), moving * 0.35 * waves[1]
+    speed, turn = moving * usual_m_s * (1.0 + 0.4 * waves[0]), moving * 0.35 * waves[1]
     yaw = np.cumsum(turn) / 500.0
     p = np.cumsum(speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))]), axis=0) / 500.0
     R_wv = Rotation.from_euler("z", yaw[:, None])

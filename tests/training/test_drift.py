@@ -22,12 +22,16 @@ TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
 FEW = ("steps=1", "samples=500", "gyro_window_s=[1.0]", "accel_window_s=[0.5]")
 BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
+BETTER_WARM = 1.5  # four logs hardly tell how long each of them was on; taken for cold, they show no warm-up at all
 
 
-def saved(folder: Path, kind: Kind, first: int, durations_s: tuple[float, ...]) -> list[Path]:
+def saved(folder: Path, kind: Kind, first: int, durations_s: tuple[float, ...], on_s: tuple[float, ...] = ()) -> list[Path]:
+    """Logs on disk, of sensors that were on for `on_s` before."""
     paths = [folder / f"{seed}.mcap" for seed in range(first, first + len(durations_s))]
-    for seed, (path, duration_s) in enumerate(zip(paths, durations_s, strict=True), start=first):
-        write(log(seed, Drifting(kind=kind, rate_hz=50.0, lag_s=15.0), duration_s), path)
+    for k, (path, duration_s) in enumerate(zip(paths, durations_s, strict=True)):
+        before_s = on_s[k] if on_s else 0.0
+        whole = log(first + k, Drifting(kind=kind, rate_hz=50.0, lag_s=15.0), before_s + duration_s)
+        write(whole.between(int(whole.imu.t_ns[0] + 1e9 * before_s), int(whole.imu.t_ns[-1])), path)
     return paths
 
 
@@ -59,6 +63,20 @@ def test_no_drift_is_found_where_there_is_none(tmp_path: Path) -> None:
     model = trained(tmp_path, saved(tmp_path, "none", 0, TRAINING_S), "hybrid", *ALONE)
     assert isinstance(model.config, Config)
     assert not {*DRIFTS, "gyro_bias_drift"} & {*(model.config.gyro_effects or ())}
+
+
+def test_training_logs_tell_how_long_their_sensor_was_on(tmp_path: Path) -> None:
+    """What is learned from logs that begin warm, each by another time, holds for a cold sensor."""
+    logs = saved(tmp_path, "warm_up", 0, TRAINING_S, on_s=(0.0, 10.0, 20.0, 100.0))
+    trained(tmp_path, logs, "linear")
+    model = trained(tmp_path, logs, "hybrid", *ALONE)
+    assert isinstance(model.config, Config)
+    assert "gyro_warm_up" in (model.config.gyro_effects or ())
+    (test,) = saved(tmp_path, "warm_up", 50, TEST_S)
+    models = ["static", *(str(tmp_path / f"{method}.safetensors") for method in ("linear", "hybrid"))]
+    for init in ("truth", "auto"):
+        _, static, linear, hybrid = (result["aoe_deg"] for result in evaluate(test, models=models, init=init))
+        assert BETTER_WARM * hybrid < min(static, linear), init
 
 
 def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path, loaded: tuple[list[Path], Path]) -> None:

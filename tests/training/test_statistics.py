@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from imutool.bias_start.initial_bias import AT_REST_STD
-from imutool.training.statistics import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, turn_on_prior
+from imutool.recording import Imu, Poses, Recording
+from imutool.training.segments import Pool
+from imutool.training.statistics import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, speed_of, turn_on_prior
 
 HOUR_NS = 3600 * 10**9
 USUAL = np.array([USUAL_STD["gyro"]] * 3 + [USUAL_STD["accel"]] * 3)
@@ -74,3 +77,18 @@ def test_a_shift_at_rest_has_to_be_shown_by_the_logs_together() -> None:
     assert shift[0] > 5e-3
     np.testing.assert_array_equal(shift[3:], AT_REST_STD[3:])
     np.testing.assert_array_equal(shift_at_rest([np.zeros((0, 6))], std[:1]), AT_REST_STD)
+
+
+def test_logs_of_a_vehicle_widen_the_bound_on_speed() -> None:
+    """Fifteen metres a second on a circle that takes 20 s, and the same path a hundred times smaller."""
+    t_s, rate = np.arange(0.0, 100.0, 0.05), 2 * np.pi / 20.0
+    heading = Rotation.from_rotvec(np.outer(rate * t_s, [0.0, 0.0, 1.0])).as_quat(scalar_first=True)
+    t_ns, speeds = np.round(1e9 * t_s).astype(np.int64), {}
+    imu = Imu(t_ns, np.tile([0.0, 0.0, rate], (len(t_s), 1)), np.tile([0.0, 15.0 * rate, 9.81], (len(t_s), 1)))
+    for speed in (0.15, 15.0):
+        p_wb = speed / rate * np.stack([np.sin(rate * t_s), 1.0 - np.cos(rate * t_s), 0.0 * t_s], axis=1)
+        speeds[speed] = speed_of(Pool.of([Recording("circle", imu, {"/pose": Poses(t_ns, p_wb, heading)})]))
+    assert speeds[0.15] == {}
+    found = speeds[15.0]["speed"]
+    np.testing.assert_allclose(found["speed_m_s"], 15.0 / np.sqrt(3.0), rtol=0.02)
+    assert 1.0 < found["speed_correlation_s"] < 20.0

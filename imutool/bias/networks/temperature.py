@@ -15,7 +15,7 @@ from imutool.bias.temperature import Scale, channel_of, holding
 from imutool.errors import ConfigError
 from imutool.mcap_io.temperature import is_temperature
 from imutool.recording import Recording, Scalars, seconds
-from imutool.sensor.signals import TEMPERATURE_TERMS, SignalFilter, Signals
+from imutool.sensor.signals import TEMPERATURE_TERMS, Load, SignalFilter, Signals
 from imutool.units import Sensor
 
 LEAST_RANGE_K = 1.0  # over all logs: less tells nothing about a temperature
@@ -69,22 +69,31 @@ def temperature_terms(recording: Recording, scale: Scale) -> Float64[np.ndarray,
     return np.asarray(scale.terms(found[1])[holding(found[1].t_ns, recording.imu.t_ns)])
 
 
-def log_signals(recording: Recording, rate_hz: float, scale: Scale | None) -> Signals:
-    """Signals of a whole log, with the terms of its temperature."""
+def log_signals(recording: Recording, rate_hz: float, scale: Scale | None, load: Load | None) -> Signals:
+    """Signals of a whole log, with the terms of its temperature.
+
+    `load` is that before its first sample.
+    """
     imu = recording.imu
-    found = SignalFilter(rate_hz)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    found = SignalFilter(rate_hz, load=load)(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
     return found if scale is None else Signals(found.t_s, found.columns, temperature_terms(recording, scale))
 
 
-def online_signals(recordings: Sequence[Recording], counts: Sequence[int], rate_hz: float, scale: Scale | None) -> Signals:
+def online_signals(
+    recordings: Sequence[Recording],
+    counts: Sequence[int],
+    rate_hz: float,
+    scale: Scale | None,
+    loads: Sequence[Load | None],
+) -> Signals:
     """Signals of so many samples of each log from its first true pose on.
 
-    Filters and time start where the log does.
+    Filters and time start where the log does. `loads` are those before each log.
     """
     parts: list[Signals] = []
-    for recording, count in zip(recordings, counts, strict=True):
+    for recording, count, load in zip(recordings, counts, loads, strict=True):
         first = int(np.searchsorted(recording.imu.t_ns, recording.overlap().imu.t_ns[0]))
-        parts.append(log_signals(recording, rate_hz, scale).rows(slice(first, first + count)))
+        parts.append(log_signals(recording, rate_hz, scale, load).rows(slice(first, first + count)))
     warm = None if scale is None else np.concatenate([part.temperature for part in parts if part.temperature is not None])
     return Signals(np.concatenate([part.t_s for part in parts]), np.concatenate([part.columns for part in parts]), warm)
 

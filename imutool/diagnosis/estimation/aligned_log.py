@@ -106,6 +106,11 @@ class AlignedLog(ABC):
         """Median time between recorded samples."""
         return float(np.median(np.diff(self.stamp_s)))
 
+    @property
+    def log_start_ns(self) -> int:
+        """Stamp of the log's first sample, from which `stamp_s` counts."""
+        return self.start_ns - round(float(self.stamp_s[0]) * 1e9)
+
     def starts(self, effect: Effect) -> list[Theta]:
         """Parameters to start a fit of an effect from."""
         if effect.starts is None:

@@ -95,14 +95,15 @@ def select_effects(
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
-    search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
+    search, settings, waiting, before = replace(first, unnamed=tuple(unnamed)), first.settings, list(later), now
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
         hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
+        hopeless &= before.objective - now.objective < settings.hopeless_share * (before.objective - now.numbers)
         better = search.added(now) if count < settings.most_effects and not hopeless else None
         if better is not None:
-            now = search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
+            before, now = now, search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
         else:
@@ -182,11 +183,9 @@ class _Search:
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
-                if effect.key == mine.key:
-                    if effect.linear:  # its score is its gain
-                        break
-                    continue
-                if log_p > own_log_p and not mine.linear:
+                if effect.key == mine.key and effect.linear:  # its score is its gain
+                    break
+                if effect.key == mine.key or (log_p > own_log_p and not mine.linear):
                     continue
                 limit = without.objective - self.settings.rival_share * (without.objective - now.objective)
                 trial = self.tried_with(others, effect, start, without, limit)

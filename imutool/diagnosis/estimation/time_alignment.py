@@ -34,12 +34,8 @@ MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and powe
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
-def with_simulation(
-    real: Recording, sim: Recording, band_hz: float | None = None, settings: DiagnoseSettings = DEFAULT
-) -> list[Pair]:
+def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT) -> list[Pair]:
     """Align a recording with each stretch of a simulation of the same motion.
-
-    The simulation is true up to `band_hz`; none: throughout.
 
     Raises:
         DataError: the two share too little time, or are not of one motion.
@@ -62,7 +58,7 @@ def with_simulation(
     shared_s = [_shared_s(stamp_s, inside) for _, _, inside in found]
     least_s = min(settings.alignment.least_s, max(shared_s))
     return [
-        _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, band_hz, settings)
+        _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, None, settings)
         for (ideal, noise, inside), shared in zip(found, shared_s, strict=True)
         if shared >= least_s
     ]

@@ -25,6 +25,14 @@ def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "
 waves_of = Remembered(_waves)
 
 
+def line_power(
+    stamp_s: Float64[np.ndarray, " n"], samples: Float64[np.ndarray, "n k"], f_hz: float, *, noise: Float64[np.ndarray, " k"]
+) -> float:
+    """Power of samples at a frequency over that of their noise, all columns together."""
+    each = np.exp(-2j * np.pi * f_hz * stamp_s) @ (samples - samples.mean(axis=0)) / noise
+    return float((np.abs(each) ** 2).sum())
+
+
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
     waves = waves_of(motion.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T

@@ -1,0 +1,153 @@
+"""Signals of training logs, and the load that the sensor bore before each log.
+
+The states z of a drift K z begin at zero in a cold sensor. A sensor that was in use before begins with what its load left,
+z_0 exp(-t / tau). As for a log to debias (`imutool.bias_start.earlier_load`), z_0 is what the mean load of the log would have
+left after a time T, so that T is the only new unknown of a log. The times are those of the largest likelihood of all logs
+together, with every other unknown integrated out; the sensor of a log is as likely cold as not.
+
+With the times given the decay is linear in K, as the drift is. So one linearisation with a free decay serves for all times, and
+a small matrix for each log and time puts K z_0 in the place of its amplitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from imutool.array_types import Float, Float64
+from imutool.bias import temperature
+from imutool.bias.networks.temperature import online_signals
+from imutool.bias_start.earlier_load import EARLIER_S, PRIOR, loads_after
+from imutool.bias_start.fitness import head
+from imutool.recording import Recording, seconds
+from imutool.sensor import catalogue
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.linear_form import LinearForm, linear_form
+from imutool.sensor.samples import SensorSamples
+from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
+from imutool.training.closed_form import minus_log_likelihood
+from imutool.training.normal_equations import Problem, Seen, linearise
+from imutool.training.segments import Pool
+from imutool.training.settings import SensorPrior
+from imutool.units import AXES
+
+COLD = 0  # index of the time zero
+SWEEPS = 5
+
+
+def _decayed(samples: SensorSamples, theta: Theta) -> SensorSamples:
+    z = np.exp(-samples.stamp_s[:, None] / LOAD_TAU_S)
+    return samples.with_added("gyro", z @ theta.reshape(3, len(LOAD_TAU_S)).T)
+
+
+DECAY = Effect(
+    "gyro_decay",
+    Stage.SENSOR,
+    ("gyro",),
+    "gyro += sum_k A_k exp(-t / tau_k)",
+    tuple(Parameter(f"{axis}_{tau_s:g}s", "rad/s", 0.01) for axis in AXES for tau_s in LOAD_TAU_S),
+    "the log is longer than tau",
+    _decayed,
+    diagnosed=False,
+)
+
+
+def _behind_load(form: LinearForm) -> bool:
+    """Whether an effect is a drift behind the load."""
+    return form.columns is not None and int(form.columns.min()) >= LOAD.start
+
+
+def signals_of(pool: Pool) -> Signals:
+    """Signals of all logs, end to end; filters start at each log's first sample in the pool."""
+    parts = []
+    for log in range(len(pool.names)):
+        rows = pool.log == log
+        t, gyro, accel = (x[rows].cpu().double().numpy() for x in (pool.t, pool.gyro, pool.accel))
+        parts.append(SignalFilter(pool.rate_hz)(t, gyro, accel))
+    return Signals(np.concatenate([part.t_s for part in parts]), np.concatenate([part.columns for part in parts]))
+
+
+def loaded_signals(
+    recordings: Sequence[Recording],
+    pool: Pool,
+    scale: temperature.Scale | None,
+    names: Sequence[str] | None,
+    sensors: SensorPrior,
+) -> tuple[Signals, list[Load | None]]:
+    """Signals of the samples in a pool, and the load before each log.
+
+    None where its sensor is taken for cold. `names` are effects of the gyro that may explain it: every trained one by default.
+    """
+    counts = torch.bincount(pool.log).tolist()
+    loads: list[Load | None] = [None] * len(recordings)
+    signals = online_signals(recordings, counts, pool.rate_hz, scale, loads)
+    forms = catalogue.trained("gyro", None if names is None else [name for name in names if name not in temperature.EFFECTS])
+    if not any(_behind_load(form) for form in forms):
+        return signals, loads
+    problem = linearise(Seen(pool, "gyro", signals, pool.gyro, sensors), (*forms, linear_form(DECAY, "gyro")), "train")
+    tried = [_loads(recording, pool.rate_hz) for recording in recordings]
+    times = _likeliest(problem, [[_decay_matrix(forms, load) for load in some] for some in tried])
+    loads = [some[time] if time != COLD else None for some, time in zip(tried, times, strict=True)]
+    return (online_signals(recordings, counts, pool.rate_hz, scale, loads) if any(times) else signals), loads
+
+
+def _loads(recording: Recording, rate_hz: float) -> Float64[np.ndarray, "t 3 11"]:
+    """States that a log may begin with, for each of the times."""
+    imu = recording.imu
+    return loads_after(rate_hz, head([(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)]))
+
+
+def _decay_matrix(forms: Sequence[LinearForm], load: Load) -> Float[Tensor, "d p"]:
+    """Matrix from the parameters of effects to the decay that an earlier load leaves: A = D theta."""
+    own = []
+    for form in forms:
+        D = np.zeros((len(AXES), len(LOAD_TAU_S), len(form.parameters)))
+        if _behind_load(form):
+            assert form.columns is not None
+            place = form.columns - LOAD.start
+            by_term = load.ravel()[place][:, None] * (place[:, None] // LOADS == np.arange(len(LOAD_TAU_S)))
+            D = np.einsum("qk,iqp->ikp", by_term, form.pattern)
+        own.append(D.reshape(-1, len(form.parameters)))
+    return torch.from_numpy(np.concatenate(own, axis=1))
+
+
+def _likeliest(problem: Problem, decays: Sequence[Sequence[Float[Tensor, "d p"]]]) -> list[int]:
+    """Index of each log's time, the likeliest of all logs together: one log after the other, from every common time."""
+    fit, logs = problem.fit.moved(-problem.theta), range(len(decays))
+    merged = [[_merged(fit.H[log], fit.g[log], D) for D in decays[log]] for log in logs]
+    prior = problem.prior[: decays[0][0].shape[1]]
+
+    @cache
+    def minus_twice(times: tuple[int, ...]) -> float:
+        H, g = (torch.stack([merged[log][time][part] for log, time in enumerate(times)]) for part in (0, 1))
+        found = minus_log_likelihood(H, g, torch.zeros_like(prior), problem.own, prior, problem.own_prior)
+        return found - 2.0 * float(np.log(PRIOR[list(times)]).sum())
+
+    best: list[tuple[float, tuple[int, ...]]] = []
+    for start in range(len(EARLIER_S)):
+        times = (start,) * len(decays)
+        for _ in range(SWEEPS):
+            before = times
+            for log in logs:
+                times = min(((*times[:log], time, *times[log + 1 :]) for time in range(len(EARLIER_S))), key=minus_twice)
+            if times == before:
+                break
+        best.append((minus_twice(times), times))
+    return list(min(best)[1])
+
+
+def _merged(
+    H: Float[Tensor, "k k"], g: Float[Tensor, " k"], D: Float[Tensor, "d p"]
+) -> tuple[Float[Tensor, "m m"], Float[Tensor, " m"]]:
+    """Loss of a log with D theta in the place of its decay."""
+    decay, parameters = D.shape
+    others = len(g) - parameters - decay
+    B = torch.zeros(len(g), parameters + others).to(g)
+    B[:parameters, :parameters] = torch.eye(parameters).to(g)
+    B[parameters : parameters + decay, :parameters] = D.to(g)
+    B[parameters + decay :, parameters:] = torch.eye(others).to(g)
+    return B.mT @ H @ B, B.mT @ g
