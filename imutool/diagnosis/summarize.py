@@ -126,7 +126,8 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
     power = partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     own = [one for one in faster if power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
-    return [finding_of([log], found, one, noise_floor([log])) for one in own]
+    findings = [finding_of([log], found, one, noise_floor([log])) for one in own]
+    return [finding for finding in findings if finding.share > 0.0]  # as of all that is found
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
