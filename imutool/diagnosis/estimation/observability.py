@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -119,10 +119,16 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
 def with_steady_clock(
     logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Mapping[str, Sequence[Theta]]
 ) -> Fit:
-    """Fit with two of offset, skew and jump instead of a clock that wanders.
+    """Fit with two of offset, skew and jump instead of a clock that wanders, and an offset instead of one that jumps.
 
-    If they do as well (BIC); `starts` by effect.
+    If they do as well (BIC); `starts` by effect. A jump has to be clearly better: one right after the start is an offset.
     """
+    offsets = [effect for effect in named if effect.name == "clock_offset" and effect.key not in now.keys]
+    jumps = [entry for entry in now.chosen if entry[0].name == "clock_jump"]
+    for offset, (jump, (_, step)) in product(offsets, jumps):
+        rest = tuple(entry for entry in now.chosen if entry[0] is not jump)
+        constant = fit(logs, (*rest, (offset, np.array([step]))), near=now)
+        now = constant if bic(constant) < bic(now) + now.logs[0].pair.settings.search.clearly_better else now
     others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
     if len(others) == len(now.chosen):
         return now

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.observability import FOLLOWING, below_model_error, beyond_the_band, unobservable
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.observability import (
+    FOLLOWING,
+    below_model_error,
+    beyond_the_band,
+    unobservable,
+    with_steady_clock,
+)
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor import catalogue
@@ -118,3 +125,16 @@ def test_a_mount_beyond_the_poses_has_to_ring_in_the_samples(
     log = planted.weighed(replace(planted.pair(felt, real, 1), band_hz=band_hz))
     ((effect, theta),) = planted.acting({"mount_resonance": RINGS})
     assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
+
+
+@pytest.mark.parametrize(
+    ("truth", "named"), [({"clock_offset": [0.01]}, "clock_offset"), ({"clock_jump": [6.0, 0.01]}, "clock_jump")]
+)
+def test_a_clock_that_jumps_right_after_the_start_has_an_offset(truth: dict[str, list[float]], named: str) -> None:
+    """Where it is right, a jump after a quarter of the log stays one."""
+    logs = [planted.weighed(planted.pair(planted.rich(), truth))]
+    jump, *others = catalogue.diagnosed(["clock_jump", "clock_offset", "clock_skew"])
+    found = fit(logs, ((jump, np.array([1.0 if named == "clock_offset" else 6.0, 0.01])),))
+    simpler = with_steady_clock(logs, found, (jump, *others), {})
+    assert simpler.keys == (named,)
+    assert simpler.chosen[0][1][-1] == pytest.approx(0.01, abs=1e-4)
