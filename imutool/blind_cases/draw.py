@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
@@ -26,9 +27,20 @@ from imutool.blind_cases.effects import ACCEL, GYRO, Model, Six, Stage, Theta
 from imutool.errors import ConfigError, DataError
 from imutool.noise.datasheet import SHEETS, Noise
 
-Kind = Literal["single", "pair", "null", "driven", "unknown"]
+Kind = Literal["single", "pair", "null", "driven", "unknown", "uncalibrated"]
 Size = Literal["large", "middle", "small"]
 KINDS, SIZES = get_args(Kind), get_args(Size)
+MANY = 5  # of the errors of a sensor that was never calibrated
+UNCALIBRATED = (
+    "gyro_scale",
+    "accel_scale",
+    "gyro_misalignment",
+    "accel_misalignment",
+    "gyro_g_sensitivity",
+    "lever_arm",
+    "gravity",
+    "clock_offset",
+)
 CHANCES = {"single": 0.45, "pair": 0.2, "null": 0.1, "driven": 0.1, "unknown": 0.15}
 FACTOR = {"large": 1.0, "middle": 0.25}
 FIXED_SMALL = {"dropped_samples": 1 / 16, "timestamp_jitter": 1 / 16, "quantization": 1 / 8, "reference_error": 1 / 8}
@@ -79,8 +91,8 @@ def draw_effects(seen: Detectability, rng: Generator, kind: Kind, size: Size, ef
             raise ConfigError(f"no effect is called {name!r}", where="conceal", expected=f"one of {', '.join(CATALOGUE)}")
     if kind == "null":
         return Concealed(kind, size)
-    if kind == "pair":
-        return _pair(seen, rng, size, effects)
+    if kind in ("pair", "uncalibrated"):
+        return _together(seen, rng, kind, size, effects)
     for _ in range(TRIES):
         for model, theta in _candidates(seen, rng, kind, effects):
             found = sized(seen, model, theta, size)
@@ -89,21 +101,24 @@ def draw_effects(seen: Detectability, rng: Generator, kind: Kind, size: Size, ef
     raise _hidden(kind, size, effects)
 
 
-def _pair(seen: Detectability, rng: Generator, size: Size, effects: Sequence[str]) -> Concealed:
+def _together(seen: Detectability, rng: Generator, kind: Kind, size: Size, effects: Sequence[str]) -> Concealed:
+    """Several effects, of which none explains another."""
+    count = 2 if kind == "pair" else MANY
+    names = effects if effects or kind == "pair" else [str(name) for name in rng.permutation(UNCALIBRATED)]
     for _ in range(TRIES):
         found: list[tuple[Model, Theta, float]] = []
-        for model, theta in _candidates(seen, rng, "single", effects):
-            if found and any({found[0][0].name, model.name} <= row for row in ALIKE):
+        for model, theta in _candidates(seen, rng, "single", names):
+            if any({before.name, model.name} <= row for before, *_ in found for row in ALIKE):
                 continue
             at_size = None if model.name in ALONE else sized(seen, model, theta, size)
             if at_size is not None:
                 found.append((model, *at_size))
-            if len(found) == 2:
+            if len(found) == count:
                 break
-        if len(found) == 2 and distinct(seen, found[0][:2], found[1][:2]):
+        if len(found) == count and all(distinct(seen, one[:2], other[:2]) for one, other in combinations(found, 2)):
             acting, factors = tuple((m, theta) for m, theta, _ in found), tuple(factor for *_, factor in found)
-            return Concealed("pair", size, acting, factors)
-    raise _hidden("pair", size, effects)
+            return Concealed(kind, size, acting, factors)
+    raise _hidden(kind, size, effects)
 
 
 def _candidates(seen: Detectability, rng: Generator, kind: str, effects: Sequence[str]) -> list[tuple[Model, Theta]]:

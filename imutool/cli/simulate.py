@@ -96,7 +96,7 @@ def simulate(
 def conceal(
     places: Annotated[list[Path], typer.Argument(metavar="[TRAJECTORY] DIR", help="A log with true poses; the case's folder.")],
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the case; by default random.")] = None,
-    kind: Annotated[str, typer.Option(help="single, pair, null, driven, unknown or any.")] = "any",
+    kind: Annotated[str, typer.Option(help="single, pair, null, driven, unknown, uncalibrated or any.")] = "any",
     size: Annotated[str, typer.Option(help="large (plausible), middle (a quarter), small (just visible) or any.")] = "any",
     noise: Annotated[str, typer.Option(help="any, adis16448, bmi160, navigation or a TOML file.")] = "any",
     longest: Annotated[

@@ -8,8 +8,9 @@ a case in DIR/cases.jsonl, one Markdown table at the end (`--table` prints that 
 --resume goes on where it stopped; --again diagnoses the cases that are there anew, for whoever works on the estimator, and its
 lines say so. --no-sim gives diagnose the recording alone, against its own poses; sizes are drawn for a simulation, so the table
 then parts the cases that poses with their noise show to an optimal test, as clearly as a simulation has to, from the others.
---mujoco takes cases of the second generator. --only null deals cases of that kind alone. Do not choose settings of the
-estimator by cases on trajectories that are kept for testing.
+--mujoco takes cases of the second generator. --only null deals cases of that kind alone, --only uncalibrated such as are not in
+the deck, of five errors of calibration each. Do not choose settings of the estimator by cases on trajectories that are kept
+for testing.
 """
 
 from __future__ import annotations
@@ -58,13 +59,16 @@ def deck() -> list[Task]:
     return tasks
 
 
+MANY = [Task("uncalibrated", size, ()) for size in SIZES[:2]]  # dealt alone
+
+
 def dealt(cases: int, seed: int, only: str = "") -> list[Task]:
     """So many of the deck (again and again), shuffled so that any first part has the kinds in proportion."""
     rng = np.random.default_rng(seed)
     out: list[Task] = []
     while len(out) < cases:
         placed = []
-        tasks = [task for task in deck() if only in ("", task.kind)]
+        tasks = MANY if only == MANY[0].kind else [task for task in deck() if only in ("", task.kind)]
         for kind in sorted({task.kind for task in tasks}):
             mine = [task for task in tasks if task.kind == kind]
             order = rng.permutation(len(mine))
@@ -260,7 +264,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--trajectories", type=Path, nargs="+", default=[])
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--only", default="", choices=["", "single", "pair", "driven", "unknown", "null"])
+    parser.add_argument("--only", default="", choices=["", "single", "pair", "driven", "unknown", "null", "uncalibrated"])
     for name in ("--no-sim", "--resume", "--again", "--table", "--mujoco", "--only-conceal"):
         parser.add_argument(name, action="store_true")
     options = parser.parse_args()

@@ -376,12 +376,14 @@ def test_a_case_drawn_beside_a_simulation_is_shown_by_good_poses_and_not_by_bad_
     assert POSES.is_detectable(POSES.beside_poses(scene, (5e-3, 1e-1)), draw.Concealed("null", "middle"))
 
 
-def test_pairs_hold_two_different_things(scene: Scene) -> None:
+@pytest.mark.parametrize(("kind", "count"), [("pair", 2), ("uncalibrated", draw.MANY)])
+def test_several_effects_are_different_things(scene: Scene, kind: draw.Kind, count: int) -> None:
     seen = detectability(scene)
     for seed in range(5):
-        (one, _), (other, _) = draw.draw_effects(seen, default_rng(seed), "pair", "large").acting
-        assert one.name != other.name
-        assert not any({one.name, other.name} <= row for row in draw.ALIKE)
+        names = {model.name for model, _ in draw.draw_effects(seen, default_rng(seed), kind, "large").acting}
+        assert len(names) == count
+        assert all(len(names & row) <= 1 for row in draw.ALIKE)
+        assert kind == "pair" or names <= {*draw.UNCALIBRATED}
 
 
 # ── the seal ──
