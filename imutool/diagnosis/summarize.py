@@ -37,7 +37,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
-from imutool.sensor.effects.vibration import line_power
+from imutool.sensor.effects.vibration import line_p_value, line_power
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS, UNITS
 
@@ -110,24 +110,24 @@ def summarize(
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise. A line that
-    is stronger in the poses is theirs: those of a camera may have one at its rate.
+    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise, from whose
+    colour a line stands out. One that is stronger in the poses is theirs, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
-    by_poses = expected(pair, ())
-    unbanded = replace(pair, real=pair.real - expected(pair, chosen) + by_poses, band_hz=None)
+    by_poses, residual = expected(pair, ()), pair.real - expected(pair, chosen)
     noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
-    log = WhitenedImu(unbanded, level(unbanded.real - by_poses, pair.usable, 1.0 / pair.period_s, noise))
+    white = level(residual, pair.usable, 1.0 / pair.period_s, noise)
+    log = WhitenedImu(replace(pair, real=residual + by_poses, band_hz=None), white)
     found = select_effects([log], [vibration])
+    chance, power = pair.settings.search.false_discovery_rate, partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
-    power = partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     own = [one for one in faster if power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
-    findings = [finding_of([log], found, one, noise_floor([log])) for one in own]
-    return [finding for finding in findings if finding.share > 0.0]  # as of all that is found
+    clear = [one for one in own if line_p_value(residual, 1.0 / pair.period_s, one.theta[0]) < chance]
+    return [finding_of([log], found, one, noise_floor([log])) for one in clear]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:

@@ -21,6 +21,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.summarize import vibration_above_band
 from imutool.recording import Poses, seconds
 from imutool.sensor import catalogue
+from imutool.sensor.effects.vibration import line_p_value
 from imutool.sensor.made_up_flight import flight
 
 DURATION_S, SLOW_S = 90.0, 1.0
@@ -101,3 +102,14 @@ def test_a_line_of_the_poses_is_no_vibration_of_the_sensor(in_poses: float, in_s
     found = vibration_above_band(logs, ())
     assert [one.effect for one in found] == (["vibration"] if named else [])
     assert all(one.parameters["f"].value == pytest.approx(LINE_HZ, abs=0.01) for one in found)
+
+
+def test_coloured_noise_has_no_line() -> None:
+    """It is as strong at one frequency as the line is at its own, but no stronger than around it."""
+    rng, t_s = np.random.default_rng(5), np.arange(6000) / 100.0
+    coloured = gaussian_filter1d(rng.normal(size=(6000, 6)), 3.0, axis=0)
+    frequency = np.fft.rfftfreq(6000, 0.01)
+    strongest = float(frequency[5 + np.argmax((np.abs(np.fft.rfft(coloured, axis=0)) ** 2).sum(axis=1)[5:])])
+    assert line_p_value(coloured, 100.0, strongest) > SETTINGS.search.false_discovery_rate
+    line = coloured + 0.05 * np.sin(2.0 * np.pi * 12.3 * t_s)[:, None]
+    assert line_p_value(line, 100.0, 12.3) < 1e-9

@@ -33,6 +33,19 @@ def line_power(
     return float((np.abs(each) ** 2).sum())
 
 
+def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: float) -> float:
+    """p-value of a line, all columns together: what stands out so far from noise of any colour, at any frequency."""
+    from scipy.ndimage import median_filter
+    from scipy.signal import periodogram
+    from scipy.stats import gamma
+
+    frequency, power = periodogram(samples, rate_hz, "hann", axis=0)
+    level = median_filter(power, (ABOUT // FINER, 1)) / np.log(2.0) + np.finfo(np.float64).tiny  # mean of what is exponential
+    at = int(np.argmin(np.abs(frequency - f_hz)))
+    highest = (power[at - 1 : at + 2] / level[at - 1 : at + 2]).sum(axis=1).max()
+    return float(min(1.0, len(frequency) * gamma.sf(highest, samples.shape[1])))
+
+
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
     waves = waves_of(motion.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
