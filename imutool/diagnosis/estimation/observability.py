@@ -119,9 +119,10 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
 def with_steady_clock(
     logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Mapping[str, Sequence[Theta]]
 ) -> Fit:
-    """Fit with two of offset, skew and jump instead of a clock that wanders, and an offset instead of one that jumps.
+    """Fit with two of offset, skew and jump instead of a clock that wanders.
 
-    If they do as well (BIC); `starts` by effect. A jump has to be clearly better: one right after the start is an offset.
+    If they do as well (BIC); `starts` by effect. Instead of a jump an offset, unless the jump is clearly better: one right
+    after the start is none.
     """
     offsets = [effect for effect in named if effect.name == "clock_offset" and effect.key not in now.keys]
     jumps = [entry for entry in now.chosen if entry[0].name == "clock_jump"]

@@ -34,7 +34,10 @@ def line_power(
 
 
 def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: float) -> float:
-    """p-value of a line, all columns together: what stands out so far from noise of any colour, at any frequency."""
+    """p-value of a line, all columns together.
+
+    That noise of any colour stands out as far from its own level, at any frequency.
+    """
     from scipy.ndimage import median_filter
     from scipy.signal import periodogram
     from scipy.stats import gamma
