@@ -37,6 +37,9 @@ from imutool.units import AXES
 
 COLD = 0  # index of the time zero
 SWEEPS = 5
+CLEAR = (
+    10.0  # twice the log-likelihood by which different times have to be better than one time for all (Kass and Raftery 1995)
+)
 
 
 def _decayed(samples: SensorSamples, theta: Theta) -> SensorSamples:
@@ -116,7 +119,10 @@ def _decay_matrix(forms: Sequence[LinearForm], load: Load) -> Float[Tensor, "d p
 
 
 def _likeliest(problem: Problem, decays: Sequence[Sequence[Float[Tensor, "d p"]]]) -> list[int]:
-    """Index of each log's time, the likeliest of all logs together: one log after the other, from every common time."""
+    """Index of each log's time, the likeliest of all logs together: one log after the other, from every common time.
+
+    One time for all is no news: a drift that every log has passed alike cannot be told from none. All are taken for cold then.
+    """
     fit, logs = problem.fit.moved(-problem.theta), range(len(decays))
     merged = [[_merged(fit.H[log], fit.g[log], D) for D in decays[log]] for log in logs]
     prior = problem.prior[: decays[0][0].shape[1]]
@@ -137,7 +143,9 @@ def _likeliest(problem: Problem, decays: Sequence[Sequence[Float[Tensor, "d p"]]
             if times == before:
                 break
         best.append((minus_twice(times), times))
-    return list(min(best)[1])
+    common = min(minus_twice((time,) * len(decays)) for time in range(len(EARLIER_S)))
+    likeliest, times = min(best)
+    return list(times) if likeliest < common - CLEAR else [COLD] * len(decays)
 
 
 def _merged(
