@@ -44,7 +44,7 @@ def closed_loop(
     given = {finding.effect for finding in first.findings} & STAYS
     missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
     white = all(residual.white for residual in again.unexplained.values())
-    nameless = bool(again.located) and not (again.findings and white)  # the misfit of what stays is located, too
+    nameless = not white or (bool(again.located) and not again.findings)  # the misfit of what stays is located, too
     return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared))
 
 

@@ -37,9 +37,7 @@ from imutool.units import AXES
 
 COLD = 0  # index of the time zero
 SWEEPS = 5
-CLEAR = (
-    10.0  # twice the log-likelihood by which different times have to be better than one time for all (Kass and Raftery 1995)
-)
+CLEAR = 10.0  # of twice the log-likelihood, by which different times beat one for all (as BIC: Kass and Raftery 1995)
 
 
 def _decayed(samples: SensorSamples, theta: Theta) -> SensorSamples:

@@ -146,6 +146,11 @@ def test_a_null_case_with_coloured_noise_says_so() -> None:
     assert said == f"{NULL} What remains of the accel is as small as the noise, but not white."
 
 
+def test_a_residual_above_the_noise_is_never_called_nothing() -> None:
+    left = {"gyro": Unexplained(0.022, 0.009, white=False)}
+    assert headline(replace(diagnoses.NOTHING, unexplained=left)) == "The gyro keeps a misfit that has no name."
+
+
 @pytest.mark.parametrize(
     ("extent", "regime", "words"),
     [

@@ -37,7 +37,7 @@ def conclusion(d: Diagnosis) -> str:
 
 def headline(d: Diagnosis) -> str:
     """Answer in one sentence: what differs, how much the findings remove, what is left."""
-    if not d.mismatch:
+    if not d.mismatch and not any(NO_EXPLANATION in _residual(d, signal) for signal in d.unexplained):
         return NULL if d.unexplained else UNKNOWN
     unnamed = _unnamed_place(d)
     parts = [_only_finding(d) if len(d.findings) == 1 else _all_findings(d)] if d.findings else []
@@ -45,7 +45,7 @@ def headline(d: Diagnosis) -> str:
         parts.append(unnamed)
     elif all(_residual(d, signal) == QUIET for signal in d.unexplained):
         parts.append(QUIET)
-    elif d.findings:
+    else:
         left = [signal for signal in d.unexplained if _residual(d, signal) != QUIET and not _rings(d, signal)]
         parts += (
             [f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name"] if left else []
