@@ -43,7 +43,7 @@ def closed_loop(
         compared.append(Compared("metric", metric(before), metric(log), "-"))
     given = {finding.effect for finding in first.findings} & STAYS
     missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
-    white = all(residual.white for residual in again.unexplained.values())
+    white = all(again.unexplained[sensor].white for sensor in SENSORS if sensor in again.unexplained)  # what was simulated
     nameless = not white or (bool(again.located) and not again.findings)  # the misfit of what stays is located, too
     return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared))
 
