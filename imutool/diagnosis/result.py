@@ -142,11 +142,12 @@ class Finding(Section, frozen=True, omit_defaults=True):
 
 
 class Unexplained(Section, frozen=True):
-    """Residual of a signal after all findings: root mean square, noise floor, whiteness."""
+    """Residual of a signal after all findings: root mean square, noise floor, whiteness and the p-value of white noise."""
 
     rms: Number
     noise_floor: Number
     white: bool
+    p_value: Number = 1.0
 
 
 class Bias(Section, frozen=True):

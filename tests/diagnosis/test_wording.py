@@ -148,7 +148,9 @@ def test_a_null_case_with_coloured_noise_says_so() -> None:
 
 def test_a_residual_above_the_noise_is_never_called_nothing() -> None:
     left = {"gyro": Unexplained(0.022, 0.009, white=False)}
-    assert headline(replace(diagnoses.NOTHING, unexplained=left)) == "The gyro keeps a misfit that has no name."
+    everywhere = Located("gyro", ("x",), ((0.0, 60.0),), "always", 1.0, 1e-5, extent="everywhere")
+    found = replace(diagnoses.NOTHING, unexplained=left, located=(everywhere,))
+    assert headline(found) == "The gyro differs throughout, and no known effect explains it."
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from textwrap import fill
 from imutool.diagnosis.result import Closer, Diagnosis, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, reference, signals
 from imutool.diagnosis.wording.quantity import percent, symbol
-from imutool.units import SENSORS, UNITS
+from imutool.units import UNITS
 
 NO_EXPLANATION = "has no explanation yet"
 QUIET = "nothing else stands above the noise"
@@ -37,7 +37,7 @@ def conclusion(d: Diagnosis) -> str:
 
 def headline(d: Diagnosis) -> str:
     """Answer in one sentence: what differs, how much the findings remove, what is left."""
-    if not d.mismatch and not any(NO_EXPLANATION in _residual(d, sensor) for sensor in SENSORS if sensor in d.unexplained):
+    if not d.mismatch:
         return NULL if d.unexplained else UNKNOWN
     unnamed = _unnamed_place(d)
     parts = [_only_finding(d) if len(d.findings) == 1 else _all_findings(d)] if d.findings else []
