@@ -133,7 +133,12 @@ def test_a_place_without_a_name_is_not_passed_over() -> None:
     [
         (0.05, True, "; nothing else stands above the noise."),
         (0.05, False, "has no name. What remains of the accel is as small as the noise, but not white."),
-        (0.06, True, "has no name. What remains of the accel is 0.06 against 0.05 m/s² of noise, and has no explanation yet."),
+        (
+            0.06,
+            True,
+            "be noise. What remains of the accel is 0.06 against 0.05 m/s² of noise, and cannot be told from noise.",
+        ),
+        (0.06, False, "has no name. What remains of the accel is 0.06 against 0.05 m/s² of noise, and has no explanation yet."),
     ],
 )
 def test_what_remains_is_held_against_the_noise(rms: float, white: bool, words: str) -> None:
