@@ -235,10 +235,9 @@ class SignalTraces:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Result of `diagnose`: findings, strongest first, located misfits, biases and traces.
+    """Result of `diagnose`: findings, strongest first, located misfits, biases (a row for each log) and traces.
 
-    `bias` has a row for each log; the JSON shows the first as `bias` and all as `biases`. `caveat` says what the reference
-    cannot show by its origin, as it goes on after a semicolon.
+    `caveat` says what the reference cannot show by its origin, as it goes on after a semicolon.
     """
 
     real: tuple[str, ...]
