@@ -47,7 +47,10 @@ def locate_residual(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations of the unexplained residuals of some signals: running means that stand out of the noise, or everywhere."""
+    """Locations of unexplained residuals: running means that stand out of the noise, or everywhere.
+
+    `p_values` are those of white noise, by signal.
+    """
     count = settings.mean_samples
     means = [np.asarray(uniform_filter1d(pair.real - a, count, axis=0)) for pair, a in zip(pairs, after, strict=True)]
     located = _locate_logs(pairs, means, floor / np.sqrt(count), p_values, settings, certain=p_values)

@@ -142,7 +142,7 @@ class Finding(Section, frozen=True, omit_defaults=True):
 
 
 class Unexplained(Section, frozen=True):
-    """Residual of a signal after all findings: root mean square, noise floor, whiteness and the p-value of white noise."""
+    """Residual of a signal after all findings: root mean square, noise floor, whiteness, p-value."""
 
     rms: Number
     noise_floor: Number
@@ -235,7 +235,7 @@ class SignalTraces:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Result of `diagnose`: findings, strongest first, located misfits, biases (a row for each log) and traces.
+    """Result of `diagnose`: findings, strongest first, places, a bias for each log, and traces.
 
     `caveat` says what the reference cannot show by its origin, as it goes on after a semicolon.
     """
