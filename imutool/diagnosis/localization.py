@@ -47,7 +47,7 @@ def locate_residual(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations of unexplained residuals: running means that stand out of the noise, or everywhere.
+    """Locations of unexplained residuals, by running means that stand out; else everywhere.
 
     `p_values` are those of white noise, by signal.
     """
