@@ -142,7 +142,7 @@ class Finding(Section, frozen=True, omit_defaults=True):
 
 
 class Unexplained(Section, frozen=True):
-    """Residual of a signal after all findings: root mean square, noise floor, whiteness, p-value."""
+    """Residual of a signal after all findings: root mean square, noise, whiteness, p-value."""
 
     rms: Number
     noise_floor: Number
