@@ -26,6 +26,7 @@ from imutool.errors import ModelError
 from imutool.inertial.preintegration import exp
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
+from imutool.sensor.effects import clock_offset
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
 from imutool.sensor.samples import SensorSamples
@@ -43,6 +44,9 @@ MATRIX = {  # effects that are a factor of a sensor's matrix
     "accel_scale": "accel",
     "accel_misalignment": "accel",
 }
+LATE_GYRO = replace(
+    clock_offset.EFFECT, name="gyro_delay", forward=lambda taken_s, tau_s: taken_s - tau_s[0], sensors=("gyro",)
+)
 DRIFTS = {"gyro_bias_drift", "accel_bias_drift"}
 
 logger = logging.getLogger(__name__)
@@ -153,8 +157,8 @@ def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
         return True
     if entry.name == DRIVEN:
         return False
-    (effect,) = catalogue.effects([entry.name])
-    if not effect.trained or (entry.name == "clock_offset" and abs(_value(entry, "tau")) > MOST_TAU_S):
+    (effect,) = (LATE_GYRO,) if entry.name == LATE_GYRO.name else catalogue.effects([entry.name])
+    if not effect.trained or (effect.stage == Stage.CLOCK and abs(_value(entry, "tau")) > MOST_TAU_S):
         return False
     if entry.name in DRIFTS:
         fixed = (replace(parameter, fixed_in_training=_value(entry, "tau")) for parameter in effect.parameters[3:])

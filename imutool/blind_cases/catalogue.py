@@ -98,6 +98,7 @@ CATALOGUE: Mapping[str, Model] = {
         Model("clock_skew", Stage.CLOCK, "both", (Parameter("eps", "-", 1e-3),), lambda t, theta: t * (1.0 + theta[0])),
         Model("clock_jump", Stage.CLOCK, "both", _JUMP, forward.clock_jump, smooth=False),
         Model("low_pass", Stage.BANDWIDTH, "both", (Parameter("f_c", "Hz", 5.0),), forward.low_pass, _quicker),
+        Model("gyro_delay", Stage.BANDWIDTH, "gyro", (Parameter("tau", "s", 5e-3),), forward.gyro_delay),
         Model("saturation", Stage.CONVERTER, "both", _LIMITS, forward.saturation, clipping, smooth=False),
         Model("quantization", Stage.CONVERTER, "both", _LSB, forward.quantization, smooth=False),
         Model("gravity", Stage.IDEAL, "accel", _GRAVITY, forward.gravity),

@@ -14,6 +14,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from imutool.array_types import Float64
@@ -186,6 +187,14 @@ def mount_resonance(rate_hz: float, signal: Six, theta: Theta) -> Six:
 def low_pass(rate_hz: float, signal: Six, theta: Theta) -> Six:
     """First-order low-pass with the cut-off theta[0] (Hz)."""
     return first_order(signal, rate_hz, float(theta[0]))
+
+
+def gyro_delay(rate_hz: float, signal: Six, theta: Theta) -> Six:
+    """The gyro's columns theta[0] (s) later, held before the first sample."""
+    out, at = signal.copy(), np.arange(len(signal), dtype=np.float64)
+    late = np.clip(at - theta[0] * rate_hz, 0.0, at[-1])
+    out[:, GYRO] = make_interp_spline(at, signal[:, GYRO], k=3)(late)
+    return out
 
 
 def clock_jump(t_s: Times, theta: Theta) -> Times:

@@ -25,7 +25,7 @@ MARGIN_S = 2.5  # of motion before and after the log: filters settle in it, shif
 SETTLE_S = 2.0
 EPOCH_NS = 1_700_000_000_000_000_000  # of every case: the start time reveals nothing
 SIM_SHARE = 0.3  # of the real sensor's noise
-FILTERS = {"low_pass", "mount_resonance"}
+FILTERS = {"gyro_delay", "low_pass", "mount_resonance"}
 JITTER_MAX_S = 2.4e-3  # neighbours 5 ms apart keep their order
 
 Acting = Sequence[tuple[Model, Theta]]

@@ -43,6 +43,7 @@ EFFECTS: Mapping[str, tuple[Mapping[str, float], float]] = {
     "gyro_bias_drift": ({"x": 0.03, "y": -0.02, "tau": 15.0}, EXACT),
     "lever_arm": ({"x": 0.2, "y": -0.3, "z": 0.1}, BY_DERIVATIVE),
     "clock_offset": ({"tau": 0.004}, BY_DERIVATIVE),
+    "gyro_delay": ({"tau": 0.003}, BY_DERIVATIVE),
 }
 
 

@@ -272,6 +272,12 @@ def test_a_late_clock_reads_the_motion_of_that_time(scene: Scene) -> None:
     assert np.abs(late - scene.ideal(t + 0.05)).max() < EXACT
 
 
+def test_a_late_gyro_reads_the_rate_of_before_and_leaves_the_force_alone(scene: Scene) -> None:
+    late = scene.converter_input([(CATALOGUE["gyro_delay"], np.array([0.004]))], scene.t_s)
+    assert np.abs(late - scene.ideal(scene.t_s - 0.004))[:, GYRO].max() < 1e-6
+    assert np.abs(late - scene.ideal(scene.t_s))[:, ACCEL].max() < 1e-6
+
+
 def test_filters_on_the_way_agree_with_the_slow_limit(scene: Scene) -> None:
     late = scene.converter_input([(CATALOGUE["low_pass"], np.array([100.0]))], scene.t_s)
     assert np.abs(late - scene.ideal(scene.t_s - 1.0 / (200.0 * np.pi)))[200:].max() < 0.02  # far below its cut-off: a delay

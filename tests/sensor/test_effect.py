@@ -168,6 +168,7 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {
+        "gyro_delay",
         "clock_offset",
         "clock_skew",
         "clock_jump",
@@ -327,6 +328,17 @@ def test_a_low_pass_has_the_gain_and_phase_of_its_formula(f_hz: float, cutoff_hz
     exact = 1.0 / (1.0 + 1j * f_hz / cutoff_hz)
     for values in (out.gyro, out.accel, out.alpha):
         assert abs(response(values[:, 0], f_hz, felt.t_s) / exact - 1.0) < promised(f_hz)
+
+
+@pytest.mark.parametrize("tau_s", [-0.012, 0.0015, 0.02])
+def test_a_late_gyro_has_the_phase_of_its_delay_and_the_rest_stays(tau_s: float) -> None:
+    f_hz = 3.0
+    felt = sine(f_hz)
+    out = act("gyro_delay", felt, tau_s)
+    exact = np.exp(-2j * np.pi * f_hz * tau_s)
+    assert abs(response(out.gyro[:, 0], f_hz, felt.t_s) / exact - 1.0) < promised(f_hz)
+    assert out.accel is felt.accel
+    assert out.alpha is felt.alpha
 
 
 @pytest.mark.parametrize("f_hz", [0.5, 3.0, 11.0, 27.0, 50.0])

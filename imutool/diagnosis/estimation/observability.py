@@ -28,7 +28,7 @@ NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {
 STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
 UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
 CLOCKS = (*STEADY, WANDER)
-FILTERS = ("low_pass", "mount_resonance")
+FILTERS = ("low_pass", "mount_resonance", "gyro_delay")
 REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 

@@ -36,6 +36,10 @@ def _clock_offset(w: Words) -> str:
     return f"{w.it} {'lags' if w.main.sign < 0 else 'is ahead of'} {w.other} by {w.main.size}"
 
 
+def _gyro_delay(w: Words) -> str:
+    return f"{w.it} {'is ahead of' if w.main.sign < 0 else 'lags'} the accelerometer by {w.main.size}"
+
+
 def _delay(w: Words) -> str:
     return f"{w.it} {'comes before' if w.main.sign < 0 else 'lags'} {w.other} by {w.main.size}"
 
@@ -98,6 +102,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "clock_skew": _clock_skew,
     "clock_jump": _clock_jump,
     "clock_wander": "the clock of the recording wanders, by {w.main}",
+    "gyro_delay": _gyro_delay,
     "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",
