@@ -23,8 +23,8 @@ from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
     "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
-    "clock_offset", "clock_skew", "clock_jump", "clock_wander", "gyro_delay", "low_pass", "saturation", "quantization", "gravity",
-    "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples", "timestamp_jitter",
+    "clock_offset", "clock_skew", "clock_jump", "clock_wander", "gyro_delay", "low_pass", "saturation", "quantization",
+    "gravity", "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples", "timestamp_jitter",
     "reference_error", "reference_smoothing", "driven", "unknown", "gain", "offset", "delay", "dead_band", "drift", "friction",
 ]  # fmt: skip
 # An uncertainty keeps one digit between 1.95 and 9.5, else two: a number moves by at most this share of it.
@@ -301,6 +301,12 @@ def test_a_clock_that_wanders_says_from_where_to_where() -> None:
     assert named_sentence(diagnoses.ARM, finding("clock_wander", offsets)) == (
         "the clock of the recording wanders, by -0.55 ± 0.06 ms to 2.73 ± 0.11 ms (clock_wander)"
     )
+
+
+@pytest.mark.parametrize(("tau_s", "words"), [(1.5e-3, "it lags"), (-1.5e-3, "it is ahead of")])
+def test_a_late_gyro_is_late_against_the_accelerometer(tau_s: float, words: str) -> None:
+    late = finding("gyro_delay", {"tau": Estimate(tau_s, 1e-4, "s")}, "gyro")
+    assert named_sentence(diagnoses.ARM, late) == f"{words} the accelerometer by 1.50 ± 0.10 ms (gyro_delay)"
 
 
 def test_a_limit_that_is_never_reached_is_not_news() -> None:
