@@ -61,7 +61,8 @@ PAPER = runpy.run_path(str(Path(__file__).parents[2] / "examples/reproduce_table
 TRAIN: dict[str, tuple[str, ...]] = PAPER["TRAIN"]
 TEST: dict[str, tuple[str, ...]] = PAPER["TEST"]
 OTHER_TRUTH: dict[str, str] = PAPER["OTHER_TRUTH"]
-MATRICES = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "lever_arm", "clock_offset")
+FITTED = (*EVERY_UNIT, "gyro_delay")
+MATRICES = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "lever_arm", "clock_offset", "gyro_delay")
 # What a sensor keeps from one recording to the next; its clock is set anew, as its bias is.
 LASTING = (
     *(name for name in MATRICES if name != "clock_offset"),
@@ -239,7 +240,7 @@ class Sensor:
     def __init__(self, data_set: str, logs: Sequence[Log], out: Path, options: argparse.Namespace) -> None:
         self.data_set, self.logs, self.out, self.options = data_set, logs, out, options
         self.only = options.sequences or [log.name for log in logs]
-        self.effects = dict.fromkeys((EVERY_UNIT, MATRICES) if data_set in published() else (EVERY_UNIT,))
+        self.effects = dict.fromkeys((FITTED, MATRICES) if data_set in published() else (FITTED,))
 
     def run(self) -> None:
         """Every sequence apart; then the training sequences' physics on the test sequences."""
@@ -248,7 +249,7 @@ class Sensor:
             for effects in self.effects:
                 kept(self._fixed(log, effects), fixed, log.path, effects)
             if log.name in OTHER_TRUTH:
-                kept(self._fixed(log, EVERY_UNIT, "_other"), fixed, log.path, EVERY_UNIT, OTHER_TRUTH[log.name])
+                kept(self._fixed(log, FITTED, "_other"), fixed, log.path, FITTED, OTHER_TRUTH[log.name])
         for name, physics in self.physics().items():
             for log in self.tests:
                 kept(self.out / "gain" / name / f"{log.name}.json", gained, log, physics)
@@ -259,7 +260,7 @@ class Sensor:
         return [log for log in self.logs if log.test]
 
     def _fixed(self, log: Log, effects: Sequence[str], suffix: str = "") -> Path:
-        kind = "measured" if effects == EVERY_UNIT else "matrices"
+        kind = "measured" if effects == FITTED else "matrices"
         return self.out / kind / f"{log.name}{suffix}.json"
 
     def physics(self) -> dict[str, Path]:
@@ -315,7 +316,7 @@ class Sensor:
             yield findings_table(sound)
         yield from (f"{name}: no answer ({why})" for name, why in failed.items())
         for effects in self.effects:
-            kind = "measured" if effects == EVERY_UNIT else "matrices"
+            kind = "measured" if effects == FITTED else "matrices"
             if rows := self.effect_sizes(kind):
                 yield consistency_table(rows, published().get(self.data_set) if kind == "matrices" else None)
         gains = {
@@ -330,10 +331,10 @@ class Sensor:
         """Every value of every sequence."""
         yield f"## {self.data_set}"
         for effects in self.effects:
-            yield values_table(self.effect_sizes("measured" if effects == EVERY_UNIT else "matrices"))
+            yield values_table(self.effect_sizes("measured" if effects == FITTED else "matrices"))
         for log in self.logs:
-            if log.name in OTHER_TRUTH and (self._fixed(log, EVERY_UNIT, "_other")).exists():
-                one = json.loads(self._fixed(log, EVERY_UNIT, "_other").read_text(encoding="utf-8"))
+            if log.name in OTHER_TRUTH and (self._fixed(log, FITTED, "_other")).exists():
+                one = json.loads(self._fixed(log, FITTED, "_other").read_text(encoding="utf-8"))
                 yield f"{log.name} beside {OTHER_TRUTH[log.name]}:"
                 yield values_table({"distributed": self.effect_sizes()[log.name], "recomputed": as_values(one)})
         for log in self.logs:
