@@ -34,7 +34,8 @@ Sim = Annotated[
     typer.Option(metavar="SIM", help="Simulation, of any motion if both have poses; by default along the recording's poses."),
 ]
 Close = Annotated[
-    bool, typer.Option("--close", help="Simulate again with physics.toml (DIR/closed.mcap), diagnose again, and compare.")
+    bool,
+    typer.Option("--close", help="Simulate again with physics.toml (DIR/closed.mcap), add what is still missing, and compare."),
 ]
 Metric = Annotated[
     Path | None, typer.Option(metavar="SCRIPT", help="Your figure for --close: python SCRIPT REAL SIM prints a number.")
@@ -94,28 +95,46 @@ def diagnose(
             for remark in diagnosis_output.write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite):
                 logger.warning("%s", remark)
             if close:
-                settled = partial(run, reals, imu=imu, truth=truth, settings=settings)
-                diagnosis = _closed(diagnosis, settled, sim, folder, metric, overwrite)
+                settled = partial(run, reals, imu=imu, truth=truth, tell=tell, settings=settings)
+                rewrite = partial(diagnosis_output.write, folder=folder, logs=look, overwrite=True)
+                diagnosis = _closed(diagnosis, settled, rewrite, sim, folder, metric, overwrite)
     if not write_json(diagnosis.report, json_to, overwrite=overwrite):
         _say(diagnosis, folder)
 
 
 def _closed(
-    first: Diagnosis, again: Callable[[Path], Diagnosis], sim: Path | None, folder: Path, metric: Path | None, overwrite: bool
+    first: Diagnosis,
+    diagnosed: Callable[..., Diagnosis],
+    rewrite: Callable[[Diagnosis], object],
+    sim: Path | None,
+    folder: Path,
+    metric: Path | None,
+    overwrite: bool,
 ) -> Diagnosis:
-    """Diagnosis with the closed loop: its physics simulated along the given simulation, or along the recording's poses."""
+    """Diagnosis with the closed loop: its physics simulated along the given simulation, or along the recording's poses.
+
+    What is still missing then is added to the next search, for some rounds.
+    """
     from dataclasses import replace
 
     from imutool import diagnosis_output
-    from imutool.diagnosis.closed_loop import LOG, closed_loop, script_metric
+    from imutool.diagnosis.closed_loop import LOG, ROUNDS, closed_loop, is_worth_a_round, script_metric
     from imutool.sensor.simulate import simulate
 
     real, log = Path(first.real[0]), folder / LOG
-    source = sim or real
-    simulate(source, log, physics=folder / diagnosis_output.EFFECT, overwrite=overwrite)
-    second = again(log)
     figure = None if metric is None else script_metric(metric, real)
-    done = replace(first, closed=closed_loop(first, second, log, metric=figure, before=sim))
+    for number in range(1, ROUNDS + 1):
+        simulate(sim or real, log, physics=folder / diagnosis_output.EFFECT, overwrite=overwrite or number > 1)
+        second = diagnosed(log)
+        loop = closed_loop(first, second, log, metric=figure, before=sim, rounds=number)
+        if number == ROUNDS or not is_worth_a_round(first, second, loop):
+            break
+        better = diagnosed(sim, begin=(*first.findings, *second.findings))
+        if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
+            break
+        first = better
+        rewrite(first)
+    done = replace(first, closed=loop)
     diagnosis_output.write_closed(done, second, folder)
     return done
 
@@ -136,7 +155,8 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
 
         left = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
         answer = f"still missing: {left}" if diagnosis.closed.mismatch else "nothing is missing"
-        say(f"Simulated again with physics.toml and diagnosed again: {answer}.")
+        rounds = f", after {diagnosis.closed.rounds} rounds" if diagnosis.closed.rounds > 1 else ""
+        say(f"Simulated again with physics.toml and diagnosed again: {answer}{rounds}.")
         table(closed_table(diagnosis.closed), keys=1)
     if folder is not None:
         say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")

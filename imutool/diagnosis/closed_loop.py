@@ -1,6 +1,8 @@
 """Closed loop: simulate with the physics that was found, diagnose again, compare.
 
 recording + simulation ─ diagnose ─> physics.toml ─ simulate ─> closed.mcap ─ diagnose ─> nothing is missing
+          ^                                                                        │
+          └────────────────────── effects that are still missing ──────────────────┘
 """
 
 from __future__ import annotations
@@ -28,11 +30,18 @@ WINDOW_S = 5.0  # over which samples are integrated
 EDGES_HZ = (0.0, 1.0, 5.0, 20.0, np.inf)  # of the bands of the spectrum
 LATE_PARTS = 4  # of a log, for the error over time
 STAYS = NO_EFFECT | {"quantization"}  # seen in the recording or its poses alone, whatever the simulation
+ROUNDS = 3  # at most
 METRIC_S = 600.0  # that a metric may take
 
 
 def closed_loop(
-    first: Diagnosis, again: Diagnosis, log: Path, *, metric: Callable[[Path], float] | None = None, before: Path | None = None
+    first: Diagnosis,
+    again: Diagnosis,
+    log: Path,
+    *,
+    metric: Callable[[Path], float] | None = None,
+    before: Path | None = None,
+    rounds: int = 1,
 ) -> ClosedLoop:
     """Figures of a recording and two simulations: the given one, and one with found physics.
 
@@ -45,7 +54,13 @@ def closed_loop(
     missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
     white = all(again.unexplained[sensor].white for sensor in SENSORS if sensor in again.unexplained)  # what was simulated
     nameless = not white or (bool(again.located) and not again.findings)  # the misfit of what stays is located, too
-    return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared))
+    return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared), rounds)
+
+
+def is_worth_a_round(first: Diagnosis, again: Diagnosis, loop: ClosedLoop) -> bool:
+    """Whether a search that begins with all effects of both may find more than the first did."""
+    named = {finding.effect for finding in again.findings if finding.kind == "catalogue"} - NO_EFFECT
+    return loop.mismatch and bool(named - {finding.effect for finding in first.findings})
 
 
 def script_metric(script: Path, real: Path) -> Callable[[Path], float]:

@@ -43,7 +43,7 @@ from imutool.diagnosis.reference_errors import SMOOTHED, reference_caveat, refer
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import with_signals
-from imutool.diagnosis.to_sensor_files import NO_EFFECT
+from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
 from imutool.log_info.conventions import warn_of_recordings
@@ -70,12 +70,13 @@ def diagnose(
     signals: Sequence[str] = (),
     tell: Tell | None = None,
     settings: DiagnoseSettings | None = None,
+    begin: Sequence[Finding] = (),
 ) -> Diagnosis:
     """Effects that separate recordings from a simulation, or from their own true poses.
 
     Several recordings share the physics; each has a constant bias of its own. `signals` are other fields that one recording and
     its simulation both hold (`TOPIC.field`), compared in the same way. A simulation of another motion is compared by what its
-    own true poses say of it (`imutool.diagnosis.compare_findings`).
+    own true poses say of it (`imutool.diagnosis.compare_findings`). The search begins with the findings of `begin`.
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
@@ -96,7 +97,7 @@ def diagnose(
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
         told = [log.remark for log in logs_read if log.remark]
-        diagnosis = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings)
+        diagnosis = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
     report(4, 4, "")
@@ -113,6 +114,7 @@ def _beside_reference(
     told: Sequence[str],
     report: Tell,
     settings: DiagnoseSettings,
+    begin: Sequence[Finding],
 ) -> Diagnosis:
     """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read."""
     simulated = None if sim is None else read_log(sim, imu=imu)
@@ -131,7 +133,8 @@ def _beside_reference(
     report(2, 4, "searching")
     wrong, wrong_at = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
-    selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"))
+    first = start_values(begin, named)
+    selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"), begin=first)
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}

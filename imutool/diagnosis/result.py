@@ -170,7 +170,7 @@ class ClosedLoop(Section, frozen=True):
     """What is left when the physics that was found is simulated.
 
     Attributes:
-        log: the new simulation.
+        log: the last simulation; `rounds` were made, each with what the one before it missed.
         mismatch: whether a second diagnosis still finds a difference; `findings` are its names.
         compared: figures before and after: misfit by signal, band and time, integrated rotation and path, the user's metric.
     """
@@ -179,6 +179,7 @@ class ClosedLoop(Section, frozen=True):
     mismatch: bool
     findings: tuple[str, ...]
     compared: tuple[Compared, ...]
+    rounds: int = 1
 
 
 class DiagnosisReport(Report, frozen=True, tag=SCHEMA):
@@ -235,10 +236,7 @@ class SignalTraces:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Result of `diagnose`: findings, strongest first, places, a bias for each log, and traces.
-
-    `caveat` says what the reference cannot show by its origin, as it goes on after a semicolon.
-    """
+    """Result of `diagnose`: findings, strongest first, places, a bias for each log, and traces."""
 
     real: tuple[str, ...]
     sim: str | None
@@ -251,7 +249,7 @@ class Diagnosis:
     closer: Mapping[str, Closer] = field(default_factory=dict)  # by signal
     traces: tuple[Traces, ...] = field(default=(), repr=False)
     signals: Mapping[str, SignalTraces] = field(default_factory=dict, repr=False)  # by TOPIC.field
-    caveat: str = ""
+    caveat: str = ""  # what the reference cannot show by its origin, as it goes on after a semicolon
     closed: ClosedLoop | None = None
     imus: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)  # other IMUs of the log, by topic
     start_ns: int | None = None  # of the first log, on the clock of the simulation: times count from it

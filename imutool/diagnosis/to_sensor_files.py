@@ -8,18 +8,33 @@ the sensor, vibration, and the motion that the reference does not know. A twin o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
+from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding
 from imutool.noise.colour import measured
 from imutool.noise.datasheet import Noise
+from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
 NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error", "reference_smoothing"})
+
+
+def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> Chosen:
+    """Candidates that are among the findings, strongest first, each with the values of its first finding."""
+    by_name, found = {effect.name: effect for effect in reversed(candidates)}, dict[str, Mapping[str, Estimate]]()
+    for finding in findings:
+        if finding.effect in by_name and finding.effect not in NO_EFFECT:
+            found.setdefault(finding.effect, finding.parameters)
+
+    def values(effect: Effect, parameters: Mapping[str, Estimate]) -> Theta:
+        return np.array([parameters[of.name].value if of.name in parameters else of.null_value for of in effect.parameters])
+
+    return tuple((by_name[name], values(by_name[name], parameters)) for name, parameters in found.items())
 
 
 def to_physics_file(d: Diagnosis) -> PhysicsFile:

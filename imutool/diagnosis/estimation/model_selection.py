@@ -60,22 +60,23 @@ def select_effects(
     progress: Callable[[str], None] | None = None,
     *,
     always: Chosen = (),
+    begin: Chosen = (),
 ) -> Selection:
     """Select the effects that the logs show together.
 
     Groups of `later` are tried in turn, once the candidates before explain nothing more. Effects of `always` are in every fit
-    and are no findings. `progress` is called with what is being tried.
+    and are no findings; the search begins with those of `begin`. `progress` is called with what is being tried.
     """
     unnamed, settings = tuple(effect for group in later for effect in group), logs[0].pair.settings.search
-    start = fit(logs, always)
-    known, report = Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
+    start, known, report = fit(logs, always), Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
     first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     orders = ((), later), (unnamed, ())  # effects without a name after the others, or beside them
     order, other_order = reversed(orders) if best_unnamed > best_named + settings.clearly_better else orders
+    begun = first.pruned(fit(logs, (*always, *begin))) if begin else start
     second = replace(first, candidates=known.copy(), progress=lambda text: None)
-    other = Forked(lambda: portable(*_grown(second, start, *other_order))) if unnamed else None
-    answers = [_grown(first, start, *order)]
+    other = Forked(lambda: portable(*_grown(second, begun, *other_order))) if unnamed else None
+    answers = [_grown(first, begun, *order)]
     now = answers[0][1]
     doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
     if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
@@ -95,15 +96,15 @@ def select_effects(
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
-    search, settings, waiting, before = replace(first, unnamed=tuple(unnamed)), first.settings, list(later), now
+    search, settings, waiting, before = replace(first, unnamed=tuple(unnamed)), first.settings, list(later), first.before
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
         hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
-        hopeless &= before.objective - now.objective < settings.hopeless_share * (before.objective - now.numbers)
+        hopeless &= before - now.objective < settings.hopeless_share * (before - now.numbers)
         better = search.added(now) if count < settings.most_effects and not hopeless else None
         if better is not None:
-            before, now = now, search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
+            before, now = now.objective, search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
         else:
@@ -199,8 +200,8 @@ class _Search:
             rivals = self._rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
-        now = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
-        now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
+        steady = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
+        now = without_unseen_low_pass(self.logs, steady, self.named, self.settings)
         return with_common_arm(
             self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold
         )
