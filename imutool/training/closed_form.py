@@ -199,7 +199,7 @@ def shown_by_logs(
 
 
 class Integrated(NamedTuple):
-    """Losses of logs with a log's own unknowns integrated out; the last axis of `c` is that of the logs."""
+    """Losses of logs with each log's own unknowns integrated out."""
 
     S: Float[Tensor, "*batch logs p p"]
     v: Float[Tensor, "*batch logs p"]
