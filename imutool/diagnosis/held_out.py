@@ -105,13 +105,16 @@ def unexplained_residuals(
         part = signals[signal]
         held_out_count = sum(len(_residual(log, model, part)) for log, model in zip(logs, after, strict=True))
         fitted_count = sum(log.count("fitted") for log in logs) / len(signals)
-        most = settings.white_ratio
+        most, p_value = settings.white_ratio, 1.0
         if held_out_count:
-            most = max(most, float(np.sqrt(fisher.isf(settings.few_samples_p_value, held_out_count, max(fitted_count, 1.0)))))
+            by_chance = fisher(held_out_count, max(fitted_count, 1.0))
+            most = max(most, float(np.sqrt(by_chance.isf(settings.few_samples_p_value))))
+            p_value = float(by_chance.sf((held_out.rms_after / noise) ** 2))
         white = held_out.rms_after < most * noise
         if not white and beside_poses:
-            white = _p_value(logs, after, part, noise, settings) > settings.white_p_value
-        out[signal] = Unexplained(held_out.rms_after, noise, white)
+            p_value = _p_value(logs, after, part, noise, settings)
+            white = p_value > settings.white_p_value
+        out[signal] = Unexplained(held_out.rms_after, noise, white, p_value)
     return out
 
 

@@ -8,7 +8,7 @@ variables tried).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -36,16 +36,25 @@ def locate_findings(
 ) -> list[Located]:
     """Locations where the findings change the expected samples (`after` minus `before`)."""
     misfits = [_converter_output(a, findings) - b for a, b in zip(after, before, strict=True)]
-    return _locate_logs(pairs, misfits, floor, p_values, settings)
+    certain = [signal for signal, p_value in p_values.items() if p_value < settings.p_value]
+    return _locate_logs(pairs, misfits, floor, p_values, settings, certain)
 
 
 def locate_residual(
-    pairs: Sequence[Pair], after: Sequence[Samples], floor: Float64[np.ndarray, "6"], settings: LocalizationSettings
+    pairs: Sequence[Pair],
+    after: Sequence[Samples],
+    floor: Float64[np.ndarray, "6"],
+    p_values: Mapping[str, float],
+    settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations of an unexplained residual: running means that stand out of the noise."""
+    """Locations of unexplained residuals, by running means that stand out; else everywhere.
+
+    `p_values` are those of white noise, by signal.
+    """
     count = settings.mean_samples
     means = [np.asarray(uniform_filter1d(pair.real - a, count, axis=0)) for pair, a in zip(pairs, after, strict=True)]
-    return _locate_logs(pairs, means, floor / np.sqrt(count), {}, settings)
+    located = _locate_logs(pairs, means, floor / np.sqrt(count), p_values, settings, certain=p_values)
+    return [place for place in located if place.signal in p_values]
 
 
 def _locate_logs(
@@ -54,13 +63,14 @@ def _locate_logs(
     floor: Float64[np.ndarray, " k"],
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
+    certain: Container[str],
 ) -> list[Located]:
     """Strongest first, log by log: `log` is the pair's name where there are several."""
     logs = list(dict.fromkeys(pair.name for pair in pairs))
     out = []
     for log in logs:
         segments = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
-        located = _locate_log(segments, floor, p_values, settings)
+        located = _locate_log(segments, floor, p_values, settings, certain)
         out += [msgspec.structs.replace(place, log=log) if len(logs) > 1 else place for place in located]
     return sorted(out, key=lambda place: place.p_value)
 
@@ -70,13 +80,14 @@ def _locate_log(
     floor: Float64[np.ndarray, " k"],
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
+    certain: Container[str],
 ) -> list[Located]:
     """Segments of one log share its clock; each has its own constant."""
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
     misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
     each = [pair.variables() for pair, _ in segments]
     variables = {name: (unit, np.concatenate([own[name][1] for own in each])) for name, (unit, _) in each[0].items()}
-    return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals)
+    return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals, certain)
 
 
 def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n k"]:
@@ -100,6 +111,7 @@ def locate(
     p_values: Mapping[str, float],
     settings: LocalizationSettings | None = None,
     signals: Mapping[str, slice] = IMU_SIGNALS,
+    certain: Container[str] = (),
 ) -> list[Located]:
     """Locations of a misfit by signal, strongest first; samples may span several segments.
 
@@ -108,9 +120,10 @@ def locate(
         misfit: real minus expected samples, without noise.
         noise: standard deviation of a sample, by column.
         variables: what a regime can be of, by name, with unit and values at the samples.
-        p_values: of the findings by signal; one that is too small for any single second to show it lies everywhere.
+        p_values: of the misfit by signal.
         settings: those of a diagnosis by default.
         signals: columns by signal; the axes of a signal of three are named.
+        certain: signals that have a misfit; where no single second shows it, it lies everywhere.
     """
     settings = settings or LocalizationSettings()
     located = []
@@ -123,7 +136,7 @@ def locate(
         axes = np.flatnonzero(axes_power > least).tolist()
         power = np.bincount(window, weights=part.sum(axis=1))
         inside = power > settings.clear_squares
-        if axes and not inside.any() and p_values.get(signal, 1.0) < settings.p_value:
+        if axes and not inside.any() and signal in certain:
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
             continue

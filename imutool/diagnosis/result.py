@@ -142,11 +142,12 @@ class Finding(Section, frozen=True, omit_defaults=True):
 
 
 class Unexplained(Section, frozen=True):
-    """Residual of a signal after all findings: root mean square, noise floor, whiteness."""
+    """Residual of a signal after all findings: root mean square, noise, whiteness, p-value."""
 
     rms: Number
     noise_floor: Number
     white: bool
+    p_value: Number = 1.0
 
 
 class Bias(Section, frozen=True):
@@ -234,10 +235,9 @@ class SignalTraces:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Result of `diagnose`: findings, strongest first, located misfits, biases and traces.
+    """Result of `diagnose`: findings, strongest first, places, a bias for each log, and traces.
 
-    `bias` has a row for each log; the JSON shows the first as `bias` and all as `biases`. `caveat` says what the reference
-    cannot show by its origin, as it goes on after a semicolon.
+    `caveat` says what the reference cannot show by its origin, as it goes on after a semicolon.
     """
 
     real: tuple[str, ...]

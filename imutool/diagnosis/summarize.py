@@ -89,8 +89,8 @@ def summarize(
     unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
     located = locate_findings(pairs, baseline, after, noise, findings, p_values, settings.localization) if findings else []
     if not located:  # where something is left all the same, it is said where
-        coloured = {signal for signal, residual in unexplained.items() if not residual.white}
-        located = [at for at in locate_residual(pairs, after, noise, settings.localization) if at.signal in coloured]
+        coloured = {signal: residual.p_value for signal, residual in unexplained.items() if not residual.white}
+        located = locate_residual(pairs, after, noise, coloured, settings.localization)
     located += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
         real=tuple(reals.values()),

@@ -37,6 +37,15 @@ def test_a_misfit_far_below_the_noise_lies_nowhere() -> None:
     assert locate(T, acting(4, T >= 0.0, 0.05), NOISE, {}, {}) == []
 
 
+def test_a_misfit_that_is_certain_and_shows_in_no_second_lies_everywhere() -> None:
+    weak = acting(4, T >= 0.0, 0.15)
+    (one,) = locate(T, weak, NOISE, {}, {"accel": 1e-4}, certain=["accel"])
+    assert (one.signal, one.axes, one.extent, one.share) == ("accel", ("y",), "everywhere", 1.0)
+    assert one.intervals_s == ((0.0, DURATION_S),)
+    assert one.p_value == 1e-4
+    assert locate(T, weak, NOISE, {}, {"accel": 1e-4}) == []
+
+
 @pytest.mark.parametrize("column", range(6))
 def test_axis_and_seconds_are_those_in_which_it_acts(column: int) -> None:
     (one,) = locate(T, acting(column, (T >= 12.0) & (T < 19.0)), NOISE, {}, {"gyro": 1e-9, "accel": 1e-7})

@@ -133,7 +133,12 @@ def test_a_place_without_a_name_is_not_passed_over() -> None:
     [
         (0.05, True, "; nothing else stands above the noise."),
         (0.05, False, "has no name. What remains of the accel is as small as the noise, but not white."),
-        (0.06, True, "has no name. What remains of the accel is 0.06 against 0.05 m/s² of noise, and has no explanation yet."),
+        (
+            0.06,
+            True,
+            "be noise. What remains of the accel is 0.06 against 0.05 m/s² of noise, and cannot be told from noise.",
+        ),
+        (0.06, False, "has no name. What remains of the accel is 0.06 against 0.05 m/s² of noise, and has no explanation yet."),
     ],
 )
 def test_what_remains_is_held_against_the_noise(rms: float, white: bool, words: str) -> None:
@@ -148,7 +153,9 @@ def test_a_null_case_with_coloured_noise_says_so() -> None:
 
 def test_a_residual_above_the_noise_is_never_called_nothing() -> None:
     left = {"gyro": Unexplained(0.022, 0.009, white=False)}
-    assert headline(replace(diagnoses.NOTHING, unexplained=left)) == "The gyro keeps a misfit that has no name."
+    everywhere = Located("gyro", ("x",), ((0.0, 60.0),), "always", 1.0, 1e-5, extent="everywhere")
+    found = replace(diagnoses.NOTHING, unexplained=left, located=(everywhere,))
+    assert headline(found) == "The gyro differs throughout, and no known effect explains it."
 
 
 @pytest.mark.parametrize(

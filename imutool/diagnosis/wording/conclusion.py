@@ -10,9 +10,10 @@ from textwrap import fill
 from imutool.diagnosis.result import Closer, Diagnosis, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, reference, signals
 from imutool.diagnosis.wording.quantity import percent, symbol
-from imutool.units import SENSORS, UNITS
+from imutool.units import UNITS
 
 NO_EXPLANATION = "has no explanation yet"
+MAY_BE_NOISE = "cannot be told from noise"
 QUIET = "nothing else stands above the noise"
 UNKNOWN = "This log has no usable reference, and its samples alone show no defect."
 NULL = "Nothing but a constant bias and noise separates the two."
@@ -37,7 +38,7 @@ def conclusion(d: Diagnosis) -> str:
 
 def headline(d: Diagnosis) -> str:
     """Answer in one sentence: what differs, how much the findings remove, what is left."""
-    if not d.mismatch and not any(NO_EXPLANATION in _residual(d, sensor) for sensor in SENSORS if sensor in d.unexplained):
+    if not d.mismatch:
         return NULL if d.unexplained else UNKNOWN
     unnamed = _unnamed_place(d)
     parts = [_only_finding(d) if len(d.findings) == 1 else _all_findings(d)] if d.findings else []
@@ -45,11 +46,10 @@ def headline(d: Diagnosis) -> str:
         parts.append(unnamed)
     elif all(_residual(d, signal) == QUIET for signal in d.unexplained):
         parts.append(QUIET)
-    else:
-        left = [signal for signal in d.unexplained if _residual(d, signal) != QUIET and not _rings(d, signal)]
-        parts += (
-            [f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name"] if left else []
-        )
+    elif left := [signal for signal, residual in d.unexplained.items() if not residual.white and not _rings(d, signal)]:
+        parts.append(f"{_the(' and '.join(left))} {'keep' if len(left) > 1 else 'keeps'} a misfit that has no name")
+    elif not any(_rings(d, signal) for signal in d.unexplained):
+        parts.append("what is left may be noise")
     if d.caveat:
         parts.append(d.caveat)
     return f"{_upper('; '.join(parts))}." if parts else NULL
@@ -169,7 +169,7 @@ def residual_text(residual: Unexplained, unit: str, of: str = "") -> str:
     rms, floor = f"{residual.rms:.3g}", f"{residual.noise_floor:.3g} {symbol(unit)}".strip()
     what = f"what remains of {of}" if of else "what remains"
     if residual.rms > ABOVE * residual.noise_floor:
-        return f"{what} is {rms} against {floor} of noise, and {NO_EXPLANATION}"
+        return f"{what} is {rms} against {floor} of noise, and {MAY_BE_NOISE if residual.white else NO_EXPLANATION}"
     return QUIET if residual.white else f"{what} is as small as the noise, but not white"
 
 
