@@ -28,7 +28,10 @@ def shared(finding: Finding, sim_findings: Sequence[Finding]) -> bool:
 
 
 def is_of_digits(finding: Finding, digits: Finding) -> bool:
-    """Whether a term or curve of an axis' own reading removes no more from it than rounding adds (LSB / sqrt(12))."""
+    """Whether a term or curve of an axis' own reading is no more than its rounding.
+
+    It removes less than rounding adds, LSB / sqrt(12).
+    """
     own = f"{OWN.get(finding.signal, '')}_{finding.axis}"
     if finding.kind != "unknown" or own not in finding.equation or f"{finding.signal}_lsb" not in digits.parameters:
         return False

@@ -8,7 +8,7 @@ variables tried).
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -16,16 +16,12 @@ from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, AlignedLog, Pair, Variables
-from imutool.diagnosis.estimation.jacobians import expected
-from imutool.diagnosis.reference_coverage import at_limit
 from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings
-from imutool.units import AXES, SENSORS, UNITS
+from imutool.units import AXES, SENSORS
 
 TIMES = ("after", "in the first")  # how a regime of the time begins, above and below its threshold
-MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 Samples = Float64[np.ndarray, "_ k"]
 
 
@@ -59,17 +55,6 @@ def locate_residual(
     means = [np.asarray(uniform_filter1d(pair.real - a, count, axis=0)) for pair, a in zip(pairs, after, strict=True)]
     located = _locate_logs(pairs, means, floor / np.sqrt(count), p_values, settings, certain=p_values)
     return [place for place in located if place.signal in p_values]
-
-
-def locate_stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Iterator[Located]:
-    """Axes with one value in every sample, although a motion was expected."""
-    stuck, ideal = timestamps.stuck(pair.real), expected(pair, ())
-    for a in np.flatnonzero(stuck & ~at_limit(pair) & (ideal.std(axis=0) > MOVES * floor)):
-        signal = SENSORS[a // 3]
-        reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
-        span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
-        name = pair.name if several else ""
-        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, name, reason, extent="everywhere")
 
 
 def _locate_logs(

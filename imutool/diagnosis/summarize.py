@@ -30,8 +30,8 @@ from imutool.diagnosis.held_out import (
     unexplained_residuals,
     with_effects,
 )
-from imutool.diagnosis.localization import locate_findings, locate_residual, locate_stuck
-from imutool.diagnosis.reference_coverage import unusable_axes
+from imutool.diagnosis.localization import locate_findings, locate_residual
+from imutool.diagnosis.reference_coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
