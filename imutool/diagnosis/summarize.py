@@ -43,6 +43,7 @@ from imutool.units import AXES, SENSORS
 
 RESONANT = {"mount_resonance", "vibration", "timestamp_jitter"}
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
+IN_POSES = 0.1  # of the power of a line in the samples, from which the poses have it, too
 SHOWN_KNOTS = 41  # of a curve without a name in the report
 
 
@@ -107,8 +108,8 @@ def summarize(
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise, from whose
-    colour a line stands out. One that is stronger in the poses is theirs, as at a camera's rate.
+    A line that stands out from the colour of what the body does there needs no reference. One that the poses have, too, is the
+    body's motion, of which their smoothing leaves a part, or their own, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
@@ -122,7 +123,7 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     found = select_effects([log], [vibration])
     chance, power = pair.settings.search.false_discovery_rate, partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
-    own = [one for one in faster if power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
+    own = [one for one in faster if IN_POSES * power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
     clear = [one for one in own if line_p_value(residual, 1.0 / pair.period_s, one.theta[0]) < chance]
     return [finding_of([log], found, one, noise_floor([log])) for one in clear]
 
