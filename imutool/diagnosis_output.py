@@ -118,12 +118,15 @@ def _make(
     remarks: list[str] = []
     seen: list[RunData] = []
     missing = {name for name, (library, _) in NEEDS.items() if find_spec(library) is None}
-    if logs is not None and LOG not in missing:
+    wanted = logs is not None and LOG not in missing
+    report = Forked(partial(_report, d, LOG if wanted else None))
+    if logs is not None and wanted:
         try:
             seen = logs(folder)
         except ImutoolError as error:
             remarks.append(f"{LOG} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
-    report = Forked(partial(_report, d, LOG if seen else None))
+            report.end()
+            report = Forked(partial(_report, d, None))
     if seen:
         _logs(seen, folder / LOG, drawn.ready() if drawn is not None else None)
     if VIEW not in missing:

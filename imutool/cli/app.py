@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -167,8 +168,9 @@ def listing(group: str, option: str) -> type[TyperCommand]:
 
         def format_help(self, ctx: Any, formatter: Any) -> None:
             lines = [f"[bold]{name}[/]  {plain(registry.summary(group, name))}" for name in registry.names(group)]
-            self.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
-            super().format_help(ctx, formatter)
+            shown = copy(self)  # a second help must not list them twice
+            shown.epilog = "\n\n".join([f"Values of {option}:", *lines, self.epilog or ""])
+            super(Listing, shown).format_help(ctx, formatter)
 
     return Listing
 

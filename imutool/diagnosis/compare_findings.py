@@ -17,6 +17,7 @@ from imutool.diagnosis.wording.quantity import grouped
 
 ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
+OWN = {"gyro": "omega", "accel": "f"}
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"
 
 
@@ -24,6 +25,18 @@ def shared(finding: Finding, sim_findings: Sequence[Finding]) -> bool:
     """Whether the simulation has the same effect with the same numbers."""
     twin = _twin(finding, sim_findings)
     return twin is not None and _alike(finding, twin)
+
+
+def is_of_digits(finding: Finding, digits: Finding) -> bool:
+    """Whether a term or curve of an axis' own reading is no more than its rounding.
+
+    It removes less than rounding adds, LSB / sqrt(12).
+    """
+    own = f"{OWN.get(finding.signal, '')}_{finding.axis}"
+    if finding.kind != "unknown" or own not in finding.equation or f"{finding.signal}_lsb" not in digits.parameters:
+        return False
+    removed = finding.held_out.rms_before**2 - finding.held_out.rms_after**2
+    return removed < digits.parameters[f"{finding.signal}_lsb"].value ** 2 / 12.0
 
 
 def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Iterator[str]:

@@ -8,11 +8,12 @@ from itertools import product
 
 import numpy as np
 
-from imutool.array_types import Bool
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
-from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
@@ -25,6 +26,7 @@ from imutool.sensor.trajectory import Stretch, smooth_motion
 from imutool.units import AXES, SENSORS, UNITS
 
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
+MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 COPIED = 0.5  # share of a simulation's poses whose stamps the recording has, too: above, it may follow them
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
@@ -206,6 +208,17 @@ def _limits(pair: Pair) -> list[Finding]:
     signal = next(iter(limits)) if len(limits) == 1 else "both"
     held_out = HeldOut(0.0, 0.0, "-", length)
     return [Finding("saturation", signal, 0.0, 0.0, 0.0, parameters, "readings pile up at +-limit", held_out)]
+
+
+def locate_stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Iterator[Located]:
+    """Axes with one value in every sample, although a motion was expected."""
+    stuck, ideal = timestamps.stuck(pair.real), expected(pair, ())
+    for a in np.flatnonzero(stuck & ~at_limit(pair) & (ideal.std(axis=0) > MOVES * floor)):
+        signal = SENSORS[a // 3]
+        reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
+        span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
+        name = pair.name if several else ""
+        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, name, reason, extent="everywhere")
 
 
 def unusable_axes(pair: Pair) -> list[str]:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.compare_findings import remarks, shared
+from imutool.diagnosis.compare_findings import is_of_digits, remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
@@ -31,20 +31,20 @@ from imutool.diagnosis.held_out import (
     with_effects,
 )
 from imutool.diagnosis.localization import locate_findings, locate_residual
-from imutool.diagnosis.reference_coverage import at_limit, unusable_axes
-from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Located, Traces
+from imutool.diagnosis.reference_coverage import locate_stuck, unusable_axes
+from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
 from imutool.sensor.effects.vibration import line_p_value, line_power
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.units import AXES, SENSORS, UNITS
+from imutool.units import AXES, SENSORS
 
 RESONANT = {"mount_resonance", "vibration", "timestamp_jitter"}
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
+IN_POSES = 0.1  # of the power of a line in the samples, from which the poses have it, too
 SHOWN_KNOTS = 41  # of a curve without a name in the report
-MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 
 
 def summarize(
@@ -62,15 +62,13 @@ def summarize(
     """
     pairs = [log.pair for log in logs]
     noise = noise_floor(logs)
-    selection, named, idle = _worthwhile(logs, selection, noise)
-    after = [with_effects(pair, selection.fitted.chosen) for pair in pairs]  # held-out time stays unseen
-    all_findings = list(named)
     exact = all(pair.exact for pair in pairs)
     # digits are a sample's, and a row beside poses is the mean of many
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
-    all_findings += (
-        timestamps.saturated(pairs, after, selection.tried) + timestamps.dropped(pairs) + timestamps.rounded(pairs, sample)
-    )
+    digits = timestamps.rounded(pairs, sample)
+    selection, named, idle = _worthwhile(logs, selection, noise, digits)
+    after = [with_effects(pair, selection.fitted.chosen) for pair in pairs]  # held-out time stays unseen
+    all_findings = [*named, *timestamps.saturated(pairs, after, selection.tried), *timestamps.dropped(pairs), *digits]
     if not exact:
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
@@ -91,7 +89,7 @@ def summarize(
     if not located:  # where something is left all the same, it is said where
         coloured = {signal: residual.p_value for signal, residual in unexplained.items() if not residual.white}
         located = locate_residual(pairs, after, noise, coloured, settings.localization)
-    located += [place for pair in pairs for place in _stuck(pair, noise, several=len(reals) > 1)]
+    located += [place for pair in pairs for place in locate_stuck(pair, noise, several=len(reals) > 1)]
     return Diagnosis(
         real=tuple(reals.values()),
         sim=sim,
@@ -110,8 +108,8 @@ def summarize(
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    No body moves in a line for minutes, so that a line needs no reference; what the body does there is its noise, from whose
-    colour a line stands out. One that is stronger in the poses is theirs, as at a camera's rate.
+    A line that stands out from the colour of what the body does there needs no reference. One that the poses have, too, is the
+    body's motion, of which their smoothing leaves a part, or their own, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
@@ -125,7 +123,7 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     found = select_effects([log], [vibration])
     chance, power = pair.settings.search.false_discovery_rate, partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
-    own = [one for one in faster if power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
+    own = [one for one in faster if IN_POSES * power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
     clear = [one for one in own if line_p_value(residual, 1.0 / pair.period_s, one.theta[0]) < chance]
     return [finding_of([log], found, one, noise_floor([log])) for one in clear]
 
@@ -155,13 +153,13 @@ def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d:
 
 
 def _worthwhile(
-    logs: Sequence[WhitenedImu], selection: Selection, noise: Float64[np.ndarray, "6"]
+    logs: Sequence[WhitenedImu], selection: Selection, noise: Float64[np.ndarray, "6"], digits: Sequence[Finding]
 ) -> tuple[Selection, list[Finding], list[str]]:
-    """Selection without effects of no held-out gain, its findings, and those effects."""
+    """Selection without effects of no held-out gain or of `digits`, its findings, and the former."""
     named, idle = [finding_of(logs, selection, selected, noise) for selected in selection.selected], []
-    while any(finding.share <= 0.0 for finding in named):
-        least = min(range(len(named)), key=lambda k: named[k].share)
-        idle.append(named[least].effect)
+    while weak := [k for k, one in enumerate(named) if one.share <= 0.0 or any(is_of_digits(one, other) for other in digits)]:
+        least = min(weak, key=lambda k: named[k].share)
+        idle += [named[least].effect] if named[least].share <= 0.0 else []
         name = selection.selected[least].effect.key
         fitted, whole = (
             fit(logs, tuple(entry for entry in before.chosen if entry[0].key != name), part=before.part, near=before)
@@ -181,17 +179,6 @@ def _not_identifiable(selection: Selection, idle: Sequence[str], hidden: Sequenc
     names += idle
     reported = {selected.effect.name for selected in selection.selected}
     return tuple(dict.fromkeys([*names, *(name for name in hidden if name.partition(".")[0] not in reported)]))
-
-
-def _stuck(pair: Pair, floor: Float64[np.ndarray, "6"], *, several: bool) -> Iterator[Located]:
-    """Axes with one value in every sample, although a motion was expected."""
-    stuck, ideal = timestamps.stuck(pair.real), expected(pair, ())
-    for a in np.flatnonzero(stuck & ~at_limit(pair) & (ideal.std(axis=0) > MOVES * floor)):
-        signal = SENSORS[a // 3]
-        reason = f"it reads {pair.real[0, a]:.4g} {UNITS[signal]} in every sample"
-        span = ((float(pair.stamp_s[0]), float(pair.stamp_s[-1])),)
-        name = pair.name if several else ""
-        yield Located(signal, (AXES[a % 3],), span, f"always: {reason}", 1.0, 0.0, name, reason, extent="everywhere")
 
 
 def finding_of(

@@ -41,9 +41,11 @@ class _Processes:
 def forking() -> Iterator[None]:
     """Allow as many processes as processors; none is left at the end, however that comes."""
     _Processes.allowed = processors() - 1 if can_fork() else 0
+    gc.freeze()  # what is imported stays: a collection that looks at it takes time, and in a fork a copy of its memory
     try:
         yield
     finally:
+        gc.unfreeze()
         _Processes.allowed = 0
         for one in list(_Processes.running):
             one.end()

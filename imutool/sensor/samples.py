@@ -21,6 +21,7 @@ from imutool.sensor.signals import FILTERED, SignalFilter, Signals, vibration_po
 from imutool.units import Sensor
 
 Vectors = Float64[np.ndarray, "n 3"]
+Column = Float64[np.ndarray, "_"]
 Columns = Float64[np.ndarray, "_ _"]
 Times = Float64[np.ndarray, " n"]
 PAD = 12  # samples beyond the ends, over which the spline forgets its start: 0.27^12 = 1e-7
@@ -92,8 +93,8 @@ class Recent:
         value = self._of(of, at)
         return self._kept(of, at, make()) if value is None else value
 
-    def changed(self, x: Columns, by: object, change: Callable[[Columns], Columns]) -> Columns:
-        """Columns behind a change of each by itself, which `by` stands for.
+    def changed(self, x: Columns, by: object, change: Callable[[Column], Column]) -> Columns:
+        """Columns behind a change of each by itself, which `by` stands for; each lies in one piece of memory.
 
         Columns that were changed before, in this array or in another, are taken from there.
         """
@@ -102,7 +103,7 @@ class Recent:
             return value
         alike = [entry for entry in self._known if entry[1] is by and entry[0].shape == x.shape]
         if not alike:
-            return self._kept(x, by, np.asarray(change(x)))
+            return self._kept(x, by, np.stack([change(column) for column in x.T]).T)
         few = slice(None, None, len(x) // 16 + 1)
         unlike = (np.stack([entry[0][few] for entry in alike]) != x[few]).any(axis=1)
         nearest = int(unlike.sum(axis=1).argmin())
@@ -110,11 +111,10 @@ class Recent:
         differs = [k for k in range(x.shape[1]) if unlike[nearest, k] or not np.array_equal(like[:, k], x[:, k])]
         if not differs:
             return self._kept(x, by, before)
-        if len(differs) == x.shape[1]:
-            return self._kept(x, by, np.asarray(change(x)))
-        out = before.copy()
-        out[:, differs] = change(x[:, differs])
-        return self._kept(x, by, out)
+        out = np.empty(before.T.shape)
+        for k, column in enumerate(out):
+            column[:] = change(x[:, k]) if k in differs else before[:, k]
+        return self._kept(x, by, out.T)
 
     def _of(self, of: object, at: object) -> Columns | None:
         for k, entry in enumerate(entries := self._known):
@@ -161,16 +161,16 @@ def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"])
     return csr_array((values.ravel(), columns.ravel(), ends), shape=(len(at), n + 2 * PAD))
 
 
-def _coefficients(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "m k"]:
-    """Spline coefficients; beyond the ends columns are reflected through their last point."""
+def _coefficients(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
+    """Spline coefficients of a column, which is reflected through its last points beyond the ends."""
     beyond = np.minimum(np.arange(1, PAD + 1), (n := len(x)) - 1)
-    padded = np.empty((x.shape[1], n + 2 * PAD))  # a column in a row
-    padded[:, PAD : n + PAD] = x.T
-    padded[:, :PAD] = (2.0 * x[0] - x[beyond[::-1]]).T
-    padded[:, n + PAD :] = (2.0 * x[-1] - x[n - 1 - beyond]).T
+    padded = np.empty(n + 2 * PAD)
+    padded[PAD : n + PAD] = x
+    padded[:PAD] = 2.0 * x[0] - x[beyond[::-1]]
+    padded[n + PAD :] = 2.0 * x[-1] - x[n - 1 - beyond]
     from scipy.ndimage import spline_filter1d
 
-    return np.ascontiguousarray(spline_filter1d(padded, 3, axis=1, output=padded).T)
+    return np.asarray(spline_filter1d(padded, 3, output=padded))
 
 
 @dataclass(frozen=True, eq=False)

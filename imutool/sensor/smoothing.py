@@ -10,7 +10,7 @@ follow from the matrices' symbols, b(theta) of the data and p(theta) = (2 - 2 co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -182,21 +182,27 @@ class Samples:
         ratio = (self.count - ROUGHNESS) * float(np.mean(np.log(self.symbol / penalty + _penalty_symbol(_angles()))))
         return free * np.log(variance) + self.y.shape[1] * ratio, float(np.sqrt(variance))
 
-    def fit(self, cutoff_hz: float | None = None) -> Penalised:
-        """Likeliest curve, smoothed a little more than that; or the curve of a given cut-off."""
-        likeliest = self._likeliest() if cutoff_hz is None else cutoff_hz
+    def fit(self, cutoff_hz: float | None = None, near_hz: float | None = None) -> Penalised:
+        """Likeliest curve, smoothed a little more than that; or the curve of a given cut-off.
+
+        `near_hz` is the likeliest cut-off of other weights, from which it is looked for.
+        """
+        likeliest = self._likeliest(near_hz) if cutoff_hz is None else cutoff_hz
         chosen = CAUTION * likeliest if cutoff_hz is None else cutoff_hz
         penalty = self.penalty_for(chosen)
         spline: BSpline = BSpline(self.knots, self.coefficients(penalty), DEGREE, extrapolate=False)
         return Penalised(spline, self.unlikelihood(likeliest)[1], chosen, penalty, self.penalty_for(likeliest), self)
 
-    def _likeliest(self) -> float:
+    def _likeliest(self, near_hz: float | None) -> float:
         def cost(log_hz: float) -> float:
             return self.unlikelihood(float(np.exp(log_hz)))[0]
 
         lowest_hz = max(min(LOWEST_HZ, self.highest_hz / 10.0), LEAST_ANGLE / (2.0 * np.pi * self.knot_s))
         tried = np.log(np.geomspace(lowest_hz, self.highest_hz, COARSE)).tolist()
-        k = int(np.argmin([cost(x) for x in tried]))
+        known = cache(lambda k: cost(tried[k]))
+        k = min(range(COARSE), key=known) if near_hz is None else int(np.abs(tried - np.log(near_hz)).argmin())
+        while (better := min(range(max(k - 1, 0), min(k + 2, COARSE)), key=known)) != k:
+            k = better
         bounds = tried[max(k - 1, 0)], tried[min(k + 1, COARSE - 1)]
         return float(np.exp(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02}).x))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import median_filter, percentile_filter
@@ -152,6 +153,16 @@ def smooth_motion(poses: Poses) -> SmoothMotion:
         DataError: no stretch of at least half a second and 25 poses can be trusted.
         NumericsError: stamps so uneven that no curve is defined.
     """
+    motion = next((motion for known, motion in _Last.motions if known is poses), None) or _smoothed(poses)
+    _Last.motions = ((poses, motion),)
+    return motion
+
+
+class _Last:
+    motions: ClassVar[tuple[tuple[Poses, SmoothMotion], ...]] = ()  # second simulation and audit ask for the same
+
+
+def _smoothed(poses: Poses) -> SmoothMotion:
     t_s = seconds(poses.t_ns, int(poses.t_ns[0])) if len(poses) else np.zeros(0)
     columns = (poses.p_wb, continuous(poses.q_wb_wxyz))
     stretches: list[Stretch] = []
@@ -202,9 +213,11 @@ def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
     period_s = float(np.median(np.diff(t_s)))
     knot_s = max(period_s, min(KNOT_PERIODS * period_s, MOST_KNOT_S), LEAST_KNOT_S)
     weights, window = np.ones(len(t_s)), min(2 * round(0.5 * USUAL_S / period_s), len(t_s)) + 1
+    near_hz = None
     for index in range(PASSES):
         samples = Samples(t_s, y, weights, knot_s)
-        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if index == 0 else None)
+        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if index == 0 else None, near_hz)
+        near_hz = fit.cutoff_hz if index else None
         size = np.linalg.norm(fit.residual(), axis=1)
         local = percentile_filter(size, USUAL_PERCENTILE, window, mode="nearest")
         usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, LEAST_NOISE)

@@ -139,8 +139,8 @@ def folded(pool: Pool) -> Pool:
 
 def parameter_columns(effects: Sequence[LinearForm], names: Sequence[str]) -> list[int]:
     """Columns of the parameters of some effects."""
-    of = [effect.name for effect in effects for _ in effect.parameters]
-    return [k for k, name in enumerate(of) if name in names]
+    chosen = [effect.name in names for effect in effects for _ in effect.parameters]
+    return [k for k, among in enumerate(chosen) if among]
 
 
 def effects_beyond_chance(problem: Problem, effects: Sequence[LinearForm]) -> dict[str, float]:
@@ -182,7 +182,8 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Seque
     """
     columns = parameter_columns(effects, names)
     theta, covariance = problem.solve(columns)
-    own = [k for k, column in enumerate(columns) if column in parameter_columns(effects, names[-1:])]
+    of_last = parameter_columns(effects, names[-1:])
+    own = [k for k, column in enumerate(columns) if column in of_last]
     last, block = theta[columns][own], covariance[own][:, own]
     wald = problem.design_effect * float(last @ torch.linalg.solve(block, last))
     shown = float((1 - block.diagonal() * problem.prior[columns][own]).sum())

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -187,34 +188,40 @@ def shown_by_logs(
     The restricted likelihood of all logs decides between widths up to `NUISANCE_STD`: what logs share is the effects', and
     logs that agree keep one clock, one rotation and one lever arm. `H` and `g` are the losses of the logs about a point.
     """
-    own_prior = widest(sensor, theta)
+    own_prior, p = widest(sensor, theta), len(prior)
     for _ in range(2):
         for part in (ROTATION[sensor], CLOCK[sensor], LEVER[sensor]):
-            tried: list[tuple[float, int, Tensor]] = []
-            for narrower in NARROWER if part.start < part.stop else ():
-                other = own_prior.clone()
-                other[part] = widest(sensor, theta)[part] * narrower**2
-                tried.append((minus_log_likelihood(H, g, theta, own, prior, other), len(tried), other))
-            own_prior = min(tried)[2] if tried else own_prior
+            if part.start < part.stop:
+                tried = own_prior.repeat(len(NARROWER), 1)
+                tried[:, part] = torch.from_numpy(NARROWER[:, None] ** 2).to(tried) * widest(sensor, theta)[part]
+                own_prior = tried[minus_log_likelihood(integrated(H, g, own, tried[:, None], p), theta, prior).argmin()]
     return own_prior
 
 
-def minus_log_likelihood(
-    H: Float[Tensor, "logs k k"],
-    g: Float[Tensor, "logs k"],
-    theta: Float[Tensor, " p"],
-    own: Float[Tensor, "logs o"],
-    prior: Float[Tensor, " p"],
-    own_prior: Float[Tensor, " o"],
-) -> float:
+class Integrated(NamedTuple):
+    """Losses of logs with each log's own unknowns integrated out."""
+
+    S: Float[Tensor, "*batch logs p p"]
+    v: Float[Tensor, "*batch logs p"]
+    c: Float[Tensor, "*batch logs"]
+
+
+def integrated(
+    H: Float[Tensor, "*#batch k k"], g: Float[Tensor, "*#batch k"], own: Tensor, own_prior: Tensor, p: int
+) -> Integrated:
+    """Integrate out a log's own unknowns, which follow p parameters that the logs share."""
+    A, b = H[..., p:, p:] + torch.diag_embed(own_prior), g[..., p:] + own_prior * own
+    X, y = torch.linalg.solve(A, torch.cat([H[..., p:, :p].expand(*A.shape[:-1], p), b[..., None]], -1)).split((p, 1), -1)
+    S, v = H[..., :p, :p] - H[..., :p, p:] @ X, g[..., :p] - (H[..., :p, p:] @ y)[..., 0]
+    c = torch.logdet(A) - own_prior.log().sum(-1) + (own_prior * own.square()).sum(-1) - (b * y[..., 0]).sum(-1)
+    return Integrated(S, v, c)
+
+
+def minus_log_likelihood(logs: Integrated, theta: Float[Tensor, " p"], prior: Float[Tensor, " p"]) -> Float[Tensor, "*batch"]:
     """Twice the negative logarithm, but for a constant, with all unknowns integrated out."""
-    p = len(prior)
-    A, b = H[:, p:, p:] + torch.diag(own_prior), g[:, p:] + own_prior * own
-    X, y = torch.linalg.solve(A, H[:, p:, :p]), torch.linalg.solve(A, b[..., None])
-    S = torch.diag(prior) + (H[:, :p, :p] - H[:, :p, p:] @ X).sum(0)
-    v = prior * theta + (g[:, :p] - (H[:, :p, p:] @ y)[..., 0]).sum(0)
-    gain = (b * y[..., 0]).sum() + v @ torch.linalg.solve(S, v) - (own_prior * own.square()).sum()
-    return float(torch.logdet(A).sum() + torch.logdet(S) - len(own) * own_prior.log().sum() - gain)
+    S, v = torch.diag(prior) + logs.S.sum(-3), prior * theta + logs.v.sum(-2)
+    found: Tensor = logs.c.sum(-1) + torch.logdet(S) - (v * torch.linalg.solve(S, v[..., None])[..., 0]).sum(-1)
+    return found
 
 
 def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:

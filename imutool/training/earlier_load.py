@@ -12,13 +12,12 @@ a small matrix for each log and time puts K z_0 in the place of its amplitude.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from imutool.array_types import Float, Float64
+from imutool.array_types import Float, Float64, Int
 from imutool.bias import temperature
 from imutool.bias.networks.temperature import online_signals
 from imutool.bias_start.earlier_load import EARLIER_S, PRIOR, loads_after
@@ -29,7 +28,7 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
-from imutool.training.closed_form import minus_log_likelihood
+from imutool.training.closed_form import Integrated, integrated, minus_log_likelihood
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.segments import Pool
 from imutool.training.settings import SensorPrior
@@ -121,29 +120,32 @@ def _likeliest(problem: Problem, decays: Sequence[Sequence[Float[Tensor, "d p"]]
 
     One time for all is no news: a drift that every log has passed alike cannot be told from none. All are taken for cold then.
     """
-    fit, logs = problem.fit.moved(-problem.theta), range(len(decays))
+    fit, logs = problem.fit.moved(-problem.theta), list(range(len(decays)))
     merged = [[_merged(fit.H[log], fit.g[log], D) for D in decays[log]] for log in logs]
+    H, g = (torch.stack([torch.stack([of_time[part] for of_time in of_log]) for of_log in merged]) for part in (0, 1))
     prior = problem.prior[: decays[0][0].shape[1]]
+    alone = integrated(H, g, problem.own[:, None], problem.own_prior, len(prior))  # by log and time
+    alone = alone._replace(c=alone.c - 2.0 * torch.from_numpy(np.log(PRIOR)).to(alone.c))
 
-    @cache
-    def minus_twice(times: tuple[int, ...]) -> float:
-        H, g = (torch.stack([merged[log][time][part] for log, time in enumerate(times)]) for part in (0, 1))
-        found = minus_log_likelihood(H, g, torch.zeros_like(prior), problem.own, prior, problem.own_prior)
-        return found - 2.0 * float(np.log(PRIOR[list(times)]).sum())
+    def minus_twice(times: Int[Tensor, "tried logs"]) -> Float[Tensor, " tried"]:
+        return minus_log_likelihood(Integrated(*(part[logs, times] for part in alone)), torch.zeros_like(prior), prior)
 
-    best: list[tuple[float, tuple[int, ...]]] = []
+    every = torch.arange(len(EARLIER_S), device=prior.device)
+    best: list[tuple[float, list[int]]] = []
     for start in range(len(EARLIER_S)):
-        times = (start,) * len(decays)
+        times = every.new_full((len(logs),), start)
         for _ in range(SWEEPS):
             before = times
             for log in logs:
-                times = min(((*times[:log], time, *times[log + 1 :]) for time in range(len(EARLIER_S))), key=minus_twice)
-            if times == before:
+                tried = times.repeat(len(every), 1)
+                tried[:, log] = every
+                times = tried[minus_twice(tried).argmin()]
+            if torch.equal(times, before):
                 break
-        best.append((minus_twice(times), times))
-    common = min(minus_twice((time,) * len(decays)) for time in range(len(EARLIER_S)))
-    likeliest, times = min(best)
-    return list(times) if likeliest < common - CLEAR else [COLD] * len(decays)
+        best.append((float(minus_twice(times[None])), times.tolist()))
+    common = float(minus_twice(every[:, None].expand(-1, len(logs))).min())
+    likeliest, found = min(best)
+    return found if likeliest < common - CLEAR else [COLD] * len(decays)
 
 
 def _merged(

@@ -92,13 +92,12 @@ class Problem:
         at = torch.zeros_like(self.theta)
         at[columns] = self.theta[columns]
         fit = self.fit.moved(at - self.theta)
-        S, v = torch.diag(self.prior[columns]), self.prior[columns] * at[columns]
         own_H, own_g = self._own_equations(fit)
-        for i in range(len(self.own)):
-            if i != without:
-                X = torch.linalg.solve(own_H[i], fit.H[i, p:][:, columns])
-                S = S + fit.H[i][columns][:, columns] - fit.H[i][columns][:, p:] @ X
-                v = v + fit.g[i, columns] - X.mT @ own_g[i]
+        shared = fit.H[:, columns]
+        X = torch.linalg.solve(own_H, shared[:, :, p:].mT)
+        S, v = shared[:, :, columns] - shared[:, :, p:] @ X, fit.g[:, columns] - (X.mT @ own_g[..., None])[..., 0]
+        kept = [i for i in range(len(self.own)) if i != without]
+        S, v = torch.diag(self.prior[columns]) + S[kept].sum(0), self.prior[columns] * at[columns] + v[kept].sum(0)
         covariance = torch.linalg.inv(S) if columns else S
         at[columns] -= covariance @ v
         return Solution(at, covariance)

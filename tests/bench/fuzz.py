@@ -1,6 +1,7 @@
 """Broken inputs of every kind: `python tests/bench/fuzz.py [KIND...] [--seconds 3600] [--seed S] [--case N]`, problems found.
 
-The kinds are the modules of `tests/fuzz`. Without a seed it is the date of the day. With `--case` that case alone runs again.
+The kinds are the modules of `tests/fuzz`. Without a seed it is the date of the day. With `--cases` so many of each kind run,
+however long that takes; with `--case` that case alone runs again.
 Exit code 1 if a promise was broken.
 """
 
@@ -24,13 +25,16 @@ def main() -> int:
     parser.add_argument("kinds", nargs="*", help=", ".join(fuzz.kinds()))
     parser.add_argument("--seconds", type=float, default=60.0, help="in all, divided over the kinds")
     parser.add_argument("--seed", default=datetime.datetime.now(datetime.UTC).date().isoformat())
+    parser.add_argument("--cases", type=int, help="of each kind, instead of seconds")
     parser.add_argument("--case", type=int, help="run this case alone")
     given = parser.parse_args()
     broken = 0
-    chosen = given.kinds or list(fuzz.kinds())
+    chosen = given.kinds or fuzz.kinds()
     for kind in chosen:
         if given.case is not None:
             each = iter([fuzz.run_case(kind, given.seed, given.case)])
+        elif given.cases is not None:
+            each = (fuzz.run_case(kind, given.seed, number) for number in range(given.cases))
         else:
             each = fuzz.hunt(kind, given.seed, given.seconds / len(chosen))
         cases = problems = 0

@@ -68,6 +68,7 @@ LASTING = (
     *(name for name in MATRICES if name != "clock_offset"),
     *("mount_rotation", "size_effect", "gyro_g_sensitivity", "gyro_quadratic", "accel_quadratic"),
 )
+ABSENT = "not run yet"
 SURE = 3.0  # sigmas, widened by the sequences' disagreement, from which on a number is carried over to other recordings
 # true = M read - b: numbers of the data set's page, https://vision.in.tum.de/data/datasets/visual-inertial-dataset, as several
 # public programs quote it; defined by equations 1 and 2 of Schubert et al., The TUM VI Benchmark, IROS 2018, arXiv 1804.06120.
@@ -179,8 +180,8 @@ def learned(fits: Sequence[Mapping[str, Any]]) -> tuple[PhysicsFile, list[str]]:
             continue
         effect, _, parameter = name.partition(".")
         entries.setdefault(effect, {})[parameter] = Written(value=float(mean[k]), std=std, unit=values[0].unit)
-    file = PhysicsFile(effect=tuple(Entry(name=effect, parameters=values) for effect, values in entries.items()))
-    return file, left
+    of_sensor = ((effect, values) for effect, values in entries.items() if effect != SMOOTHED.name)
+    return PhysicsFile(effect=tuple(Entry(name=effect, parameters=values) for effect, values in of_sensor)), left
 
 
 def as_file(values: Mapping[str, float]) -> PhysicsFile:
@@ -294,7 +295,7 @@ class Sensor:
 
     def _told(self, kind: str, log: Log) -> dict[str, Any]:
         path = self.out / kind / f"{log.name}.json"
-        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"failed": "not run yet"}
+        told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"failed": ABSENT}
         return told
 
     # ── what it says ──
@@ -326,6 +327,9 @@ class Sensor:
         }
         if shown := {name: one for name, one in gains.items() if "failed" not in one}:
             yield gain_table(shown)
+        yield from (
+            f"{name}: no answer ({one['failed']})" for name, one in gains.items() if one.get("failed", ABSENT) != ABSENT
+        )
 
     def values(self) -> Iterable[str]:
         """Every value of every sequence."""

@@ -10,7 +10,7 @@ import pytest
 from support import planted
 from support.diagnoses import replace
 
-from imutool.diagnosis.compare_findings import ANOTHER_MOTION, remarks, shared
+from imutool.diagnosis.compare_findings import ANOTHER_MOTION, is_of_digits, remarks, shared
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut
 from imutool.errors import DataError
@@ -48,6 +48,25 @@ def test_another_effect_signal_or_driver_is_another_finding() -> None:
     assert not shared(finding(), [finding("gyro_misalignment"), finding(signal="accel")])
     assert not shared(driven, [finding("driven", driver="/motor.y")])
     assert shared(driven, [driven])
+
+
+@pytest.mark.parametrize(
+    ("equation", "lsb", "sensor", "rounding"),
+    [
+        ("gyro.x += curve(omega_x)", 0.1, "gyro", True),
+        ("gyro.x += c omega_x |omega_x|", 0.1, "gyro", True),
+        ("gyro.x += curve(omega_x)", 0.05, "gyro", False),  # rounding adds less than it removes
+        ("gyro.x += curve(omega_y)", 0.1, "gyro", False),
+        ("gyro.x += curve(omega_x)", 0.1, "accel", False),
+    ],
+)
+def test_a_curve_of_an_axis_that_does_no_more_than_its_digits_is_theirs(
+    equation: str, lsb: float, sensor: str, rounding: bool
+) -> None:
+    curve = finding("unknown", kind="unknown", axis="x", equation=equation)
+    digits = finding("quantization", parameters={f"{sensor}_lsb": Estimate(lsb, 1e-3 * lsb, "rad/s")})
+    assert is_of_digits(curve, digits) is rounding
+    assert not is_of_digits(finding(equation=equation, axis="x"), digits)
 
 
 def test_curves_are_alike_where_both_reach() -> None:

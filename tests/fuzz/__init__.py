@@ -36,22 +36,21 @@ class TooLong(BaseException):
     """A case did not end in time; no `except Exception` takes it."""
 
 
-def kinds() -> dict[str, Problems]:
-    """The generators: every module of this package with a function `problems`, by name."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith(("test_", "_")))
-    modules = {name: importlib.import_module(f"{__name__}.{name}") for name in names}
-    return {name: module.problems for name, module in modules.items() if hasattr(module, "problems")}
+def kinds() -> list[str]:
+    """Names of the generators: the modules of this package."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith(("test_", "_")))
 
 
 def run_case(kind: str, seed: str, number: int) -> list[str]:
     """Problems of one case, each with its name and the line that runs it again."""
+    problems: Problems = importlib.import_module(f"{__name__}.{kind}").problems
     rng = random.Random(f"{kind} {seed} {number}")
     found, began = list[str](), time.process_time()
     with tempfile.TemporaryDirectory(prefix="imutool-fuzz-", dir=_quick_folder()) as folder:
         try:
             with warnings.catch_warnings(), bounded():
                 warnings.simplefilter("error")
-                found.extend(kinds()[kind](rng, Path(folder)))
+                found.extend(problems(rng, Path(folder)))
         except TooLong:
             found.append(f"not done after {HANG_S:.0f} s")
         except Exception:  # noqa: BLE001  # any that leaves a case is what is sought

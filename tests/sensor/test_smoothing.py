@@ -48,6 +48,14 @@ def test_the_noise_is_found(noise: float) -> None:
     assert fit.noise == pytest.approx(noise, rel=0.06)  # 1 / sqrt(2 n) is 1 per cent; a little more smoothing than likeliest
 
 
+@pytest.mark.parametrize("near_hz", [0.3, 5.0, 20.0])
+def test_from_any_start_the_same_cut_off_is_likeliest(near_hz: float) -> None:
+    p, _ = wander(1)
+    y = p[:, None] + 1e-3 * default_rng(2).normal(size=(len(p), 1))
+    of_all = Samples(T_S[: len(p)], y, np.ones(len(p)), 0.02)
+    assert of_all.fit(near_hz=near_hz).cutoff_hz == of_all.fit().cutoff_hz
+
+
 @pytest.mark.parametrize("derivative", [0, 2])
 def test_it_errs_as_it_says(derivative: int) -> None:
     """On a motion with white jerk, for which the statement is exact."""

@@ -92,6 +92,12 @@ def test_the_noise_of_poses_and_what_it_does_are_stated(path: Trajectory) -> Non
     assert SAID[0] < motion.accel_std / rms(found[1]) < SAID[1]
 
 
+def test_a_motion_is_smoothed_once_though_others_ask_for_it_again(path: Trajectory) -> None:
+    poses = noisy(path, clock(path.start_ns, 120.0), 2e-4, 0.03)
+    assert smooth_motion(poses) is smooth_motion(poses)
+    assert smooth_motion(poses) is not smooth_motion(Poses(poses.t_ns, poses.p_wb, poses.q_wb_wxyz))
+
+
 def test_the_ends_that_are_trusted_are_nearly_as_good_as_the_middle(path: Trajectory) -> None:
     poses = noisy(path, clock(path.start_ns, 120.0), 5e-4, 0.05)
     first, middle = [], []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import runpy
@@ -39,11 +40,20 @@ def _restored() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def run_command(words: list[str], cwd: Path, env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
-    """What `imutool` in a process of its own would have printed, and its exit code; a bug is a traceback and 1."""
+@functools.cache
+def _main() -> Callable[[], object]:
+    """`imutool.cli.main`. Each command is made once: a process that ran many tests has loaded all, and typer makes all anew."""
+    import typer.main
+
     from imutool.cli import main
 
-    return _run(main, ["imutool", *words], cwd, env, "default")
+    typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)
+    return main
+
+
+def run_command(words: list[str], cwd: Path, env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    """What `imutool` in a process of its own would have printed, and its exit code; a bug is a traceback and 1."""
+    return _run(_main(), ["imutool", *words], cwd, env, "default")
 
 
 def run_script(line: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -123,7 +123,7 @@ class CandidateScore:
                     js, b, more = B.parameters[on], axis.free(B.rows[on]), None
                     N[np.ix_(js, js)] += b @ b.T
                     if column in added:
-                        more = axis.free(log.whiten.rows(added[column][None], np.array([column]))[0])
+                        more = axis.free(log.whiten.rows([added[column]], np.array([column]))[0])
                     rows.append((log.pair.columns * k + column, js, b, more))
         return _Linear(start, rows, N)
 

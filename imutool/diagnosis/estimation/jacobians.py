@@ -42,7 +42,7 @@ class AddedColumns(ABC):
 
     def __call__(self, samples: SensorSamples, theta: Theta) -> SensorSamples:
         """The samples with the columns on them."""
-        out = (samples.gyro if self.sensor == 0 else samples.accel).copy()
+        out = (samples.gyro if self.sensor == 0 else samples.accel).copy(order="K")
         out[:, self.axis] += self.added_at(samples, theta)
         return samples.with_readings(gyro=out) if self.sensor == 0 else samples.with_readings(accel=out)
 
@@ -100,7 +100,8 @@ class ForwardPass:
             for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
                 if then is not now:
                     rows = np.subtract(then.T, now.T, order="C")
-                    yield from ((first + k, j, row / h) for k, row in enumerate(rows) if row.any())
+                    rows /= h
+                    yield from ((first + k, j, row) for k, row in enumerate(rows) if row.any())
 
 
 def _shared(a: list[tuple[Effect, Theta]], b: list[tuple[Effect, Theta]]) -> int:
@@ -186,9 +187,7 @@ def effect_jacobian(whiten: Whitener, forward: ForwardPass, effect: Effect, *, o
     """Jacobian of an effect in a forward pass, or of a linear one outside it."""
     entries = list(forward.derivatives(effect, onsets=onsets))
     axes, js = (np.array([entry[k] for entry in entries], np.int64) for k in (0, 1))
-    width, length = len(effect.parameters), len(forward.pair.stamp_s)
-    rows = np.stack([row for _, _, row in entries]) if entries else np.zeros((0, length))
-    return EffectJacobian(whiten.rows(rows, axes), axes, js, width)
+    return EffectJacobian(whiten.rows([row for _, _, row in entries], axes), axes, js, len(effect.parameters))
 
 
 class Jacobians:

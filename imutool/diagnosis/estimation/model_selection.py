@@ -226,6 +226,7 @@ class _Search:
         """Selection of the effects that pass on all rows and on held-out blocks."""
         while len(now.chosen) > (first := len(self.always)):
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
+            _ = now.jacobians  # which both processes need
             unseen = Forked(partial(first_refuted, now, first))
             whole = fit(self.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:

@@ -36,7 +36,8 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     ideal, works = expected(pair, ()), pair.axes
     band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)
     pair = replace(pair, band_hz=band_hz)
-    whiten = _in_band(pair, _rich(pair, candidates), pair.real - ideal, band_hz)
+    band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
+    whiten = _in_band(pair, _rich(pair, candidates, band), pair.real - ideal, band)
     return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
 
 
@@ -46,11 +47,10 @@ def _counting(pair: Pair, white: Whitener) -> WhitenedImu:
 
 
 def _in_band(
-    pair: Pair, wide: Sequence[Float64[np.ndarray, "_ _"]], wide_misfit: Float64[np.ndarray, "n 6"], band_hz: float
+    pair: Pair, columns: Sequence[Float64[np.ndarray, "_ m"]], wide_misfit: Float64[np.ndarray, "n 6"], band: Band
 ) -> Whitener:
-    """The noise of rows up to a frequency, from the residual of a rich model there."""
-    band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
-    columns, misfit = [band.rows(rows) for rows in wide], band(wide_misfit)
+    """The noise of rows in a band, from the residual of a rich model there, whose columns are in it by axis."""
+    misfit = band(wide_misfit)
     usable = pair.usable[:: band.every]
     whiten = Whitener(np.ones((6, 1)), np.ones(6))
     for _ in range(pair.settings.noise.rounds):
@@ -113,19 +113,21 @@ def ridge_fit(
     return np.asarray(A @ np.linalg.solve(N, A[rows].T @ y[rows]))
 
 
-def _rich(pair: Pair, candidates: Sequence[Effect]) -> list[Float64[np.ndarray, "_ n"]]:
-    """Design columns by axis: a constant, and derivatives where fits begin."""
-    columns = [[np.ones(len(pair.real))] for _ in range(6)]
+def _rich(pair: Pair, candidates: Sequence[Effect], band: Band) -> list[Float64[np.ndarray, "_ m"]]:
+    """Design columns in a band by axis: a constant, and derivatives where fits begin."""
+    columns = [[band.rows([np.ones(len(pair.real))])[0]] for _ in range(6)]
     ideal = ForwardPass(pair, ())
 
-    def rows(effect: Effect) -> list[tuple[int, int, Float64[np.ndarray, " n"]]]:
+    def rows(effect: Effect) -> list[tuple[int, Float64[np.ndarray, " m"]]]:
         passes = [ideal]
         if effect.starts is not None and not effect.linear:
             passes = [ForwardPass(pair, ((effect, start),), ideal) for start in pair.starts(effect)] or passes
-        return [row for forward in passes for row in forward.derivatives(effect, onsets=False)]
+        found = [row for forward in passes for row in forward.derivatives(effect, onsets=False)]
+        slow = band.rows([row for _, _, row in found])  # of which a process passes on far less
+        return [(axis, row) for (axis, _, _), row in zip(found, slow, strict=True)]
 
     for found in of_each(rows, candidates):
-        for axis, _, row in found:
+        for axis, row in found:
             columns[axis].append(row)
     return [np.stack(rows) for rows in columns]
 
@@ -134,9 +136,11 @@ def _solved(A: Float64[np.ndarray, "q m"], y: Float64[np.ndarray, " m"]) -> tupl
     """Least squares by the independent columns, and their number."""
     size = np.linalg.norm(A, axis=1)
     size = np.where(size > 0, size, 1.0)
-    left, singular, right = np.linalg.svd((A / size[:, None]).T, full_matrices=False)
+    both = np.concatenate([A / size[:, None], y[None]])
+    R = np.asarray(np.linalg.qr(both.T, mode="r"))  # takes, with its singular values, half the time of A's own
+    left, singular, right = np.linalg.svd(R[: len(A), :-1], full_matrices=False)
     kept = singular > INDEPENDENT * singular[0]
-    return right[kept].T @ ((left[:, kept].T @ y) / singular[kept]) / size, float(kept.sum())
+    return right[kept].T @ ((left[:, kept].T @ R[: len(A), -1]) / singular[kept]) / size, float(kept.sum())
 
 
 def known_band_hz(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -121,24 +121,26 @@ def with_steady_clock(
 ) -> Fit:
     """Fit with two of offset, skew and jump instead of a clock that wanders.
 
-    If they do as well (BIC); `starts` by effect. Instead of a jump an offset, unless the jump is clearly better: one right
-    after the start is none.
+    If they do as well (BIC); `starts` by effect. Instead of a jump an offset, or a clock that runs fast, unless the jump is
+    clearly better: one right after the start is none, and half of what a clock gains over a log looks like one in its middle.
     """
-    offsets = [effect for effect in named if effect.name == "clock_offset" and effect.key not in now.keys]
-    jumps = [entry for entry in now.chosen if entry[0].name == "clock_jump"]
-    for offset, (jump, (_, step)) in product(offsets, jumps):
-        rest = tuple(entry for entry in now.chosen if entry[0] is not jump)
-        constant = fit(logs, (*rest, (offset, np.array([step]))), near=now)
-        now = constant if bic(constant) < bic(now) + now.logs[0].pair.settings.search.clearly_better else now
     others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
-    if len(others) == len(now.chosen):
-        return now
-    steady, fits = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys], [now]
-    for pair in combinations(steady, 2):
-        on_trend = any(effect.name == "clock_skew" for effect in pair)
-        at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
-        fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in pair)), near=now))
-    return min(fits, key=bic)
+    if len(others) < len(now.chosen):
+        steady, fits = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys], [now]
+        for some in chain(combinations(steady, 1), combinations(steady, 2)):
+            on_trend = len(some) > 1 and any(effect.name == "clock_skew" for effect in some)
+            at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
+            fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some)), near=now))
+        now = min(fits, key=bic)
+    simpler = [effect for effect in named if effect.name in ("clock_offset", "clock_skew") and effect.key not in now.keys]
+    for jump, (begin_s, step_s) in [entry for entry in now.chosen if entry[0].name == "clock_jump"]:
+        rest = tuple(entry for entry in now.chosen if entry[0] is not jump)
+        size = {"clock_offset": step_s, "clock_skew": step_s / max(2.0 * begin_s, 1.0)}
+        trials = [fit(logs, (*rest, (effect, np.array([size[effect.name]]))), near=now) for effect in simpler]
+        margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
+        best = min(trials, key=bic, default=now)
+        now = best if bic(best) < bic(now) + margin else now
+    return now
 
 
 def with_finer_curve(logs: Sequence[WhitenedLog], now: Fit) -> Fit:

@@ -8,6 +8,7 @@ correlated costs what it should.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +20,7 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Blocks, Pair
 from imutool.diagnosis.settings import NoiseSettings
 
+Rows = Sequence[Float64[np.ndarray, " n"]] | Float64[np.ndarray, "r n"]
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
 AT_ONCE = 8  # values of a band in one product of matrices
@@ -46,17 +48,20 @@ class Band:
         slow = self.rows(np.moveaxis(x, 0, -1).reshape(math.prod(x.shape[1:]), len(x)))
         return np.moveaxis(slow.reshape(*x.shape[1:], slow.shape[1]), -1, 0)
 
-    def rows(self, x: Float64[np.ndarray, "r n"]) -> Float64[np.ndarray, "r m"]:
-        """The slow part of some rows, one after another in time; `upfirdn` takes two to four times as long."""
-        count, hop = len(range(0, x.shape[1], self.every)), AT_ONCE * self.every
+    def rows(self, x: Rows) -> Float64[np.ndarray, "r m"]:
+        """The slow part of some rows, each while a processor's cache holds it; `upfirdn` takes two to four times as long."""
+        n = x.shape[1] if isinstance(x, np.ndarray) else len(x[0]) if x else 0
+        count, hop = len(range(0, n, self.every)), AT_ONCE * self.every
         blocks, parts, before = -(-count // AT_ONCE), self._matrix.shape[1] // AT_ONCE, len(self.taps) // 2
-        padded = np.zeros((len(x), (blocks + parts - 1) * hop))
-        padded[:, before : before + x.shape[1]] = x[:, : padded.shape[1] - before]
-        each = (padded.reshape(-1, hop) @ self._matrix).reshape(len(x), blocks + parts - 1, parts, AT_ONCE)
-        out = each[:, :blocks, 0].copy()
-        for k in range(1, parts):
-            out += each[:, k : blocks + k, k]
-        return np.asarray(out.reshape(len(x), blocks * AT_ONCE)[:, :count])
+        padded, out = np.zeros((blocks + parts - 1) * hop), np.empty((len(x), count))
+        for slow, row in zip(out, x, strict=True):
+            padded[before : before + n] = row[: len(padded) - before]
+            each = (padded.reshape(-1, hop) @ self._matrix).reshape(-1, parts, AT_ONCE)
+            added = each[:blocks, 0].copy()
+            for k in range(1, parts):
+                added += each[k : blocks + k, k]
+            slow[:] = added.ravel()[:count]
+        return out
 
     @cached_property
     def _matrix(self) -> Float64[np.ndarray, "hop _"]:
@@ -86,17 +91,18 @@ class Whitener:
         columns = x.reshape(len(x), x.shape[1], math.prod(x.shape[2:]))
         axes, ks = np.nonzero(columns.any(axis=0))
         out = np.zeros((len(range(0, len(x), self.every)), *columns.shape[1:]))
-        out[:, axes, ks] = self.rows(columns[:, axes, ks].T, axes).T
+        if len(axes):
+            out[:, axes, ks] = self.rows(columns[:, axes, ks].T, axes).T
         return out.reshape(len(out), *x.shape[1:])
 
-    def rows(self, x: Float64[np.ndarray, "r n"], axes: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "r m"]:
+    def rows(self, x: Rows, axes: Int64[np.ndarray, " r"]) -> Float64[np.ndarray, "r m"]:
         """Some rows, one after another in time, each of an axis of its own, made white."""
-        slow = np.ascontiguousarray(x) if self.band is None else self.band.rows(x)
+        slow = x if self.band is None else self.band.rows(x)
         taps = (self.filters / self.std[:, None])[axes]
-        out = np.empty_like(slow)
+        out = np.empty((len(slow), len(slow[0]) if len(slow) else 0))
         for white, of, row in zip(out, taps, slow, strict=True):  # numpy's loop for few taps takes half the time of lfilter
             white[:] = np.convolve(row, of)[: len(row)]
-        if self.counts is not None:
+        if self.counts is not None and len(out):
             out[~self.counts.T[axes]] = 0.0
         return out
 
@@ -151,14 +157,12 @@ class WhitenedLog:
         columns = [column for _, block in blocks for column in block.T]
         others, theirs = ([], None) if known is None else ([column for _, block in known[0] for column in block.T], known[1].T)
         new = [k for k, column in enumerate(columns) if theirs is None or not np.array_equal(column, others[k])]
-        rows = np.empty((len(new), len(self.pair.real)))
-        for row, k in zip(rows, new, strict=True):
-            np.subtract(self.pair.real[:, k], columns[k], out=row)
-        white = self.whiten.rows(rows, np.array(new, np.int64))
+        white = self.whiten.rows([self.pair.real[:, k] - columns[k] for k in new], np.array(new, np.int64))
         if theirs is None or len(new) == len(columns):
             return np.asarray(white.T)
         out = theirs.copy()
-        out[new] = white
+        if new:
+            out[new] = white
         return np.asarray(out.T)
 
 

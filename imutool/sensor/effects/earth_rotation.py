@@ -28,9 +28,8 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     latitude, heading = theta.tolist()
     if math.isinf(latitude):
         return motion
-    return replace(
-        motion, gyro=motion.gyro + np.einsum("nji,j->ni", attitude_of(motion, "earth_rotation"), omega_w(latitude, heading))
-    )
+    turning = np.einsum("nji,j->in", attitude_of(motion, "earth_rotation"), omega_w(latitude, heading)).T
+    return replace(motion, gyro=motion.gyro + turning)
 
 
 EFFECT = Effect(

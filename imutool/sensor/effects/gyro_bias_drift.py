@@ -18,7 +18,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
     course_of = Remembered(_course)
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-        added = course_of(samples.stamp_s, float(theta[3]))[:, None] * theta[:3]
+        added = np.outer(theta[:3], course_of(samples.stamp_s, float(theta[3]))).T
         return samples.with_added(sensor, added)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:

@@ -1,4 +1,4 @@
-"""Delay of the gyro against the accelerometer: the two filters of one chip differ by a millisecond or two.
+"""Delay of the gyro against the accelerometer, from the filters of one chip.
 
 What delays both is a `clock_offset`. Only a motion that both sensors see tells the two apart.
 """

@@ -7,7 +7,7 @@ from imutool.sensor.samples import SensorSamples
 
 
 def _forward(samples: SensorSamples, g: Theta) -> SensorSamples:
-    return samples.with_readings(gyro=samples.gyro + samples.accel @ g.reshape(3, 3).T)
+    return samples.with_readings(gyro=samples.gyro + (g.reshape(3, 3) @ samples.accel.T).T)
 
 
 EFFECT = Effect(

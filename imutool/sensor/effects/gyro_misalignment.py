@@ -14,7 +14,7 @@ def misalignment(sensor: Sensor, symbol: str, observable_if: str) -> Effect:
     """Misalignment of either sensor."""
 
     def forward(samples: SensorSamples, m: Theta) -> SensorSamples:
-        return samples.with_added(sensor, getattr(samples, sensor) @ matrix(m).T)
+        return samples.with_added(sensor, (matrix(m) @ getattr(samples, sensor).T).T)
 
     parameters = each_pair("-", 0.05, diagonal=False)
     equation = f"{sensor} += M {symbol}, diag M = 0"

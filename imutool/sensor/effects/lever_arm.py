@@ -16,7 +16,7 @@ from imutool.units import Three
 
 def _forward(motion: IdealMotion, r_b: Theta) -> IdealMotion:
     added = lever_acceleration(motion.gyro.T, motion.alpha.T, (r_b, r_b, r_b))
-    return replace(motion, accel=motion.accel + np.stack(added, axis=1))
+    return replace(motion, accel=motion.accel + np.stack(added).T)
 
 
 def _fast(r_b: Theta) -> CompiledEffect:

@@ -65,21 +65,18 @@ def _first_order(a: float) -> Filter:
 
 def slowed(motion: IdealMotion, x: Vectors, by: Filter) -> Vectors:
     """Columns of a motion behind a filter."""
-    return motion.sampler.behind.changed(x, by, lambda columns: filtered(columns, by))
+    return motion.sampler.behind.changed(x, by, lambda column: filtered(column, by))
 
 
-def filtered(x: Float64[np.ndarray, "n k"], by: Filter) -> Float64[np.ndarray, "n k"]:
-    """Columns behind a filter of gain 1 at rest, held constant beyond the ends."""
+def filtered(x: Float64[np.ndarray, " n"], by: Filter) -> Float64[np.ndarray, " n"]:
+    """Column behind a filter of gain 1 at rest, held constant beyond the ends."""
     n, half = len(x), len(by.taps) // 2
-    from_first = np.empty((x.shape[1], n + AHEAD))  # a column in a row
-    np.subtract(x.T, x[0, :, None], out=from_first[:, :n])
-    from_first[:, n:] = from_first[:, n - 1 : n]
-    driven = np.empty_like(from_first)
-    for out, column in zip(driven, from_first, strict=True):  # numpy is quick for up to 11 taps
-        out[:] = np.convolve(column, by.taps[:half])[: len(column)]
-        out[half:] += np.convolve(column, by.taps[half:])[: len(column) - half]
-    y = lfilter([1.0], by.denominator, driven, axis=1)[:, AHEAD:]
-    return np.asarray(np.add(y.T, x[0], order="C"))
+    from_first = np.empty(n + AHEAD)
+    np.subtract(x, x[0], out=from_first[:n])
+    from_first[n:] = from_first[n - 1]
+    driven = np.convolve(from_first, by.taps[:half])[: len(from_first)]  # numpy is quick for up to 11 taps
+    driven[half:] += np.convolve(from_first, by.taps[half:])[: len(from_first) - half]
+    return np.asarray(lfilter([1.0], by.denominator, driven)[AHEAD:] + x[0])
 
 
 def _taps(numerator: Complex128[np.ndarray, " w"]) -> Float64[np.ndarray, " taps"]:

@@ -10,15 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
-from imutool.sensor.samples import IdealMotion
+from imutool.sensor.samples import IdealMotion, Vectors
 
 
 def _forward(motion: IdealMotion, phi: Theta) -> IdealMotion:
     """R_bi = Exp(phi) takes the sensor's vectors to the body; R_wb stays the body's attitude."""
     R_bi = _rotation(*phi.tolist())
     turned = motion.sampler.behind.made
-    gyro, accel, alpha = (turned(x, R_bi, partial(np.matmul, x, R_bi)) for x in (motion.gyro, motion.accel, motion.alpha))
+    gyro, accel, alpha = (turned(x, R_bi, partial(_turned, x, R_bi)) for x in (motion.gyro, motion.accel, motion.alpha))
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
+
+
+def _turned(x: Vectors, R_bi: Float64[np.ndarray, "3 3"]) -> Vectors:
+    return np.asarray(R_bi.T @ x.T).T
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ from imutool.sensor.samples import IdealMotion
 
 def _forward(motion: IdealMotion, r_b: Theta) -> IdealMotion:
     added = lever_acceleration(motion.gyro.T, motion.alpha.T, r_b.reshape(3, 3))
-    return replace(motion, accel=motion.accel + np.stack(added, axis=1))
+    return replace(motion, accel=motion.accel + np.stack(added).T)
 
 
 EFFECT = Effect(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from imutool.errors import DataError
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import SensorSamples
@@ -17,8 +19,8 @@ def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
     if not names:
         raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
     T = samples.channels[names[0]]
-    warmer = (T - T.mean())[:, None]
-    return samples.with_readings(samples.gyro + warmer * k[:3], samples.accel + warmer * k[3:])
+    gyro, accel = (np.outer(own, T - T.mean()).T for own in (k[:3], k[3:]))
+    return samples.with_readings(samples.gyro + gyro, samples.accel + accel)
 
 
 EFFECT = Effect(

@@ -19,7 +19,7 @@ ABOUT = 401  # frequencies whose median tells what a line stands out from
 
 def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "n 2"]:
     phase = 2.0 * np.pi * f_hz * t_s
-    return np.stack([np.sin(phase), np.cos(phase)], axis=1)
+    return np.stack([np.sin(phase), np.cos(phase)]).T
 
 
 waves_of = Remembered(_waves)
@@ -51,7 +51,7 @@ def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: floa
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     """f (Hz), then the amplitudes of sine and cosine of each axis, accel (m/s²), gyro (rad/s); t on the motion's clock."""
-    waves = waves_of(motion.t_s, float(theta[0])) @ theta[1:].reshape(6, 2).T
+    waves = (theta[1:].reshape(6, 2) @ waves_of(motion.t_s, float(theta[0])).T).T
     return replace(motion, accel=motion.accel + waves[:, :3], gyro=motion.gyro + waves[:, 3:])
 
 

@@ -12,8 +12,8 @@ from imutool.sensor.samples import SensorSamples
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
     """K of the gyro, then of the accelerometer."""
-    power = samples.vibration
-    return samples.with_readings(samples.gyro + power @ k[:9].reshape(3, 3).T, samples.accel + power @ k[9:].reshape(3, 3).T)
+    gyro, accel = ((own.reshape(3, 3) @ samples.vibration.T).T for own in (k[:9], k[9:]))
+    return samples.with_readings(samples.gyro + gyro, samples.accel + accel)
 
 
 EFFECT = Effect(

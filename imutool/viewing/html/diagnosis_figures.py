@@ -248,12 +248,13 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
 
     def draw(figure: Any) -> None:
         panels = figure.subplots(2, 3, sharey="row")
+        kinds = ((False, BEFORE), (True, AFTER))[: 1 + bool(d.findings)]
+        sides = [([residual_in_band(t, t.after if found else t.before) for t in d.traces], color) for found, color in kinds]
         for row, (signal, part) in enumerate(SIGNALS.items()):
             for axis, axes in enumerate(panels[row]):
                 x = np.concatenate([variable(trace, signal, axis)[held_out_mask(trace)] for trace in d.traces])
                 blocks = np.concatenate([_blocks(trace, k)[held_out_mask(trace)] for k, trace in enumerate(d.traces)])
-                for side, color in enumerate((BEFORE, AFTER)[: 1 + bool(d.findings)]):
-                    left = [residual_in_band(trace, trace.after if side else trace.before) for trace in d.traces]
+                for left, color in sides:
                     y = np.concatenate([one[held_out_mask(t), part][:, axis] for one, t in zip(left, d.traces, strict=True)])
                     centre, mean, band = means(x, y, blocks)
                     axes.fill_between(centre, mean - band, mean + band, color=color, alpha=0.25, lw=0)

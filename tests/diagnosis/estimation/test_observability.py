@@ -138,3 +138,13 @@ def test_a_clock_that_jumps_right_after_the_start_has_an_offset(truth: dict[str,
     simpler = with_steady_clock(logs, found, (jump, *others), {})
     assert simpler.keys == (named,)
     assert simpler.chosen[0][1][-1] == pytest.approx(0.01, abs=1e-4)
+
+
+def test_a_clock_that_runs_fast_is_no_jump_in_the_middle_of_the_log() -> None:
+    logs = [planted.weighed(planted.pair(planted.rich(), {"clock_skew": [2e-4]}))]
+    middle_s = 0.5 * float(logs[0].pair.stamp_s[-1])
+    jump, *others = catalogue.diagnosed(["clock_jump", "clock_offset", "clock_skew"])
+    found = fit(logs, ((jump, np.array([middle_s, 2e-4 * middle_s])),))
+    simpler = with_steady_clock(logs, found, (jump, *others), {})
+    assert simpler.keys == ("clock_skew",)
+    assert simpler.chosen[0][1][0] == pytest.approx(2e-4, rel=0.1)
