@@ -25,7 +25,7 @@ NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error",
 
 
 def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> Chosen:
-    """Candidates that are among the findings, strongest first, each with the values of its first finding."""
+    """Candidates that were found, strongest first, with the values of the first finding of each."""
     by_name, found = {effect.name: effect for effect in reversed(candidates)}, dict[str, Mapping[str, Estimate]]()
     for finding in findings:
         if finding.effect in by_name and finding.effect not in NO_EFFECT:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from imutool.diagnosis.closed_loop import LOG, closed_loop
+from imutool.diagnosis.closed_loop import LOG, closed_loop, is_worth_a_round
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_sensor_files import to_physics_file
@@ -35,7 +35,11 @@ def diagnosis(misfits: list[tuple[float, float, float]], *, findings: tuple[str,
         real = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (len(t_s), 1))
         expected = real - [0.1 * misfit, 0.0, 0.0, 0.0, 0.0, 0.0]
         traces.append(Traces("log", t_s, real, expected, expected, np.zeros(len(t_s), bool)))
-    found = tuple(Finding(name, "both", 0.0, 0.0, 0.0, {}, "", HeldOut(0.0, 0.0, "rad/s", 1.0)) for name in findings)
+    kinds = {"unknown": "unknown"}
+    found = tuple(
+        Finding(name, "both", 0.0, 0.0, 0.0, {}, "", HeldOut(0.0, 0.0, "rad/s", 1.0), kind=kinds.get(name, "catalogue"))
+        for name in findings
+    )
     left = {"gyro": Unexplained(1.0, 1.0, white)}
     located = (PLACE,) if findings or not white else ()
     return Diagnosis(("log",), "sim", located, found, np.zeros((1, 6)), (), left, traces=tuple(traces))
@@ -71,6 +75,15 @@ def test_what_no_simulation_changes_is_not_missing() -> None:
     ):
         loop = closed_loop(first, diagnosis([(0.0, 20.0, 0.5)], findings=findings, white=white), Path(LOG))
         assert (loop.mismatch, loop.findings) == (missing is not None, missing or ())
+
+
+@pytest.mark.parametrize(
+    ("again", "another"),
+    [((), False), (("lever_arm",), False), (("gravity",), True), (("unknown",), False), (("timestamp_jitter",), False)],
+)
+def test_only_an_effect_that_the_first_search_did_not_have_is_worth_another(again: tuple[str, ...], another: bool) -> None:
+    first, second = (diagnosis([(0.0, 20.0, 1.0)], findings=names, white=not again) for names in (("lever_arm",), again))
+    assert is_worth_a_round(first, second, closed_loop(first, second, Path(LOG))) is another
 
 
 def test_a_jump_of_the_clock_comes_at_its_time_in_a_simulation_that_begins_later(tmp_path: Path) -> None:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 from support import diagnoses
+from support.diagnoses import replace as replace_struct
 
-from imutool.diagnosis.result import Traces
-from imutool.diagnosis.to_sensor_files import to_noise_file
+from imutool.diagnosis.result import Estimate, Traces
+from imutool.diagnosis.to_sensor_files import start_values, to_noise_file
+from imutool.sensor import catalogue
 
 RATE_HZ, SECONDS = 200.0, 60
 
@@ -24,6 +26,16 @@ def test_the_noise_has_the_size_of_what_is_left_and_its_colour() -> None:
     assert noise.colour is not None
     np.testing.assert_allclose(noise.values("gyro_density") * np.sqrt(RATE_HZ), left.std(axis=0)[:3], rtol=1e-6)
     assert noise.colour.mean[0][0] > noise.colour.mean[0][-1] + 2.0
+
+
+def test_a_search_begins_with_the_first_values_of_what_was_found_and_nothing_for_what_was_not_seen() -> None:
+    arm, delay = catalogue.diagnosed(["lever_arm", "gyro_delay"])
+    again = replace_struct(diagnoses.LEVER_ARM, parameters={"x": Estimate(9.0, 1.0, "m")})
+    some = replace_struct(diagnoses.LEVER_ARM, parameters={"x": Estimate(0.2, 0.01, "m"), "z": Estimate(0.1, 0.01, "m")})
+    jitter = replace_struct(diagnoses.LEVER_ARM, effect="timestamp_jitter")
+    ((effect, theta),) = start_values([some, jitter, again], [delay, arm])
+    assert effect is arm
+    assert theta.tolist() == [0.2, 0.0, 0.1]
 
 
 def test_without_samples_there_is_no_noise() -> None:

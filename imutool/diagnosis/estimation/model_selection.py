@@ -4,7 +4,6 @@ Forward: each candidate is scored beside the effects so far; those of the best s
 Then back: an effect that the others have made superfluous goes, and one for which another serves better is exchanged. What
 stays is decided on all rows at once: dropping it must cost more than noise would, corrected for all that was tried, and on
 held-out blocks of time it must help.
-
 Candidates compare by log p-values of chi-square: twenty squares for one parameter are worth more than twenty-five for nine.
 """
 
@@ -184,8 +183,8 @@ class _Search:
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
-                if effect.key == mine.key and effect.linear:  # its score is its gain
-                    break
+                if effect.key == mine.key and effect.linear:
+                    break  # its score is its gain
                 if effect.key == mine.key or (log_p > own_log_p and not mine.linear):
                     continue
                 limit = without.objective - self.settings.rival_share * (without.objective - now.objective)

@@ -335,6 +335,15 @@ def test_a_clock_that_runs_fast_and_jumps_shows_both(seed: int, eps: float, t_ju
     assert sure(found, "clock_jump", [t_jump, step])
 
 
+def test_a_search_that_begins_with_too_much_and_with_wrong_values_ends_alike() -> None:
+    pair = planted.pair(planted.rich(), {"lever_arm": SINGLE["lever_arm"], "gyro_scale": SINGLE["gyro_scale"]})
+    begin = planted.acting({"mount_rotation": [0.01, 0.0, 0.0], "lever_arm": [0.0, 0.3, 0.0], "accel_quadratic": [1e-3] * 3})
+    found = select_effects([planted.weighed(pair)], planted.catalogue(), begin=begin)
+    assert sorted(names(found)) == ["gyro_scale", "lever_arm"]
+    assert sure(found, "lever_arm", SINGLE["lever_arm"])
+    assert sure(found, "gyro_scale", SINGLE["gyro_scale"])
+
+
 OFFSETS_S = [0.003, 0.001, -0.002, 0.002, *[0.002] * (len(clock_wander.KNOTS_S) - 4)]
 
 
