@@ -18,7 +18,6 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Stage, Theta
 
-RIDGE = 1e-9
 FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
 UNLIKELY = -3.0  # log p-value above which they need not be right
@@ -95,8 +94,8 @@ class CandidateScore:
 
     def __init__(self, logs: Sequence[WhitenedLog], now: Fit) -> None:
         self.logs, self.now = logs, now
-        q = sum(len(theta) for _, theta in now.chosen)
-        self.N, self.g, self.total, self.axes = RIDGE * np.eye(q), np.zeros(q), 0.0, []
+        _, std = priors(now.chosen, now.settings)  # two curves of one axis share a constant, which they alone hold apart
+        self.N, self.g, self.total, self.axes = np.diag(1.0 / std**2), np.zeros(len(std)), 0.0, []
         for number, log in enumerate(logs):
             mask, residual = log.rows("fitted"), now.residuals[number]
             fitted = np.flatnonzero(mask)

@@ -21,6 +21,7 @@ from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
+from imutool.sensor import catalogue
 from imutool.sensor.effects import clock_wander
 
 SURE = 4.0
@@ -342,6 +343,17 @@ def test_a_search_that_begins_with_too_much_and_with_wrong_values_ends_alike() -
     assert sorted(names(found)) == ["gyro_scale", "lever_arm"]
     assert sure(found, "lever_arm", SINGLE["lever_arm"])
     assert sure(found, "gyro_scale", SINGLE["gyro_scale"])
+
+
+def test_candidates_are_scored_beside_two_curves_of_one_axis_whose_constants_are_one() -> None:
+    pair = planted.pair(planted.rich(), {"lever_arm": SINGLE["lever_arm"]})
+    curves = [curve for curve in unnamed.curves(unnamed.like([pair])) if curve.key.startswith("unknown:gyro.y")]
+    for other in curves[1:]:
+        chosen = tuple((curve, curve.null_value.astype(float)) for curve in (curves[0], other))
+        now = fit([planted.weighed(pair)], chosen)
+        (arm,) = catalogue.diagnosed(["lever_arm"])
+        (scored,) = Candidates(now.logs, (arm,)).ranked(now, [arm])
+        assert scored.gain > 0.99 * (now.objective - fit(now.logs, (*chosen, (arm, arm.null_value.astype(float)))).objective)
 
 
 OFFSETS_S = [0.003, 0.001, -0.002, 0.002, *[0.002] * (len(clock_wander.KNOTS_S) - 4)]
