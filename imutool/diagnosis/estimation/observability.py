@@ -123,6 +123,7 @@ def with_steady_clock(
 
     If they do as well (BIC); `starts` by effect. Instead of a jump an offset, or a clock that runs fast, unless the jump is
     clearly better: one right after the start is none, and half of what a clock gains over a log looks like one in its middle.
+    Beside poses, whose clock is another one, an offset instead of a gyro's delay.
     """
     others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
     if len(others) < len(now.chosen):
@@ -132,11 +133,14 @@ def with_steady_clock(
             at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
             fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some)), near=now))
         now = min(fits, key=bic)
-    simpler = [effect for effect in named if effect.name in ("clock_offset", "clock_skew") and effect.key not in now.keys]
-    for jump, (begin_s, step_s) in [entry for entry in now.chosen if entry[0].name == "clock_jump"]:
-        rest = tuple(entry for entry in now.chosen if entry[0] is not jump)
-        size = {"clock_offset": step_s, "clock_skew": step_s / max(2.0 * begin_s, 1.0)}
-        trials = [fit(logs, (*rest, (effect, np.array([size[effect.name]]))), near=now) for effect in simpler]
+    poses = any(log.pair.band_hz is not None for log in logs)
+    for entry in [entry for entry in now.chosen if entry[0].name == "clock_jump" or (poses and entry[0].name == "gyro_delay")]:
+        rest, theta = tuple(other for other in now.chosen if other is not entry), entry[1]
+        sizes = {"clock_offset": -theta[0]}
+        if entry[0].name == "clock_jump":
+            sizes = {"clock_offset": theta[1], "clock_skew": theta[1] / max(2.0 * theta[0], 1.0)}
+        simpler = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
+        trials = [fit(logs, (*rest, (effect, np.array([sizes[effect.name]]))), near=now) for effect in simpler]
         margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
         best = min(trials, key=bic, default=now)
         now = best if bic(best) < bic(now) + margin else now
