@@ -89,22 +89,24 @@ def diagnose(
         diagnosis_output.refuse(folder, overwrite=overwrite)
     with forking(), progress("Diagnosing", verbose, quiet) as tell:
         drawn = None if folder is None else diagnosis_output.drawings(look)
-        diagnosis = run(reals, sim, imu=imu, truth=truth, signals=signal or (), tell=tell, settings=settings)
+        against = partial(run, reals, imu=imu, truth=truth, tell=tell, settings=settings)
+        search = partial(against, sim, signals=signal or ())
+        diagnosis = search()
         if folder is not None:
             tell(0, 1, "writing")
             for remark in diagnosis_output.write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite):
                 logger.warning("%s", remark)
             if close:
-                settled = partial(run, reals, imu=imu, truth=truth, tell=tell, settings=settings)
                 rewrite = partial(diagnosis_output.write, folder=folder, logs=look, overwrite=True)
-                diagnosis = _closed(diagnosis, settled, rewrite, sim, folder, metric, overwrite)
+                diagnosis = _closed(diagnosis, against, search, rewrite, sim, folder, metric, overwrite)
     if not write_json(diagnosis.report, json_to, overwrite=overwrite):
         _say(diagnosis, folder)
 
 
 def _closed(
     first: Diagnosis,
-    diagnosed: Callable[..., Diagnosis],
+    against: Callable[[Path], Diagnosis],
+    search: Callable[..., Diagnosis],
     rewrite: Callable[[Diagnosis], object],
     sim: Path | None,
     folder: Path,
@@ -125,11 +127,11 @@ def _closed(
     figure = None if metric is None else script_metric(metric, real)
     for number in range(1, ROUNDS + 1):
         simulate(sim or real, log, physics=folder / diagnosis_output.EFFECT, overwrite=overwrite or number > 1)
-        second = diagnosed(log)
+        second = against(log)
         loop = closed_loop(first, second, log, metric=figure, before=sim, rounds=number)
         if number == ROUNDS or not is_worth_a_round(first, second, loop):
             break
-        better = diagnosed(sim, begin=(*first.findings, *second.findings))
+        better = search(begin=(*first.findings, *second.findings))
         if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
             break
         first = better
