@@ -6,8 +6,9 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
 from imutool.cli import load
+from imutool.diagnosis import diagnose
 from imutool.diagnosis.closed_loop import LOG
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
@@ -119,6 +121,29 @@ def test_the_closed_loop_misses_nothing_and_compares_before_and_after(diagnosed:
         assert figures[name][1] < 0.3 * figures[name][0]
     assert figures["metric"][1] == (place / LOG).stat().st_size
     assert "Nothing but a constant bias" in (place / diagnosis_output.CLOSED).read_text()
+
+
+def test_what_the_loop_still_misses_begins_another_search(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first search overlooks the arm here; the second begins with it, and the folder holds its answer."""
+    begins: list[list[str]] = []
+    searched = diagnose.diagnose
+
+    def overlooked(*words: Any, begin: Sequence[Finding] = (), **more: Any) -> Diagnosis:
+        begins.append([finding.effect for finding in begin])
+        found = searched(*words, begin=begin, **more)
+        return replace(found, findings=(), located=()) if len(begins) == 1 else found
+
+    monkeypatch.setattr(diagnose, "diagnose", overlooked)
+    said = run("diagnose", folder / "arm.mcap", "--sim", folder / "ideal.mcap", "--close", "-o", tmp_path / "out")
+    assert said.exit_code == 0, said.output
+    told = json.loads((tmp_path / "out" / "findings.json").read_text())
+    assert [one["effect"] for one in told["findings"]] == ["lever_arm"]
+    assert (told["closed"]["mismatch"], told["closed"]["rounds"]) == (False, 2)
+    assert begins == [[], [], ["lever_arm"], []]
+    assert [entry.name for entry in physics_file.read(tmp_path / "out" / "physics.toml").effect] == ["lever_arm"]
+    assert "nothing is missing, after 2 rounds" in said.output
 
 
 def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
