@@ -44,6 +44,7 @@ MATRIX = {  # effects that are a factor of a sensor's matrix
     "accel_scale": "accel",
     "accel_misalignment": "accel",
 }
+# a delay of the gyro as a clock of the gyro alone, whose error is linear in its own samples
 LATE_GYRO = replace(
     clock_offset.EFFECT, name="gyro_delay", forward=lambda taken_s, tau_s: taken_s - tau_s[0], sensors=("gyro",)
 )

@@ -128,15 +128,14 @@ def _closed(
     for number in range(1, ROUNDS + 1):
         simulate(sim or real, log, physics=folder / diagnosis_output.EFFECT, overwrite=overwrite or number > 1)
         second = against(log)
-        loop = closed_loop(first, second, log, metric=figure, before=sim, rounds=number)
-        if number == ROUNDS or not is_worth_a_round(first, second, loop):
+        if number == ROUNDS or not is_worth_a_round(first, second):
             break
         better = search(begin=(*first.findings, *second.findings))
         if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
             break
         first = better
         rewrite(first)
-    done = replace(first, closed=loop)
+    done = replace(first, closed=closed_loop(first, second, log, metric=figure, before=sim, rounds=number))
     diagnosis_output.write_closed(done, second, folder)
     return done
 

@@ -57,10 +57,10 @@ def closed_loop(
     return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared), rounds)
 
 
-def is_worth_a_round(first: Diagnosis, again: Diagnosis, loop: ClosedLoop) -> bool:
+def is_worth_a_round(first: Diagnosis, again: Diagnosis) -> bool:
     """Whether a search that begins with all effects of both may find more than the first did."""
     named = {finding.effect for finding in again.findings if finding.kind == "catalogue"} - NO_EFFECT
-    return loop.mismatch and bool(named - {finding.effect for finding in first.findings})
+    return bool(named - {finding.effect for finding in first.findings})
 
 
 def script_metric(script: Path, real: Path) -> Callable[[Path], float]:

@@ -17,7 +17,7 @@ from imutool.diagnosis.wording.quantity import grouped
 
 ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
-OWN = {"gyro": "omega", "accel": "f"}
+READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"
 
 
@@ -32,7 +32,7 @@ def is_of_digits(finding: Finding, digits: Finding) -> bool:
 
     It removes less than rounding adds, LSB / sqrt(12).
     """
-    own = f"{OWN.get(finding.signal, '')}_{finding.axis}"
+    own = f"{READING.get(finding.signal, '')}_{finding.axis}"
     if finding.kind != "unknown" or own not in finding.equation or f"{finding.signal}_lsb" not in digits.parameters:
         return False
     removed = finding.held_out.rms_before**2 - finding.held_out.rms_after**2

@@ -94,7 +94,7 @@ class CandidateScore:
 
     def __init__(self, logs: Sequence[WhitenedLog], now: Fit) -> None:
         self.logs, self.now = logs, now
-        _, std = priors(now.chosen, now.settings)  # two curves of one axis share a constant, which they alone hold apart
+        _, std = priors(now.chosen, now.settings)  # without it two curves of one axis, which share a constant, are singular
         self.N, self.g, self.total, self.axes = np.diag(1.0 / std**2), np.zeros(len(std)), 0.0, []
         for number, log in enumerate(logs):
             mask, residual = log.rows("fitted"), now.residuals[number]

@@ -183,8 +183,8 @@ class _Search:
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
             for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
-                if effect.key == mine.key and effect.linear:
-                    break  # its score is its gain
+                if effect.key == mine.key and effect.linear:  # its score is its gain
+                    break
                 if effect.key == mine.key or (log_p > own_log_p and not mine.linear):
                     continue
                 limit = without.objective - self.settings.rival_share * (without.objective - now.objective)
@@ -199,8 +199,8 @@ class _Search:
             rivals = self._rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
-        steady = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
-        now = without_unseen_low_pass(self.logs, steady, self.named, self.settings)
+        now = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
+        now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
         return with_common_arm(
             self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold
         )

@@ -119,11 +119,10 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
 def with_steady_clock(
     logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Mapping[str, Sequence[Theta]]
 ) -> Fit:
-    """Fit with two of offset, skew and jump instead of a clock that wanders.
+    """Fit with the simplest clock that does as well (BIC); `starts` by effect.
 
-    If they do as well (BIC); `starts` by effect. Instead of a jump an offset, or a clock that runs fast, unless the jump is
-    clearly better: one right after the start is none, and half of what a clock gains over a log looks like one in its middle.
-    Beside poses, whose clock is another one, an offset instead of a gyro's delay.
+    One or two of offset, skew and jump replace a clock that wanders. An offset or a skew replaces a jump that is not clearly
+    better. Beside poses, which have a clock of their own, an offset replaces a gyro's delay that is not clearly better.
     """
     others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
     if len(others) < len(now.chosen):
@@ -134,11 +133,14 @@ def with_steady_clock(
             fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some)), near=now))
         now = min(fits, key=bic)
     poses = any(log.pair.band_hz is not None for log in logs)
-    for entry in [entry for entry in now.chosen if entry[0].name == "clock_jump" or (poses and entry[0].name == "gyro_delay")]:
-        rest, theta = tuple(other for other in now.chosen if other is not entry), entry[1]
-        sizes = {"clock_offset": -theta[0]}
-        if entry[0].name == "clock_jump":
+    for complex_one, theta in now.chosen:
+        if complex_one.name == "clock_jump":
             sizes = {"clock_offset": theta[1], "clock_skew": theta[1] / max(2.0 * theta[0], 1.0)}
+        elif complex_one.name == "gyro_delay" and poses:
+            sizes = {"clock_offset": -theta[0]}
+        else:
+            continue
+        rest = tuple(entry for entry in now.chosen if entry[0] is not complex_one)
         simpler = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
         trials = [fit(logs, (*rest, (effect, np.array([sizes[effect.name]]))), near=now) for effect in simpler]
         margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
