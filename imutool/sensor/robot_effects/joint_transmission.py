@@ -8,7 +8,7 @@ Controlling mechanical systems with backlash, Automatica 38, 2002).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ MOST_TEETH, LEAST_TURNS = 120.0, 3.0  # ripples a turn that are tried, and how m
 STARTS = 2
 BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
 PLAUSIBLE_RAD = 0.05
+GAPS = (0.3, 1.0, 1.5)  # of a joint's play to start from, over twice the deviation of the misfit
 
 
 # ── in the effort ──
@@ -139,18 +140,24 @@ def play(x: Samples, width: float) -> Samples:
     return out
 
 
+def _gaps(ideal: IdealSignal, real: Any) -> list[Theta]:
+    """Gaps to start from: with play the misfit is half a gap, on either side."""
+    gap = 2.0 * float((real.y[:, 0] - ideal.sample(real.stamp_s, real.stamp_s).x[:, 0]).std())
+    return [np.array([share * gap]) for share in GAPS]
+
+
 def position_effects(scale: Scale) -> Iterator[Effect]:
     """Backlash, compliance and eccentricity of a joint whose position alone is compared."""
     size = scale.size[0]
-    yield scale.effect(
+    backlash = scale.effect(
         "backlash",
         (0,),
         "the position rests until the drive has crossed the gap",
         (Parameter("gap", scale.units[0], size, positive=True, step=0.02),),
         lambda s, theta: s.with_column(0, play(s.y[:, 0], theta[0])),
         "the joint turns both ways",
-        starts=[np.array([share * size]) for share in (0.02, 0.1, 0.4)],
     )
+    yield replace(backlash, linear=False, starts=_gaps)
     waves = (Parameter("sine", scale.units[0], PLAUSIBLE_RAD), Parameter("cosine", scale.units[0], PLAUSIBLE_RAD))
     yield scale.effect(
         "eccentricity",
