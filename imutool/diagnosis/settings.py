@@ -107,6 +107,7 @@ class AlignmentSettings(Settings, frozen=True):
     poses_hz: Positive = 40.0  # slower poses cannot be differentiated twice
     coarse_samples: Count = 5  # of the means in which a misfit between poses and samples stands out
     coarse_factor: Positive = 1.3  # over their noise, up to which poses stand for the samples
+    line_chance: Share = 1e-6  # of white noise to show a line above those means, below which poses do not stand for the samples
 
 
 class SignalSettings(Settings, frozen=True):

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import label, maximum, uniform_filter1d
-from scipy.signal import correlate, correlation_lags
+from scipy.signal import correlate, correlation_lags, periodogram
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
@@ -165,7 +165,7 @@ def _simulated(
         t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + ideal.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
-    t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
+    t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     clean = np.stack([wiener_filter(column, settings.alignment) for column in even.T], axis=1)
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
@@ -206,11 +206,18 @@ def _by_poses(
     expected = ideal.sample(t_s[rows], t_s[rows])
     residual = samples[rows] - np.concatenate([expected.gyro, expected.accel], axis=1)
     residual = residual - residual.mean(axis=0)
-    coarse = (
-        residual[: len(residual) // own.coarse_samples * own.coarse_samples].reshape(-1, own.coarse_samples, 6).mean(axis=1)
-    )  # where a misfit of motion would stand out
-    exact = (coarse.std(axis=0) < own.coarse_factor * np.maximum(noise, LEAST_NOISE) / np.sqrt(own.coarse_samples)).all()
-    return ideal if exact else None
+    size, least = own.coarse_samples, np.maximum(noise, LEAST_NOISE)
+    coarse = residual[: len(residual) // size * size].reshape(-1, size, 6).mean(axis=1)  # shows a misfit of motion
+    exact = (coarse.std(axis=0) < own.coarse_factor * least / np.sqrt(size)).all()
+    return ideal if exact and not _has_line(residual, 1.0 / size, own.line_chance) else None
+
+
+def _has_line(residual: Float64[np.ndarray, "n 6"], above: float, chance: float) -> bool:
+    """Whether one frequency (Nyquist: 1) stands out of white noise, as a simulated vibration does."""
+    f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
+    band = power[f > above]
+    floor = np.maximum(band.mean(axis=0), LEAST_NOISE**2)
+    return bool(band.size and (len(band) * np.exp(-band.max(axis=0) / floor)).min() < chance)
 
 
 def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
@@ -248,10 +255,7 @@ def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DE
 
 
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
-    """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None if unlike.
-
-    None where the two are not of one motion.
-    """
+    """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None for two motions."""
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
     if _rests(real) and _rests(sim):
