@@ -17,6 +17,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, closed_loop, is_worth_a_round
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
@@ -196,6 +198,7 @@ def _make(
     seen: list[RunData] = []
     missing = {name for name, (library, _) in NEEDS.items() if find_spec(library) is None}
     wanted = logs is not None and LOG not in missing
+    wanted = wanted and not (d.bias.size and np.isnan(d.bias).all())  # it draws an IMU
     report = Forked(partial(_report, d, LOG if wanted else None))
     if logs is not None and wanted:
         try:

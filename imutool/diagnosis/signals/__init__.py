@@ -42,7 +42,7 @@ def with_signals(
             "recording and simulation share no IMU and no other varying number",
             where=real,
             expected="topics of one name and message in both logs",
-            fix="Give both logs the topics of one robot",
+            fix=". ".join(["Give both logs the topics of one robot", *pairing.remarks]),
         )
     if pairing.pairs:
         diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks))

@@ -23,25 +23,33 @@ LEAST_EFFORTS = 0.5  # of the joints, that have efforts where efforts are compar
 DRIVES = 0.05  # of a vehicle's speed or turning, that a wheel makes
 
 
-def joint_names(log: Log, topic: str) -> list[str]:
-    """Names of the joints in the first message of a topic."""
+def joint_names(log: Log, topic: str) -> list[list[str]]:
+    """Names of the joints in a topic's messages: one list, or those of several publishers."""
+    found = dict[tuple[str, ...], None]()
     for _, rows in log.rows([topic]):
-        payload = rows.payload[0].tobytes()
-        order, at = "<" if payload[1] else ">", 12
-        texts = list[str]()
-        count = 1  # the frame of the header, and then the names
-        try:
-            while len(texts) < count:
-                (size,) = struct.unpack_from(f"{order}I", payload, at)
-                texts.append(payload[at + 4 : at + 4 + max(size - 1, 0)].decode(errors="replace"))
-                at += 4 + size + (-size) % 4
-                if len(texts) == 1:
-                    (names,) = struct.unpack_from(f"{order}I", payload, at)
-                    count, at = 1 + names, at + 4
-        except struct.error:
-            return []
-        return texts[1:]
-    return []
+        names, end = _names(rows.payload[0].tobytes())
+        found[tuple(names)] = None
+        differ = (rows.payload[:, 12:end] != rows.payload[0, 12:end]).any(axis=1)
+        for row in rows.payload[differ]:
+            found[tuple(_names(row.tobytes())[0])] = None
+    return [list(names) for names in found]
+
+
+def _names(payload: bytes) -> tuple[list[str], int]:
+    """Names in a message, and where they end."""
+    order, at = "<" if payload[1] else ">", 12
+    texts, count = list[str](), 1  # the frame of the header, and then the names
+    try:
+        while len(texts) < count:
+            (size,) = struct.unpack_from(f"{order}I", payload, at)
+            texts.append(payload[at + 4 : at + 4 + max(size - 1, 0)].decode(errors="replace"))
+            at += 4 + size + (-size) % 4
+            if len(texts) == 1:
+                (names,) = struct.unpack_from(f"{order}I", payload, at)
+                count, at = 1 + names, at + 4
+    except struct.error:
+        return [], 12
+    return texts[1:], at
 
 
 def by_joint(fields: Mapping[str, Fields], wanted: Sequence[str], given: Sequence[str]) -> dict[str, Fields]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,11 +22,15 @@ ELSEWHERE = frozenset(
 
 @dataclass(frozen=True)
 class LogFields:
-    """One log: schemas by topic, varying fields by topic and path, and names of joints."""
+    """One log: schemas by topic, varying fields by topic and path, and names of joints.
+
+    `mixed` are topics of joints on which messages name now these joints, now those: an index there is no one joint.
+    """
 
     schemas: Mapping[str, str]
     fields: Mapping[str, Mapping[str, Fields]]
     joints: Mapping[str, list[str]]
+    mixed: Sequence[str]
 
     @classmethod
     def of(cls, path: Location, schemas: Mapping[str, str], compared: Collection[str]) -> LogFields:
@@ -36,14 +40,15 @@ class LogFields:
             ConfigError, LogError: the log cannot be opened, or is damaged.
         """
         with Log(path) as log:
-            joints = {name: joint_names(log, name) for name, schema in schemas.items() if schema == JOINTS}
+            named = {name: joint_names(log, name) for name, schema in schemas.items() if schema == JOINTS}
+        mixed = {name for name, lists in named.items() if len(lists) > 1}
+        joints = {name: lists[0] if len(lists) == 1 else [] for name, lists in named.items()}
         found: dict[str, dict[str, Fields]] = {}
-        rest = set(schemas) - set(compared)
-        for skipped in (rest, set(compared)):
-            for name, values in others(path, "", MOST_READ, skip=skipped, gaps=True).items():
+        for skipped in (set(schemas) - set(compared), set(compared)):
+            for name, values in others(path, "", MOST_READ, skip=skipped | mixed, gaps=True).items():
                 topic = max((topic for topic in schemas if name.startswith(f"{topic}.")), key=len)
                 found.setdefault(topic, {})[name[len(topic) + 1 :]] = on_one_clock(values)
-        return cls(schemas, {name: found[name] for name in schemas if name in found}, joints)
+        return cls(schemas, {name: found[name] for name in schemas if name in found}, joints, sorted(mixed))
 
 
 def read_both(real: Location, sim: Location) -> tuple[LogFields, LogFields, dict[str, str]]:

@@ -140,7 +140,9 @@ def _unit(path: str) -> str:
 
 def _remarks(real: LogFields, sim: LogFields, topics: Mapping[str, str]) -> list[str]:
     """What a reader of the findings has to know: joints by index, and what only one log holds."""
-    out, alone, gaps = list[str](), list[str](), list[str]()
+    mixed = sorted({*real.mixed, *sim.mixed})
+    out = _listed("Not compared, for its messages name now these joints and now those", mixed)
+    alone, gaps = list[str](), list[str]()
     for topic, theirs in topics.items():
         mine, other = real.fields[topic], sim.fields[theirs]
         if real.schemas[topic] == JOINTS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -163,7 +164,7 @@ def _summarized(
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
         findings = [_with_learnt_error(finding) for finding in findings]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
-    located = locate_findings([pair], [before], [after], level, (), p_values, settings.localization) if findings else []
+    place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
     for k in range(pair.columns):
         if lsb[k] > settings.timestamps.least_digits * float(level[k]):
@@ -178,10 +179,12 @@ def _summarized(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
         )
     unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
+    most = settings.held_out.most_white_ratio
+    beyond = any(not left.white and left.rms > most * left.noise_floor for left in unexplained.values())
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
     unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
     return SignalDiagnosis(
-        located=tuple(located),
+        located=tuple(place() if findings or beyond else ()),  # what nothing explains has a place
         findings=tuple(findings),
         offset=offsets,
         not_identifiable=(*hidden, *unseen),

@@ -9,7 +9,7 @@ accelerations, products of velocities and gravity, each times sines and cosines 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -22,6 +22,7 @@ GRAVITY_M_S2 = 9.81
 MOST_JOINTS = 7
 MOST_COMBINED = 3  # joints up to which all sums of angles are tried
 RIDGE = 1e-9
+SCREENED = 1000  # samples that refute a wrong set of signs
 WELL_DETERMINED = 0.02  # of the efforts' size that a fit may leave
 STEEP = 0.01  # of a velocity's size, within which its sign turns
 
@@ -172,23 +173,30 @@ def identified(state: State, efforts: Columns) -> Dynamics | None:
     if n > MOST_JOINTS:
         return None
     orders = dict.fromkeys((tuple(range(n)), tuple(np.argsort(-size).tolist())))
-    for find in (_chain, _general):
-        found = (find(_in_order(state, order), efforts[:, order], size[list(order)], order) for order in orders)
-        known = [dynamics for dynamics in found if dynamics is not None]
-        if known:
-            return min(known, key=lambda dynamics: max(np.array(dynamics.left) / size))
-    return None
+
+    def found(find: Callable[..., Dynamics | None]) -> Iterator[Dynamics]:
+        each = (find(_in_order(state, order), efforts[:, order], size[list(order)], order) for order in orders)
+        yield from (dynamics for dynamics in each if dynamics is not None)
+
+    chains = list(found(_chain))
+    return min(chains, key=lambda chain: max(np.array(chain.left) / size)) if chains else next(found(_general), None)
 
 
 def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
     """A chain of parallel hinges, in its order."""
     n, best = len(order), None
+    few = {name: values[:: max(1, len(efforts) // SCREENED)] for name, values in state.items()}
+    sets = [(few, efforts[:: max(1, len(efforts) // SCREENED)]), (state, efforts)]  # most signs fail in a few samples
     for tail in product((1, -1), repeat=n - 1):
-        columns = np.concatenate([chain_columns(state, (1, *tail)), own_columns(state, n)], axis=2)
-        theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (efforts / size).ravel()[:, None])[:, 0]
-        left = (efforts - columns @ theta).std(axis=0)
-        if (left < WELL_DETERMINED * size).all() and (best is None or (left / size).max() < best[0]):
-            best = (left / size).max(), (1, *tail), theta[None], left
+        for motion, wanted in sets:
+            columns = np.concatenate([chain_columns(motion, (1, *tail)), own_columns(motion, n)], axis=2)
+            theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (wanted / size).ravel()[:, None])[:, 0]
+            left = (wanted - columns @ theta).std(axis=0)
+            if (left > WELL_DETERMINED * size).any():
+                break
+        else:
+            if best is None or (left / size).max() < best[0]:
+                best = (left / size).max(), (1, *tail), theta[None], left
     return None if best is None else Dynamics(n, best[1], best[2], _by_joint(best[3], order), order)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from support.robot_cases.log import write
 
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -110,6 +113,29 @@ def test_topics_in_another_namespace_are_paired_and_a_dead_field_is_told(tmp_pat
     real["/load"] = (NUMBER, T, np.ones((len(T), 1)))
     pairing = logged(tmp_path, real, sim, (), ())
     assert {pair.name for pair in pairing.pairs} == {"/left/speed.data", "/right/speed.data"}
+
+
+def test_joints_of_two_publishers_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
+    """An index is now the finger, now the hip."""
+    write(tmp_path / "both.mcap", {"/joint_states": (JOINTS, T, joints(wave(1)))}, ("hip",))
+    write(tmp_path / "finger.mcap", {"/joint_states": (JOINTS, T + 0.003, joints(wave(2)))}, ("finger",))
+    merged = tmp_path / "real.mcap"
+    with merged.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "two publishers")
+        channel = None
+        for name in ("both.mcap", "finger.mcap"):
+            for schema, _, message in make_reader(io.BytesIO((tmp_path / name).read_bytes())).iter_messages():
+                assert schema is not None
+                if channel is None:
+                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channel = writer.register_channel("/joint_states", "cdr", known)
+                writer.add_message(channel, message.log_time, message.data, message.publish_time)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap has no annotation for it
+    write(tmp_path / "sim.mcap", {"/joint_states": (JOINTS, T, joints(wave(1)))}, ("hip",))
+    pairing = paired(merged, tmp_path / "sim.mcap")
+    assert not pairing.pairs
+    assert pairing.remarks == ("Not compared, for its messages name now these joints and now those: /joint_states",)
 
 
 def fields_of_other_topics(count: int) -> dict[str, object]:
