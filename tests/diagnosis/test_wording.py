@@ -128,6 +128,10 @@ def test_a_place_without_a_name_is_not_passed_over() -> None:
     assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
 
 
+def test_where_nothing_was_compared_it_is_not_said_that_nothing_is_missing() -> None:
+    assert conclusion(replace(diagnoses.NOTHING, unexplained={}, sim="sim.mcap")).startswith("Nothing could be compared")
+
+
 def test_a_finding_of_a_message_explains_its_fields() -> None:
     """A wheel's radius is a finding of /odom: its speeds do not differ without a name."""
     wheels = finding("wheel_radius", {"wheel_0": Estimate(0.02, 0.001, "-")}, signal="/odom")
