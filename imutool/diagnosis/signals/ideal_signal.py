@@ -111,7 +111,7 @@ def at_recorded_motion(
 
 
 def without_others(pair: SignalPair, settings: DiagnoseSettings) -> SignalPair | None:
-    """Efforts of the joints that follow from the motion, where those of others, as of a gripper, do not."""
+    """Efforts of the joints that follow from the motion, without those of a gripper."""
     if pair.kind != "efforts":
         return None
     sim_s, _, state = motion(pair.sim_state, settings)
