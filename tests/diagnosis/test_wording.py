@@ -225,7 +225,7 @@ def test_what_is_on_both_sensors_is_said_of_the_sensor() -> None:
 def test_any_other_signal_goes_by_its_own_name() -> None:
     one = finding("gain", {"gain": Estimate(1.05, 0.002, "-")}, "/odom.twist.twist.linear.x")
     said = conclusion(replace(diagnoses.ARM, located=(), findings=(one,)))
-    assert said.startswith("/odom.twist.twist.linear.x differs: its gain is off by 1.050 ± 0.002 (gain);")
+    assert said.startswith("/odom.twist.twist.linear.x differs: its gain is 1.050 ± 0.002 of that of the simulation (gain);")
 
 
 def test_lines_hold_each_finding_place_gain_and_remark() -> None:
