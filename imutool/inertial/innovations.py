@@ -1,4 +1,4 @@
-"""Innovations of the filter's velocity: their likelihood, and how much of a correction of the samples they ask for."""
+"""Innovations of the filter's velocity, and the share of a correction they ask for."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ class Innovations(NamedTuple):
     @property
     def log_likelihood(self) -> Float64[np.ndarray, " m"]:
         """Student's log-likelihood of each block."""
-        return -0.5 * (STUDENT + 3.0) * np.log1p(self.chi_square / STUDENT) - 0.5 * np.linalg.slogdet(self.S)[1]
+        fit = -0.5 * (STUDENT + 3.0) * np.log1p(self.chi_square / STUDENT)
+        return np.asarray(fit - 0.5 * np.linalg.slogdet(self.S)[1])
 
 
 class Share(NamedTuple):
-    """Share of a correction that the innovations ask for, and its standard deviation; infinite where they do not tell."""
+    """Share of a correction that innovations ask for, with its deviation; infinite if unknown."""
 
     value: float
     std: float
 
 
 def share_of_correction(without: Innovations, corrected: Innovations) -> Share:
-    """Share of a correction of the samples that best explains their innovations, by weighted least squares.
+    """Share of a correction that best explains the innovations, by weighted least squares.
 
     A correction changes the innovations e of the raw samples by d to those of the corrected. The share a minimises
     sum (e - a d)^T S^-1 (e - a d): the sensor's own correction has 1, one of an unrelated sensor 0, and above one half a

@@ -17,6 +17,7 @@ from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.errors import ModelError
+from imutool.inertial.stationary import white_noise
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 
@@ -37,7 +38,7 @@ def model(recording: Recording) -> BiasModel:
     statistics = {
         "prior_mean": rest,
         "prior_std": np.array([1e-3] * 3 + [0.05] * 3),
-        "noise_std": np.array([5e-3] * 3 + [0.1] * 3),
+        "noise_std": white_noise(np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)),
     }
     made = linear.Model(linear.Config(), 1.0 / recording.imu.period_s, statistics)
     made.card = {"name": "own", "logs": [{}] * 3, **MADE_FOR}
@@ -118,6 +119,15 @@ def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(
     assert found.verdict == "fits"
     assert "about y differs by" in found.reasons[1]
     assert judged(corrects(model, -WRONG), shifted).verdict == "unfit"
+
+
+@pytest.mark.parametrize(("times", "words"), [(5.0, "5 times as noisy"), (0.2, "20% of that in the training runs")])
+def test_another_noise_is_doubtful(model: BiasModel, recording: Recording, times: float, words: str) -> None:
+    made = linear.Model(linear.Config(), model.rate_hz, dict(model.tensors) | {"noise_std": model.noise_std / times})
+    made.card = model.card
+    found = judged(made, recording.imu)
+    assert found.verdict == "doubtful"
+    assert words in found.reasons[0]
 
 
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(
