@@ -8,22 +8,32 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, closed_loop, is_worth_a_round
+from imutool.diagnosis.diagnose import diagnose as diagnose_logs
+from imutool.diagnosis.estimation.aligned_log import DEFAULT
 from imutool.diagnosis.result import Diagnosis
+from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
+from imutool.location import Location, local
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
+from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.noise import datasheet
 from imutool.processes.forked import Forked
 from imutool.report import json_text
 from imutool.sensor import physics_file
+from imutool.sensor.simulate import simulate
 
 if TYPE_CHECKING:
     from imutool.viewing.model.run_data import RunData
@@ -52,17 +62,6 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
     above = next(parent for parent in folder.absolute().parents if parent.is_dir())
     with _told(folder), TemporaryDirectory(dir=above, prefix=".imutool-"):
         pass  # even the superuser cannot write everywhere
-
-
-def drawings(logs: Callable[[], list[RunData]]) -> Forked[dict[str, str]]:
-    """Drawings of a page of the logs, made while they are diagnosed where time is left."""
-
-    def drawn() -> dict[str, str]:
-        from imutool.viewing.html.report import drawings
-
-        return drawings(logs())
-
-    return Forked(drawn, idle=True)
 
 
 def write(
@@ -98,13 +97,93 @@ def write(
     return remarks
 
 
-def write_closed(d: Diagnosis, again: Diagnosis, folder: Path) -> None:
-    """Write findings.json with the closed loop, and a page with figures of both simulations."""
-    (folder / FINDINGS).write_text(json_text(d.report), encoding="utf-8")
+def diagnose(
+    reals: Sequence[Location],
+    sim: Location | None = None,
+    folder: Path | None = None,
+    *,
+    imu: str | None = None,
+    truth: str | None = None,
+    signals: Sequence[str] = (),
+    settings: DiagnoseSettings = DEFAULT,
+    close: bool = False,
+    metric: Callable[[Path], float] | None = None,
+    overwrite: bool = False,
+    tell: Callable[[int, int, str], None] | None = None,
+) -> tuple[Diagnosis, list[str]]:
+    """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
+
+    With `close` its physics is simulated along `sim` or the recording's poses. What is missing against that log begins another
+    search, for some rounds.
+
+    Raises:
+        ConfigError: as `refuse`; with `close` several recordings, no folder, or an input that is no file or would be replaced.
+        LogError: no such topic.
+        DataError: no truth and no simulation, or too little shared time.
+    """
+
+    def look(findings: Path | None = None) -> list[RunData]:
+        from imutool.viewing.model.load_view import load
+
+        return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
+
+    if close:
+        _check_close(reals, sim, folder, overwrite=overwrite)
+    against = partial(diagnose_logs, reals, imu=imu, truth=truth, settings=settings, tell=tell)
+    search = partial(against, sim, signals=signals)
+    if folder is None:
+        return search(), []
+    refuse(folder, overwrite=overwrite)
+    drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
+    diagnosis = search()
+    if tell is not None:
+        tell(0, 1, "writing")
+    remarks = write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite)
+    if close:
+        rewrite = partial(write, folder=folder, logs=look, overwrite=True)
+        truth = None if sim else truth
+        diagnosis = _closed(diagnosis, against, search, rewrite, folder, sim, truth=truth, metric=metric, overwrite=overwrite)
+    return diagnosis, remarks
+
+
+def _check_close(reals: Sequence[Location], sim: Location | None, folder: Path | None, *, overwrite: bool) -> None:
+    if folder is None or len(reals) != 1:
+        raise ConfigError("needs one recording and a folder", where="`close`", fix="Give one recording, and a folder")
+    inputs = [local(place, "close") for place in (reals[0], sim) if place is not None]
+    check_outputs([OutputFile("close", folder, files=(*FILES, CLOSED, CLOSED_LOG))], inputs, overwrite=overwrite)
+
+
+def _closed(
+    first: Diagnosis,
+    against: Callable[[Path], Diagnosis],
+    search: Callable[..., Diagnosis],
+    rewrite: Callable[[Diagnosis], object],
+    folder: Path,
+    sim: Location | None,
+    *,
+    truth: str | None,
+    metric: Callable[[Path], float] | None,
+    overwrite: bool,
+) -> Diagnosis:
+    log, given = folder / CLOSED_LOG, None if sim is None else local(sim, "close")
+    for number in range(1, ROUNDS + 1):
+        physics, replaces = folder / EFFECT, overwrite or number > 1
+        simulate(given or Path(first.real[0]), log, physics=physics, truth=truth, overwrite=replaces)
+        again = against(log)
+        if number == ROUNDS or not is_worth_a_round(first, again):
+            break
+        better = search(begin=(*first.findings, *again.findings))
+        if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
+            break
+        first = better
+        rewrite(first)
+    done = replace(first, closed=closed_loop(first, again, log, metric=metric, before=given, rounds=number))
+    (folder / FINDINGS).write_text(json_text(done.report), encoding="utf-8")
     if find_spec("matplotlib") is not None:
         from imutool.viewing.html.diagnosis_page import write as write_page
 
-        write_page(again, folder / CLOSED, logs=LOG if (folder / LOG).exists() else None, first=d)
+        write_page(again, folder / CLOSED, logs=LOG if (folder / LOG).exists() else None, first=done)
+    return done
 
 
 def _make(
@@ -119,6 +198,7 @@ def _make(
     seen: list[RunData] = []
     missing = {name for name, (library, _) in NEEDS.items() if find_spec(library) is None}
     wanted = logs is not None and LOG not in missing
+    wanted = wanted and not (d.bias.size and np.isnan(d.bias).all())  # it draws an IMU
     report = Forked(partial(_report, d, LOG if wanted else None))
     if logs is not None and wanted:
         try:
@@ -144,6 +224,12 @@ def _report(d: Diagnosis, logs: str | None) -> str:
     from imutool.viewing.html.diagnosis_page import html
 
     return html(d, logs=logs)
+
+
+def _drawings(logs: Callable[[], list[RunData]]) -> dict[str, str]:
+    from imutool.viewing.html.report import drawings
+
+    return drawings(logs())
 
 
 def _logs(logs: list[RunData], path: Path, drawn: dict[str, str] | None) -> None:

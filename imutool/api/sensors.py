@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 
 from imutool import diagnosis_output
 from imutool.api import NamedProgress
-from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.location import LogPath, local, location
 from imutool.mcap_io.storage import output_conflicts
@@ -19,9 +17,6 @@ from imutool.recording import Recording
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
 from imutool.sensor.simulate import simulate as simulate_log
-
-if TYPE_CHECKING:
-    from imutool.viewing.model.run_data import RunData
 
 
 def example_recording(seed: int = 1, *, duration_s: float = 20.0) -> Recording:
@@ -106,6 +101,8 @@ def diagnose(
     truth: str | None = None,
     signals: Sequence[str] = (),
     output: str | Path | None = None,
+    close: bool = False,
+    metric: Callable[[Path], float] | None = None,
     overwrite: bool = False,
     progress: NamedProgress | None = None,
 ) -> Diagnosis:
@@ -118,14 +115,16 @@ def diagnose(
         truth: Topic of the true poses; by default the first.
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
         output: Folder for `findings.json`, `physics.toml`, `noise.toml`, `report.html`, `log.html` and `view.rrd`.
+        close: Simulate again with the physics that was found, diagnose again, and compare. Needs one recording and `output`.
+        metric: Your own figure for `close`, from the path of a simulated log.
         overwrite: Replace an earlier diagnosis in `output`.
         progress: Callback with steps done, steps in all, and the current step.
 
     Returns:
-        `findings`, each with effect, parameters, uncertainty and gain, and `remarks`.
+        `findings`, each with effect, parameters, uncertainty and gain, and `remarks`; with `close` also `closed`.
 
     Raises:
-        ConfigError: A log cannot be read, or `output` exists.
+        ConfigError: A log cannot be read, `output` exists, or `close` without what it needs.
         LogError: No such topic.
         DataError: No truth and no simulation, or too little shared time.
 
@@ -139,15 +138,16 @@ def diagnose(
     logs = [location(real) for real in several]
     folder = None if output is None else local(output, "output")
     check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [several, sim], overwrite=overwrite)
-    diagnosis = diagnose_logs(
-        logs, None if sim is None else location(sim), imu=imu, truth=truth, signals=signals, tell=progress
+    diagnosis, _ = diagnosis_output.diagnose(
+        logs,
+        None if sim is None else location(sim),
+        folder,
+        imu=imu,
+        truth=truth,
+        signals=signals,
+        close=close,
+        metric=metric,
+        overwrite=overwrite,
+        tell=progress,
     )
-    if folder is not None:
-
-        def runs(findings: Path) -> list[RunData]:
-            from imutool.viewing.model.load_view import load
-
-            return [load(real, imu=imu, truth=truth, findings=findings) for real in logs]
-
-        diagnosis_output.write(diagnosis, folder, logs=runs, overwrite=overwrite)
     return diagnosis

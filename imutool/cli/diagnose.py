@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,11 +10,9 @@ import typer
 from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, Written, app
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import logger, progress, say, table, write_json
-from imutool.errors import ConfigError
 
 if TYPE_CHECKING:
     from imutool.diagnosis.result import Diagnosis
-    from imutool.viewing.model.run_data import RunData
 
 FOLDER = Written(files=("findings.json", "physics.toml", "noise.toml", "report.html", "log.html", "view.rrd"))
 Folder = Annotated[
@@ -74,70 +70,29 @@ def diagnose(
     """
     from imutool import diagnosis_output
     from imutool.config import load as load_settings
-    from imutool.diagnosis.diagnose import diagnose as run
+    from imutool.diagnosis.closed_loop import script_metric
     from imutool.diagnosis.settings import DiagnoseSettings
     from imutool.processes.forked import forking
-    from imutool.viewing.model.load_view import load
 
-    def look(findings: Path | None = None) -> list[RunData]:
-        return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
-
-    if close and (folder is None or len(reals) != 1):
-        raise ConfigError("`close` needs one recording and a folder", where="close", fix="Give one REAL, and `folder`")
     settings = load_settings(DiagnoseSettings, config, set_ or ())
-    if folder is not None:
-        diagnosis_output.refuse(folder, overwrite=overwrite)
     with forking(), progress("Diagnosing", verbose, quiet) as tell:
-        drawn = None if folder is None else diagnosis_output.drawings(look)
-        against = partial(run, reals, imu=imu, truth=truth, tell=tell, settings=settings)
-        search = partial(against, sim, signals=signal or ())
-        diagnosis = search()
-        if folder is not None:
-            tell(0, 1, "writing")
-            for remark in diagnosis_output.write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite):
-                logger.warning("%s", remark)
-            if close:
-                rewrite = partial(diagnosis_output.write, folder=folder, logs=look, overwrite=True)
-                diagnosis = _closed(diagnosis, against, search, rewrite, sim, folder, metric, overwrite)
+        diagnosis, remarks = diagnosis_output.diagnose(
+            reals,
+            sim,
+            folder,
+            imu=imu,
+            truth=truth,
+            signals=signal or (),
+            settings=settings,
+            close=close,
+            metric=None if metric is None else script_metric(metric, reals[0]),
+            overwrite=overwrite,
+            tell=tell,
+        )
+    for remark in remarks:
+        logger.warning("%s", remark)
     if not write_json(diagnosis.report, json_to, overwrite=overwrite):
         _say(diagnosis, folder)
-
-
-def _closed(
-    first: Diagnosis,
-    against: Callable[[Path], Diagnosis],
-    search: Callable[..., Diagnosis],
-    rewrite: Callable[[Diagnosis], object],
-    sim: Path | None,
-    folder: Path,
-    metric: Path | None,
-    overwrite: bool,
-) -> Diagnosis:
-    """Diagnosis with the closed loop: its physics simulated along the given simulation, or along the recording's poses.
-
-    What is still missing then is added to the next search, for some rounds.
-    """
-    from dataclasses import replace
-
-    from imutool import diagnosis_output
-    from imutool.diagnosis.closed_loop import LOG, ROUNDS, closed_loop, is_worth_a_round, script_metric
-    from imutool.sensor.simulate import simulate
-
-    real, log = Path(first.real[0]), folder / LOG
-    figure = None if metric is None else script_metric(metric, real)
-    for number in range(1, ROUNDS + 1):
-        simulate(sim or real, log, physics=folder / diagnosis_output.EFFECT, overwrite=overwrite or number > 1)
-        second = against(log)
-        if number == ROUNDS or not is_worth_a_round(first, second):
-            break
-        better = search(begin=(*first.findings, *second.findings))
-        if {finding.effect for finding in better.findings} == {finding.effect for finding in first.findings}:
-            break
-        first = better
-        rewrite(first)
-    done = replace(first, closed=closed_loop(first, second, log, metric=figure, before=sim, rounds=number))
-    diagnosis_output.write_closed(done, second, folder)
-    return done
 
 
 def _say(diagnosis: Diagnosis, folder: Path | None) -> None:

@@ -25,7 +25,7 @@ from imutool.diagnosis.wording.quantity import symbol
 from imutool.errors import ConfigError
 from imutool.units import ASCII_UNITS, SENSORS
 
-LOG = "closed.mcap"
+CLOSED_LOG = "closed.mcap"
 WINDOW_S = 5.0  # over which samples are integrated
 EDGES_HZ = (0.0, 1.0, 5.0, 20.0, np.inf)  # of the bands of the spectrum
 LATE_PARTS = 4  # of a log, for the error over time

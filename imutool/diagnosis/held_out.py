@@ -113,7 +113,7 @@ def unexplained_residuals(
         white = held_out.rms_after < most * noise
         if not white and beside_poses:
             p_value = _p_value(logs, after, part, noise, settings)
-            white = p_value > settings.white_p_value
+            white = p_value > settings.white_p_value and held_out.rms_after < settings.most_white_ratio * noise
         out[signal] = Unexplained(held_out.rms_after, noise, white, p_value)
     return out
 

@@ -107,6 +107,7 @@ class AlignmentSettings(Settings, frozen=True):
     poses_hz: Positive = 40.0  # slower poses cannot be differentiated twice
     coarse_samples: Count = 5  # of the means in which a misfit between poses and samples stands out
     coarse_factor: Positive = 1.3  # over their noise, up to which poses stand for the samples
+    line_chance: Share = 1e-6  # of white noise to show a line above those means, below which poses do not stand for the samples
 
 
 class SignalSettings(Settings, frozen=True):
@@ -117,6 +118,8 @@ class SignalSettings(Settings, frozen=True):
     oversampling: Positive = 4.0  # so that a straight line between fine samples is the signal
     align_hz: Positive = 100.0  # of the clock on which recording and simulation are correlated
     least_correlation: Share = 0.3  # below which nothing says that the two are one motion
+    alike_sigma: tuple[float, float] = (3.0, 4.0)  # over chance: with a shared epoch, and at any lag
+    most_demanded: Share = 0.9  # of such a correlation, for slow signals
     noise_band: Share = 0.4  # of the rate: from here to `noise_band_end` a simulation's spectrum is its noise
     noise_band_end: Share = 0.45
     better_noise: Share = 0.95  # of the first noise level, below which effects are searched once more
@@ -225,6 +228,7 @@ class HeldOutSettings(Settings, frozen=True):
 
     white_ratio: Positive = 1.15  # of residual and noise, up to which the residual is white
     white_p_value: Share = 0.01  # below which a residual beside poses is not white
+    most_white_ratio: Positive = 3.0  # of residual and noise, above which it is not, however few the blocks
     block_s: Positive = 3.0  # of held-out time for that test
     few_samples_p_value: Share = 1e-3  # of a larger ratio, where few values are left
 

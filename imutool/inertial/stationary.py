@@ -32,6 +32,8 @@ TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, 
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
 FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
 NOISE_BLOCK, CALMEST = 20, 0.25
+MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean of noise, and how many means there are at least
+TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 KEPT_MEANS = 100  # of windows at rest, for their median
 GAP_PERIODS = 3.0  # a longer step between samples breaks a window
 
@@ -220,6 +222,14 @@ def white_noise(values: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]
         return np.zeros(values.shape[1])
     blocks = second[: len(second) // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK, values.shape[1]).mean(axis=1)
     return np.asarray(np.sqrt(quantile(blocks, CALMEST) / 6.0))
+
+
+def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
+    """Whether means of a signal scatter no more than means of white noise."""
+    noise = max(float(white_noise(x[:, None])[0]), least)
+    sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
+    means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
+    return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
 
 
 def _window_statistics(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 
@@ -37,6 +37,7 @@ class Fields:
     t_ns: Int64[np.ndarray, " n"]
     values: Float64[np.ndarray, " n"]
     unit: str = ""
+    left_out: int = 0  # rows without a number, or with the stamp of the row before
 
     def __len__(self) -> int:
         return len(self.t_ns)
@@ -104,18 +105,19 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     return []
 
 
-def others(path: Location, signal: str, most: int = MAX_OTHERS, skip: Collection[str] = ()) -> dict[str, Fields]:
+def others(
+    path: Location, signal: str, most: int = MAX_OTHERS, skip: Collection[str] = (), *, gaps: bool = False
+) -> dict[str, Fields]:
     """Every other varying number of a log by TOPIC.field: candidates to drive a signal.
 
-    Left out are stamps, covariances, constants, NaN, stamps that go back, long arrays (images), topics without a definition or
-    computed by imutool, those in `skip`, and all fields behind the first `most` that vary, in the order of the log.
+    Left out are stamps, covariances, constants, long arrays (images), unreadable or computed topics, those in `skip`, all that
+    vary behind the first `most`, and fields with NaN or stamps that do not increase; with `gaps`, only such rows of theirs.
 
     Raises:
         ConfigError, LogError: the log cannot be opened, or is damaged.
     """
     with Log(path) as log:
-        readers = {}
-        left = READ_FACTOR * most
+        readers, left = dict[str, _Reader](), READ_FACTOR * most
         for name, topic in log.topics.items():
             paths = [] if name in skip or DERIVED_KEY in topic.metadata else _offered(log, name)
             paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
@@ -124,12 +126,8 @@ def others(path: Location, signal: str, most: int = MAX_OTHERS, skip: Collection
         for name, rows in log.rows(list(readers)):
             with log.named(name):
                 readers[name].take(rows)
-    found = dict[str, Fields]()
-    for name, reader in readers.items():
-        for inside in reader.paths:
-            if len(found) < most and (values := reader.usable(inside)) is not None:
-                found[f"{name}.{inside}"] = values
-    return found
+    offered = ((f"{name}.{inside}", reader.usable(inside, gaps)) for name, reader in readers.items() for inside in reader.paths)
+    return dict(islice(((name, values) for name, values in offered if values is not None), most))
 
 
 def _offered(log: Log, topic: str) -> list[str]:
@@ -276,14 +274,16 @@ class _Reader:
         StampCheck().check(t_ns, sequence)
         return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
 
-    def usable(self, path: str) -> Fields | None:
+    def usable(self, path: str, gaps: bool = False) -> Fields | None:
         """A field over the whole log if it varies and can be a channel."""
         if not self.log_times:
             return None
         t_ns, values = self.t_ns(), np.concatenate(self.values)[:, self.paths.index(path)]
-        if not np.isfinite(values).all() or (np.diff(t_ns) <= 0).any() or len(values) < 2 or np.ptp(values) == 0.0:
+        sound = np.isfinite(values) & (np.diff(t_ns, prepend=t_ns[0] - 1) != 0)
+        t_ns, values = t_ns[sound], values[sound]
+        if not (gaps or (sound.all() and (np.diff(t_ns) > 0).all())) or len(values) < 2 or np.ptp(values) == 0.0:
             return None
-        return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""))
+        return Fields(t_ns, values, self.topic.metadata.get(UNIT_KEY, ""), int((~sound).sum()))
 
 
 def _column(payload: UInt8[np.ndarray, "n L"], place: Leaf, order: str) -> np.ndarray:

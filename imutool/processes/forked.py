@@ -132,17 +132,18 @@ class Forked(Generic[T]):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def of_each(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
+def of_each(function: Callable[[T], R], items: Sequence[T], *, long: bool = False) -> Iterator[R]:
     """Function of each item, in order, until nobody asks for more.
 
-    The first item is done here. Free processors take equal shares of the others if that saves time, as its time tells.
+    The first item is done here. Free processors take equal shares of the others if that saves time, as its time tells. Where
+    every item is known to take `long`, they take equal shares of all.
     """
     began = time.perf_counter()
-    first = [function(item) for item in items[:1]]
+    first = [function(item) for item in items[: 0 if long else 1]]
     took = time.perf_counter() - began
-    size = max(1, math.ceil((len(items) - 1) / (1 + max(0, Forked.free()))))
-    shares = [items[k : k + size] for k in range(1, len(items), size)]
-    worth = took * (len(items) - 1 - size) > WORTH_S
+    size = max(1, math.ceil((len(items) - len(first)) / (1 + max(0, Forked.free()))))
+    shares = [items[k : k + size] for k in range(len(first), len(items), size)]
+    worth = long or took * (len(items) - 1 - size) > WORTH_S
     beside = [Forked(partial(lambda share: [function(item) for item in share], share)) for share in shares[1:] if worth]
     try:
         yield from first

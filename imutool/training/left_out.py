@@ -96,7 +96,7 @@ def compare(
         return scores
 
     logs = list(enumerate(_logs(recordings, pool, fits["gyro"])))
-    scores = [score for some in of_each(of_log, logs) for score in some]
+    scores = [score for some in of_each(of_log, logs, long=True) for score in some]
     return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS})
 
 

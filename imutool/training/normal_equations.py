@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from imutool.array_types import Float, Float64, Int
 from imutool.bias.networks.threads import of_each
@@ -238,9 +239,10 @@ def _equations(
         cut = pool.windows(some, n, pool.t.new_zeros(len(some), 6))
         true_u = (pool.gyro if seen.sensor == "gyro" else pool.accel)[index] - error[index] - own[cut.log, None, :3]
         e, A, by_nuisance = _residual(seen, cut, true_u, index, own, windows.R_wb)
-        each = terms[index]
-        each = 0.5 * (each[:, :-1] + each[:, 1:]) if seen.sensor == "gyro" else each  # rates hold between samples
-        S = A.permute(0, 2, 3, 1).flatten(1, 2) @ each
+        by_sample = A.flatten(2)
+        if seen.sensor == "gyro":  # rates hold between samples
+            by_sample = 0.5 * (pad(by_sample, (0, 0, 0, 1)) + pad(by_sample, (0, 0, 1, 0)))
+        S = by_sample.mT @ terms[index]
         by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
         return e, torch.cat([by_theta, A.sum(1), by_nuisance], dim=2)
 

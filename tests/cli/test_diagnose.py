@@ -17,10 +17,10 @@ from support.diagnoses import replace
 from support.report_schema import assert_valid
 from typer.testing import CliRunner, Result
 
+import imutool
 from imutool import diagnosis_output
 from imutool.cli import load
-from imutool.diagnosis import diagnose
-from imutool.diagnosis.closed_loop import LOG
+from imutool.diagnosis.closed_loop import CLOSED_LOG
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_sensor_files import to_physics_file
@@ -85,7 +85,9 @@ def diagnosed(folder: Path, imutool: Command) -> tuple[Path, Done]:
 
 def test_the_planted_lever_arm_is_found_and_written(diagnosed: tuple[Path, Done]) -> None:
     place, _ = diagnosed
-    assert sorted(path.name for path in place.iterdir()) == sorted([*diagnosis_output.FILES, diagnosis_output.CLOSED, LOG])
+    assert sorted(path.name for path in place.iterdir()) == sorted(
+        [*diagnosis_output.FILES, diagnosis_output.CLOSED, CLOSED_LOG]
+    )
     assert f'href="{diagnosis_output.LOG}"' in (place / diagnosis_output.REPORT).read_text()
     closed = (place / diagnosis_output.CLOSED).read_text()
     assert "Before and after" in closed
@@ -119,7 +121,7 @@ def test_the_closed_loop_misses_nothing_and_compares_before_and_after(diagnosed:
     figures = {one["figure"]: (one["before"], one["after"]) for one in closed["compared"]}
     for name in ("accel rms", "accel rms, 1 to 5 Hz", "accel rms, quarter 4", "path over 5 s"):
         assert figures[name][1] < 0.3 * figures[name][0]
-    assert figures["metric"][1] == (place / LOG).stat().st_size
+    assert figures["metric"][1] == (place / CLOSED_LOG).stat().st_size
     assert "Nothing but a constant bias" in (place / diagnosis_output.CLOSED).read_text()
 
 
@@ -128,14 +130,14 @@ def test_what_the_loop_still_misses_begins_another_search(
 ) -> None:
     """The first search overlooks the arm here; the second begins with it, and the folder holds its answer."""
     begins: list[list[str]] = []
-    searched = diagnose.diagnose
+    searched = diagnosis_output.diagnose_logs
 
     def overlooked(*words: Any, begin: Sequence[Finding] = (), **more: Any) -> Diagnosis:
         begins.append([finding.effect for finding in begin])
         found = searched(*words, begin=begin, **more)
         return replace(found, findings=(), located=()) if len(begins) == 1 else found
 
-    monkeypatch.setattr(diagnose, "diagnose", overlooked)
+    monkeypatch.setattr(diagnosis_output, "diagnose_logs", overlooked)
     said = run("diagnose", folder / "arm.mcap", "--sim", folder / "ideal.mcap", "--close", "-o", tmp_path / "out")
     assert said.exit_code == 0, said.output
     told = json.loads((tmp_path / "out" / "findings.json").read_text())
@@ -144,6 +146,22 @@ def test_what_the_loop_still_misses_begins_another_search(
     assert begins == [[], [], ["lever_arm"], []]
     assert [entry.name for entry in physics_file.read(tmp_path / "out" / "physics.toml").effect] == ["lever_arm"]
     assert "nothing is missing, after 2 rounds" in said.output
+
+
+def test_a_loop_closes_in_python_with_a_figure_of_ones_own(folder: Path, tmp_path: Path) -> None:
+    """Its own log is refused as an input before the work."""
+    place, metric = tmp_path / "out", lambda log: float(log.stat().st_size)
+    told = imutool.diagnose(folder / "null.mcap", folder / "ideal.mcap", output=place, close=True, metric=metric)
+    assert told.closed is not None
+    assert not told.closed.mismatch
+    figures = {one.figure: (one.before, one.after) for one in told.closed.compared}
+    assert figures["metric"] == (metric(folder / "ideal.mcap"), metric(place / CLOSED_LOG))
+    assert json.loads((place / "findings.json").read_text())["closed"]["mismatch"] is False
+    before = (place / CLOSED_LOG).read_bytes()
+    for output in (place, None):
+        with pytest.raises(ConfigError, match="close"):
+            imutool.diagnose(folder / "null.mcap", place / CLOSED_LOG, output=output, close=True, overwrite=True)
+    assert (place / CLOSED_LOG).read_bytes() == before
 
 
 def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:

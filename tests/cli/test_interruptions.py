@@ -216,12 +216,11 @@ def read_for_ever() -> None:
 @pytest.mark.parametrize("name", AT_WORK)
 def test_a_signal_while_the_input_is_read(here: Path, name: str) -> None:
     """Three runs at once, each with a signal of its own: the exit code is the signal's, and nothing is left."""
-    runs = {}
     for number in CODES:
-        (folder := here / number.name).mkdir()
-        shutil.copy(here / "in.mcap", folder)
-        runs[number] = Forked([*AT_WORK[name], "-q"], folder, read_for_ever)
+        (here / number.name).mkdir()
+        shutil.copy(here / "in.mcap", here / number.name)
     before = digests(here)
+    runs = {number: Forked([*AT_WORK[name], "-q"], here / number.name, read_for_ever) for number in CODES}
     for number, run in runs.items():
         soon((here / number.name / "reading").exists)
         run.send_signal(number)

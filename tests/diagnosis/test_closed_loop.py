@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from imutool.diagnosis.closed_loop import LOG, closed_loop, is_worth_a_round
+from imutool.diagnosis.closed_loop import CLOSED_LOG, closed_loop, is_worth_a_round
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_sensor_files import to_physics_file
@@ -50,7 +50,7 @@ def test_figures_are_of_all_time_that_both_know() -> None:
         diagnosis([(0.0, 40.0, 3.0), (50.0, 80.0, 3.0)]),
         diagnosis([(0.0, 10.0, 1.0), (12.0, 40.0, 2.0), (60.0, 70.0, 0.0)]),
     )
-    compared = closed_loop(first, again, Path(LOG)).compared
+    compared = closed_loop(first, again, Path(CLOSED_LOG)).compared
     figures = {one.figure: (one.before, one.after) for one in compared}
     after, quarter = (
         0.1 * np.sqrt(square / 3.0) for square in ((10.0 + 28.0 * 4.0) / 48.0, (10.0 + 2.0 * 4.0) / 12.0)
@@ -73,7 +73,7 @@ def test_what_no_simulation_changes_is_not_missing() -> None:
         (("gravity", "quantization"), True, ("gravity",)),
         (("timestamp_jitter",), True, ("timestamp_jitter",)),  # the first did not have it
     ):
-        loop = closed_loop(first, diagnosis([(0.0, 20.0, 0.5)], findings=findings, white=white), Path(LOG))
+        loop = closed_loop(first, diagnosis([(0.0, 20.0, 0.5)], findings=findings, white=white), Path(CLOSED_LOG))
         assert (loop.mismatch, loop.findings) == (missing is not None, missing or ())
 
 
@@ -93,7 +93,7 @@ def test_a_jump_of_the_clock_comes_at_its_time_in_a_simulation_that_begins_later
     real = simulated(path, [(jump, np.array([20.0, 0.05]))], white, RATE_HZ, 1).recording
     later = path.truth.rows(seconds(path.truth.t_ns, int(path.truth.t_ns[0])) > LATE_S)
     ideal = simulated(Recording("sim", path.imu, {"/gt": later}), [], white, RATE_HZ, 2).recording
-    recorded, sim, closed, physics = (tmp_path / name for name in ("real.mcap", "sim.mcap", LOG, "physics.toml"))
+    recorded, sim, closed, physics = (tmp_path / name for name in ("real.mcap", "sim.mcap", CLOSED_LOG, "physics.toml"))
     write(replace(real, truths={}), recorded)
     write(ideal, sim)
     first = diagnose([recorded], sim)

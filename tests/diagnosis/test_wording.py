@@ -128,6 +128,20 @@ def test_a_place_without_a_name_is_not_passed_over() -> None:
     assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
 
 
+def test_a_finding_of_a_message_explains_its_fields() -> None:
+    """A wheel's radius is a finding of /odom: its speeds do not differ without a name."""
+    wheels = finding("wheel_radius", {"wheel_0": Estimate(0.02, 0.001, "-")}, signal="/odom")
+    place = replace(diagnoses.UNEXPLAINED.located[0], signal="/odom.twist.twist.linear.x")
+    left = {place.signal: Unexplained(0.05, 0.05, white=True)}
+    assert "no known effect" not in conclusion(replace(diagnoses.ARM, findings=(wheels,), located=(place,), unexplained=left))
+
+
+def test_a_curve_of_which_no_number_is_distinguished_still_has_a_sentence() -> None:
+    curve = replace(diagnoses.NAMELESS.findings[0].curve, variable="t")
+    drift = finding("drift", {"c0": Estimate(0.1, 1.0, "m")}, equation="y += curve(t)", curve=curve)
+    assert named_sentence(diagnoses.ARM, drift).startswith("it shows drift, y += curve(t); c0 not distinguished")
+
+
 @pytest.mark.parametrize(
     ("rms", "white", "words"),
     [

@@ -154,6 +154,16 @@ def test_each_item_has_its_result_in_order_and_free_processors_share_what_is_wor
 
 
 @pytest.mark.usefixtures("two")
+@pytest.mark.parametrize("count", range(5))
+def test_items_that_take_long_are_shared_from_the_first_on(count: int) -> None:
+    here = os.getpid()
+    with forking():
+        made = list(of_each(lambda k: (10 * k, os.getpid()), range(count), long=True))
+    assert [tens for tens, _ in made] == [10 * k for k in range(count)]
+    assert [process == here for _, process in made] == [k < math.ceil(count / 2) for k in range(count)]
+
+
+@pytest.mark.usefixtures("two")
 def test_whatever_ends_a_command_ends_its_processes() -> None:
     def interrupted() -> None:
         with forking():

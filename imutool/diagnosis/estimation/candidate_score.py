@@ -12,8 +12,9 @@ import numpy as np
 from imutool.array_types import Float, Float64, Int64
 from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit
 from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian, priors
-from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, finer_curve, with_free
+from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
+from imutool.diagnosis.estimation.unnamed_effects import finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Stage, Theta

@@ -29,7 +29,7 @@ from imutool.diagnosis.estimation.observability import (
     unidentified,
     values_of,
     with_common_arm,
-    with_finer_curve,
+    with_plainer_effects,
     with_steady_clock,
     without_implausible,
     without_unseen_low_pass,
@@ -45,7 +45,7 @@ from imutool.diagnosis.estimation.significance import (
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
+from imutool.diagnosis.estimation.unnamed_effects import SplineCurve, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
@@ -199,7 +199,7 @@ class _Search:
             rivals = self._rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
-        now = with_steady_clock(self.logs, now, self.named, self.candidates.starts)
+        now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
         return with_common_arm(
             self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold

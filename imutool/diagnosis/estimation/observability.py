@@ -11,13 +11,13 @@ import numpy as np
 from scipy.signal import welch
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
+from imutool.diagnosis.estimation.aligned_log import AlignedLog
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.significance import bic
-from imutool.diagnosis.estimation.unnamed_effects import Curve, finer, like
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
+from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
@@ -27,6 +27,8 @@ NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
 STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
 UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
+DRIFTS = {"gyro_bias_drift": range(3), "accel_bias_drift": range(3, 6)}  # parameters of a temperature's for the same biases
+SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth
 CLOCKS = (*STEADY, WANDER)
 FILTERS = ("low_pass", "mount_resonance", "gyro_delay")
 REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
@@ -119,49 +121,47 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
 def with_steady_clock(
     logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Mapping[str, Sequence[Theta]]
 ) -> Fit:
-    """Fit with the simplest clock that does as well (BIC); `starts` by effect.
-
-    One or two of offset, skew and jump replace a clock that wanders. An offset or a skew replaces a jump that is not clearly
-    better. Beside poses, which have a clock of their own, an offset replaces a gyro's delay that is not clearly better.
-    """
+    """Fit with one or two of offset, skew and jump for a clock that wanders, if as good (BIC)."""
     others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
-    if len(others) < len(now.chosen):
-        steady, fits = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys], [now]
-        for some in chain(combinations(steady, 1), combinations(steady, 2)):
-            on_trend = len(some) > 1 and any(effect.name == "clock_skew" for effect in some)
-            at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
-            fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some)), near=now))
-        now = min(fits, key=bic)
+    if len(others) == len(now.chosen):
+        return now
+    steady, fits = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys], [now]
+    for some in chain(combinations(steady, 1), combinations(steady, 2)):
+        on_trend = len(some) > 1 and any(effect.name == "clock_skew" for effect in some)
+        at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
+        fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some)), near=now))
+    return min(fits, key=bic)
+
+
+def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+    """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
     poses = any(log.pair.band_hz is not None for log in logs)
     for complex_one, theta in now.chosen:
-        if complex_one.name == "clock_jump":
-            sizes = {"clock_offset": theta[1], "clock_skew": theta[1] / max(2.0 * theta[0], 1.0)}
-        elif complex_one.name == "gyro_delay" and poses:
-            sizes = {"clock_offset": -theta[0]}
-        else:
-            continue
+        sizes = _plainer(complex_one.name, theta, poses=poses)
         rest = tuple(entry for entry in now.chosen if entry[0] is not complex_one)
-        simpler = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
-        trials = [fit(logs, (*rest, (effect, np.array([sizes[effect.name]]))), near=now) for effect in simpler]
+        plainer = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
+        parts = [(with_free(effect, sizes[effect.name][0]), np.array(sizes[effect.name][1])) for effect in plainer]
+        trials = [fit(logs, (*rest, part), near=now) for part in parts]
         margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
         best = min(trials, key=bic, default=now)
         now = best if bic(best) < bic(now) + margin else now
     return now
 
 
-def with_finer_curve(logs: Sequence[WhitenedLog], now: Fit) -> Fit:
-    """Fit with more knots in the curve that has just come in, where an edge pays for them (BIC)."""
-    others, (effect, _) = now.chosen[:-1], now.chosen[-1]
-    fine = finer_curve(logs, effect) if isinstance(effect.forward, Curve) else None
-    if fine is None:
-        return now
-    trial = fit(logs, (*others, (fine, fine.null_value.astype(float))), near=now)
-    return trial if bic(trial) < bic(now) - now.logs[0].pair.settings.search.clearly_better else now
+def _plainer(name: str, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
+    """Effects that may stand for one: their free parameters, by index, and a start.
 
-
-def finer_curve(logs: Sequence[WhitenedLog], curve: Effect) -> Effect | None:
-    """Curve with more knots; none where the variable has no room for them."""
-    return finer(curve, like([log.pair for log in logs if isinstance(log.pair, Pair)]))
+    A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift beside a temperature of the
+    log, three scales as one gravity within what the Earth has.
+    """
+    if name == "clock_jump":
+        return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
+    if name == "gyro_delay" and poses:
+        return {"clock_offset": ([0], [-theta[0]])}
+    if name in DRIFTS:
+        return {"temperature": (DRIFTS[name], [0.0, 0.0, 0.0])}
+    g = GRAVITY_M_S2 * float(np.mean(theta))
+    return {"gravity": (range(3), [g, 0.0, 0.0])} if name == "accel_scale" and len(theta) == 3 and abs(g) < SITES_M_S2 else {}
 
 
 def with_common_arm(

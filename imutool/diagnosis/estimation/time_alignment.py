@@ -13,23 +13,21 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import label, maximum, uniform_filter1d
-from scipy.signal import correlate, correlation_lags
+from scipy.signal import correlate, correlation_lags, periodogram
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
-from imutool.inertial.kinematics import fit_trajectory
-from imutool.inertial.stationary import white_noise
+from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
+from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
 
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
-MEANS, LEAST_MEANS = (20, 200), 8  # samples of a mean, and how many means there are at least
-TOLERATED_MEAN = 1.8  # by which they may scatter more than noise is measured, which finds five sixths of it
 MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and power that chance does not reach in any band
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
@@ -165,7 +163,7 @@ def _simulated(
         t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + ideal.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
-    t_s = t_sim[0] + period_s * np.arange(int((t_sim[-1] - t_sim[0]) / period_s) + 1)
+    t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     clean = np.stack([wiener_filter(column, settings.alignment) for column in even.T], axis=1)
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
@@ -194,23 +192,39 @@ def _by_poses(
     if holes or poses.period_s * own.poses_hz > 1.0:
         return None
     trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
-    t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
-    motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
-    R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
-    t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
-    ideal = IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, R_wb)
-    t_s = seconds(sim.imu.t_ns, int(poses.t_ns[0]))
-    rows = (t_s >= ideal.t_s[0]) & (t_s <= ideal.t_s[-1])
+    t_ns = sim.imu.t_ns
+    rows = (t_ns >= poses.t_ns[0]) & (t_ns <= poses.t_ns[-1])
     if rows.mean() < own.poses_share:
         return None
-    expected = ideal.sample(t_s[rows], t_s[rows])
-    residual = samples[rows] - np.concatenate([expected.gyro, expected.accel], axis=1)
+    there = trajectory.at(t_ns[rows])
+    residual = samples[rows] - np.concatenate([there.omega_b, there.specific_force()], axis=1)
+    off = _gravity_error(rotation_matrices(there), residual[:, 3:])
+    residual[:, 3:] -= np.einsum("nji,j->ni", rotation_matrices(there), off)
     residual = residual - residual.mean(axis=0)
-    coarse = (
-        residual[: len(residual) // own.coarse_samples * own.coarse_samples].reshape(-1, own.coarse_samples, 6).mean(axis=1)
-    )  # where a misfit of motion would stand out
-    exact = (coarse.std(axis=0) < own.coarse_factor * np.maximum(noise, LEAST_NOISE) / np.sqrt(own.coarse_samples)).all()
-    return ideal if exact else None
+    size, least = own.coarse_samples, np.maximum(noise, LEAST_NOISE)
+    coarse = residual[: len(residual) // size * size].reshape(-1, size, 6).mean(axis=1)  # shows a misfit of motion
+    exact = (coarse.std(axis=0) < own.coarse_factor * least / np.sqrt(size)).all()
+    if not exact or _has_line(residual, 1.0 / size, own.line_chance):
+        return None
+    t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
+    motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
+    t_s = np.arange(len(motion.p_wb)) * round(1e9 / rate_hz) * 1e-9
+    return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=G_W - off), motion.alpha_b, rotation_matrices(motion))
+
+
+def _gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], residual: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
+    """By how much a simulator's own specific force at rest differs, in the world, beside a constant of the body."""
+    few = slice(None, None, len(residual) // 20_000 + 1)
+    columns = np.concatenate([R_wb[few].transpose(0, 2, 1), np.broadcast_to(np.eye(3), (len(R_wb[few]), 3, 3))], axis=2)
+    return np.asarray(np.linalg.lstsq(columns.reshape(-1, 6), residual[few].ravel(), rcond=1e-6)[0][:3])
+
+
+def _has_line(residual: Float64[np.ndarray, "n 6"], above: float, chance: float) -> bool:
+    """Whether one frequency (Nyquist: 1) stands out of white noise, as a simulated vibration does."""
+    f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
+    band = power[f > above]
+    floor = np.maximum(band.mean(axis=0), LEAST_NOISE**2)
+    return bool(band.size and (len(band) * np.exp(-band.max(axis=0) / floor)).min() < chance)
 
 
 def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
@@ -220,7 +234,7 @@ def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 
     return rotation_matrices(poses) if known.mean() > 0.9 else None
 
 
-def rotation_matrices(poses: Poses) -> Float64[np.ndarray, "n 3 3"]:
+def rotation_matrices(poses: Poses | Motion) -> Float64[np.ndarray, "n 3 3"]:
     """R_wb of some poses."""
     return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
 
@@ -248,10 +262,7 @@ def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DE
 
 
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
-    """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None if unlike.
-
-    None where the two are not of one motion.
-    """
+    """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None for two motions."""
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
     if _rests(real) and _rests(sim):
@@ -265,14 +276,6 @@ def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
 def _rests(imu: Imu) -> bool:
     """Whether a gyro shows noise only, so that nothing can be aligned, and nothing has to be."""
     return all(nothing_but_noise(column, least) for column, least in zip(imu.gyro.T, LEAST_NOISE, strict=False))
-
-
-def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
-    """Whether means of a signal scatter no more than means of white noise."""
-    noise = max(float(white_noise(x[:, None])[0]), least)
-    sizes = [size for size in (*MEANS, len(x) // LEAST_MEANS) if 0 < size <= len(x) // LEAST_MEANS]
-    means = (x[: len(x) // size * size].reshape(-1, size).mean(axis=1) for size in sizes)
-    return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
 
 
 def _lag(real: Imu, sim: Imu, settings: AlignmentSettings) -> tuple[float, float]:

@@ -18,7 +18,10 @@ from scipy.interpolate import BSpline, PPoly
 
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import AddedColumns
+from imutool.diagnosis.estimation.significance import bic
+from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import Recent, SensorSamples
@@ -218,3 +221,18 @@ def like(pairs: Sequence[Pair]) -> SensorSamples:
     pair = pairs[0]
     stamp_s = pair.stamp_s[pair.fitted]
     return pair.ideal.sample(stamp_s, stamp_s)
+
+
+def with_finer_curve(logs: Sequence[WhitenedLog], now: Fit) -> Fit:
+    """Fit with more knots in the curve that has just come in, where an edge pays for them (BIC)."""
+    others, (effect, _) = now.chosen[:-1], now.chosen[-1]
+    fine = finer_curve(logs, effect) if isinstance(effect.forward, Curve) else None
+    if fine is None:
+        return now
+    trial = fit(logs, (*others, (fine, fine.null_value.astype(float))), near=now)
+    return trial if bic(trial) < bic(now) - now.logs[0].pair.settings.search.clearly_better else now
+
+
+def finer_curve(logs: Sequence[WhitenedLog], curve: Effect) -> Effect | None:
+    """Curve with more knots; none where the variable has no room for them."""
+    return finer(curve, like([log.pair for log in logs if isinstance(log.pair, Pair)]))

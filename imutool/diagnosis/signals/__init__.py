@@ -8,7 +8,8 @@ from dataclasses import replace
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.pairing import Pairing, on_one_clock, paired
+from imutool.diagnosis.signals.log_fields import on_one_clock
+from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError
 from imutool.location import Location
@@ -41,7 +42,7 @@ def with_signals(
             "recording and simulation share no IMU and no other varying number",
             where=real,
             expected="topics of one name and message in both logs",
-            fix="Give both logs the topics of one robot",
+            fix=". ".join(["Give both logs the topics of one robot", *pairing.remarks]),
         )
     if pairing.pairs:
         diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import correlate, correlation_lags
 
 from imutool.array_types import Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks, Variables, split
@@ -20,6 +19,7 @@ from imutool.diagnosis.signals.ideal_signal import (
     from_simulation,
     state_on,
 )
+from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.fields import Fields
@@ -137,7 +137,7 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
         band = band_hz(ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
         return _aligned(pair, ideal, rows, t_real, density, settings, band_hz=band)
     t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
-    lag_s, aligned_s = _lag(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
+    lag_s, aligned_s = lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
     if aligned_s is not None:
         t_sim, lag_s = t_sim - aligned_s, 0.0
     period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))
@@ -251,49 +251,3 @@ def _check(t_ns: Int64[np.ndarray, " n"], values: Column, what: str, name: str, 
             expected="a signal that varies",
             fix=f"Choose another field: {why}",
         )
-
-
-def _lag(
-    t_real: Column,
-    real: Float64[np.ndarray, "_ k"],
-    t_sim: Column,
-    sim: Float64[np.ndarray, "_ k"],
-    names: Sequence[str],
-    settings: DiagnoseSettings,
-) -> tuple[float, float | None]:
-    """Lag (s) of the recording at first sight, and the clock shift (s) if no epoch is shared.
-
-    Raises:
-        DataError: nowhere are the two alike.
-    """
-    own = settings.signal
-    a, b = (
-        np.stack([_smooth(t_s, column, own.align_hz) for column in values.T]) for t_s, values in ((t_real, real), (t_sim, sim))
-    )
-    if len(names) > 1:  # columns of one size each, so that none decides for all
-        size = np.maximum(b.std(axis=1, keepdims=True), 1e-300)
-        a, b = a / size, b / size
-    total = np.sum([correlate(x, y, mode="full") for x, y in zip(a, b, strict=True)], axis=0)
-    correlation = total / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
-    lags = correlation_lags(a.shape[1], b.shape[1]) / own.align_hz + float(t_real[0] - t_sim[0])
-    shared = min(t_real[-1], t_sim[-1]) - max(t_real[0], t_sim[0])
-    length = min(t_real[-1] - t_real[0], t_sim[-1] - t_sim[0])
-    near = np.abs(lags) <= settings.alignment.farthest_s
-    if shared > max(own.least_s, 0.5 * length) and near.any() and np.abs(correlation[near]).max() > own.least_correlation:
-        return float(lags[near][np.argmax(np.abs(correlation[near]))]), None
-    best = int(np.argmax(correlation))
-    if correlation[best] < own.least_correlation:
-        raise DataError(
-            f"recording and simulation of {names[0]} are not alike (correlation {correlation[best]:.2f} at best)",
-            where=names[0],
-            expected="one motion",
-            fix="Simulate what was recorded, or choose another field",
-        )
-    return 0.0, -float(lags[best])
-
-
-def _smooth(t_s: Column, values: Column, rate_hz: float) -> Float64[np.ndarray, " _"]:
-    """On an even clock, without its mean."""
-    at = np.arange(t_s[0], t_s[-1], 1.0 / rate_hz)
-    even = np.interp(at, t_s, values)
-    return np.asarray(even - even.mean())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,29 @@ class SignalPair:
         """One plain number."""
         columns = (values.values[:, None] for values in (real, sim))
         return cls(name, (name,), (real.unit or sim.unit,), real.t_ns, next(columns), sim.t_ns, next(columns))
+
+    @classmethod
+    def of_columns(
+        cls,
+        topic: str,
+        paths: tuple[str, ...],
+        kind: str,
+        units: tuple[str, ...],
+        real: Mapping[str, Fields],
+        sim: Mapping[str, Fields],
+        state: Mapping[str, Fields],
+        sim_state: Mapping[str, Fields] | None = None,
+    ) -> SignalPair:
+        """Fields of one message, at the stamps that all of them have."""
+        names = tuple(f"{topic}.{path}" for path in paths)
+        (real_ns, mine), (sim_ns, theirs) = (stacked([side[path] for path in paths]) for side in (real, sim))
+        return cls(topic, names, units, real_ns, mine, sim_ns, theirs, kind, state, sim_state or {})
+
+
+def stacked(columns: Sequence[Fields]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
+    """Stamps that all columns have, and their values there."""
+    t_ns = reduce(np.intersect1d, [column.t_ns for column in columns])
+    return t_ns, np.stack([column.values[np.isin(column.t_ns, t_ns)] for column in columns], axis=1)
 
 
 def at_recorded_motion(

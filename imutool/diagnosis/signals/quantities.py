@@ -11,17 +11,14 @@ from imutool.array_types import Float64
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.mcap_io.fields import Fields
 
-FACTOR_ERROR = 0.05
+FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
+OTHER_MOTION_ERROR = 1.5  # likewise, of the efforts of two motions
 TURNS = (2.0 * np.pi, 360.0)
 EARTH_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
-FACTORS = {
-    180.0 / np.pi: "degrees",
-    1000.0: "thousandths",
-    1e4: "gauss",
-    1e6: "millionths",
-    0.01: "hundreds",
-    1e-3: "thousands",
-}
+FACTORS = {180.0 / np.pi: "degrees", 100.0: "hundreds", 1e3: "thousands", 1e4: "gauss", 1e6: "millions"}
+"""Factors between units of one quantity, either way round."""
+USUAL = {"magnetic": 5e-5, "pressure": 1e5}
+"""Size in the message's own unit (T, Pa), which tells what log is in another."""
 
 
 def unwrapped(pair: SignalPair) -> SignalPair:
@@ -42,15 +39,33 @@ def unwrapped(pair: SignalPair) -> SignalPair:
 
 
 def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
-    """The recording in the simulation's unit, where the two differ by a known factor."""
-    if pair.sim_state:
-        return pair, ""
-    ratio = float(np.linalg.norm(np.std(pair.real, axis=0))) / max(float(np.linalg.norm(np.std(pair.sim, axis=0))), 1e-300)
-    for factor, word in FACTORS.items():
-        if abs(ratio / factor - 1.0) < FACTOR_ERROR:
-            text = f"{pair.name} is {factor:.4g} times larger than in the simulation, as {word} are; it was divided by that"
-            return replace(pair, real=pair.real / factor), text
+    """Both logs in one unit, where they differ by a known factor.
+
+    It is the message's unit where the size of the values shows it, else the simulation's.
+    """
+    sizes = [float(np.linalg.norm(np.std(values, axis=0))) for values in (pair.real, pair.sim)]
+    ratio = np.log(max(sizes[0], 1e-300) / max(sizes[1], 1e-300))
+    factors, error = ({1e3: "thousands"}, OTHER_MOTION_ERROR) if pair.sim_state else (FACTORS, FACTOR_ERROR)
+    for factor, word in factors.items():
+        if abs(abs(ratio) - np.log(factor)) < error:
+            larger, changed = bool(ratio > 0.0), "sim" if _is_usual(pair) else "real"
+            by = factor if larger != (changed == "real") else 1.0 / factor
+            text = (
+                f"{pair.name} is {factor:.4g} times {'larger' if larger else 'smaller'} than in the simulation,"
+                f" as in another unit ({word}); the {'simulation' if changed == 'sim' else 'recording'} was"
+                f" {'divided' if by < 1.0 else 'multiplied'} by that"
+            )
+            return replace(pair, **{changed: getattr(pair, changed) * by}), text
     return pair, ""
+
+
+def _is_usual(pair: SignalPair) -> bool:
+    """Whether the recording, and not the simulation, has the size that its message's unit gives."""
+    usual = USUAL.get(pair.kind)
+    if usual is None:
+        return False
+    real, sim = (abs(np.log(max(float(np.sqrt((v**2).sum(axis=1).mean())), 1e-300) / usual)) for v in (pair.real, pair.sim))
+    return bool(real < sim)
 
 
 def metres(side: Mapping[str, Fields], origin: Mapping[str, Fields]) -> dict[str, Fields]:

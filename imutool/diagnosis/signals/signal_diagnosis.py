@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -156,14 +157,14 @@ def _summarized(
 ) -> SignalDiagnosis:
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     level, logs, names = noise_floor([log]), [log], pair.names
-    selection, small = _above_model_error(log, selection, level)
+    selection, small = _above_model_error(log, selection)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
     similar = selection.similar()
     findings = [_with_python(finding_of(logs, selection, selected, level, similar)) for selected in selection.selected]
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
         findings = [_with_learnt_error(finding) for finding in findings]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
-    located = locate_findings([pair], [before], [after], level, (), p_values, settings.localization) if findings else []
+    place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
     for k in range(pair.columns):
         if lsb[k] > settings.timestamps.least_digits * float(level[k]):
@@ -178,10 +179,12 @@ def _summarized(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
         )
     unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
+    most = settings.held_out.most_white_ratio
+    beyond = any(not left.white and left.rms > most * left.noise_floor for left in unexplained.values())
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
     unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
     return SignalDiagnosis(
-        located=tuple(located),
+        located=tuple(place() if findings or beyond else ()),  # what nothing explains has a place
         findings=tuple(findings),
         offset=offsets,
         not_identifiable=(*hidden, *unseen),
@@ -213,21 +216,28 @@ def _with_learnt_error(finding: Finding) -> Finding:
     return msgspec.structs.replace(finding, parameters=parameters)
 
 
-def _above_model_error(log: WhitenedLog, selection: Selection, level: Float64[np.ndarray, " k"]) -> tuple[Selection, list[str]]:
+def _above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection, list[str]]:
     """Selection without effects as small as the error of learnt dynamics, and those effects."""
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if pair.band_hz is None or not selection.selected:
         return selection, []
     least, scale = SMALL_GAIN * max(selected.gain for selected in selection.selected), pair.scale()
-    gains = [finding_of([log], selection, selected, level).held_out for selected in selection.selected]
-    sizes = [float(np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0))) for gain in gains]
-    kept, small = list[SelectedEffect](), list[SelectedEffect]()
+    sizes = [_sizes(log, selection, selected) for selected in selection.selected]
+    largest, kept, small = max(float(of.max()) for of in sizes), list[SelectedEffect](), list[SelectedEffect]()
     for selected, size in zip(selection.selected, sizes, strict=True):
-        columns = [pair.names.index(name) for name in selected.effect.sensors] or list(range(pair.columns))
-        error = max(LEARNT_ERROR * min(scale.size[k] for k in columns), float(np.sqrt(SMALL_GAIN)) * max(sizes))
-        (kept if selected.gain >= least and size >= error else small).append(selected)
+        clear = (size >= LEARNT_ERROR * np.array(scale.size)).any() and size.max() >= np.sqrt(SMALL_GAIN) * largest
+        (kept if selected.gain >= least and clear else small).append(selected)
     names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names
+
+
+def _sizes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Float64[np.ndarray, " k"]:
+    """What an effect removes of each column, on held-out time."""
+    chosen = selection.fitted.chosen
+    without = tuple(entry for entry in chosen if entry[0].key != selected.effect.key)
+    before, after = ([with_effects(log.pair, these)] for these in (without, chosen))
+    gains = [held_out_rms([log], before, after, name) for name in log.pair.signals]
+    return np.array([np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0)) for gain in gains])
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:

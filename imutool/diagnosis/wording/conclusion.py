@@ -202,7 +202,12 @@ def _all_findings(d: Diagnosis) -> str:
 def _unnamed_place(d: Diagnosis) -> str:
     """Clause on signals that differ without a finding, empty where there is none."""
     named = {part for finding in d.findings for part in signals(finding.signal)}
-    places = [place for place in d.located if not place.reason and not set(signals(place.signal)) & named]
+    columns = tuple(f"{name}." for name in named)  # of a message that has a finding as a whole
+    places = [
+        place
+        for place in d.located
+        if not place.reason and not set(signals(place.signal)) & named and not place.signal.startswith(columns)
+    ]
     if not places:
         return ""
     differing = list(dict.fromkeys(place.signal for place in places))

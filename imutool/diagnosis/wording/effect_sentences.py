@@ -165,7 +165,7 @@ def effect_sentence(d: Diagnosis, finding: Finding) -> str:
     main = quantities[0] if quantities else Quantity("", (), ())
     words = Words(_pronoun(finding.signal), reference(d), main, tuple(quantities[1:]), finding)
     template = SENTENCES.get(finding.effect)
-    if template is None or not (quantities or finding.curve):
+    if template is None or not (quantities or (finding.curve is not None and callable(template))):
         text = f"{words.it} shows {finding.effect}, {finding.equation}"
         text += f", {main.labelled}" if quantities else ""
     else:

@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.joint_dynamics import chain_columns, mass_coefficients
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics, mass_coefficients
 from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples, State
 
@@ -29,13 +29,13 @@ LIMITS = (1.0, 1.5, 2.0)
 
 
 class _Payload:
-    def __init__(self, signs: tuple[int, ...], links: tuple[complex, ...]) -> None:
-        self.signs, self.links = signs, links
+    def __init__(self, dynamics: Dynamics) -> None:
+        self.dynamics, self.links = dynamics, dynamics.links
         self._last: tuple[State, Float64[np.ndarray, "_ _ _"]] | None = None
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         if self._last is None or self._last[0] is not s.state:  # a fit asks for other masses at the same motion
-            self._last = s.state, chain_columns(s.state, self.signs)
+            self._last = s.state, self.dynamics.chain(s.state)
         coefficients = mass_coefficients(theta[0], [*self.links, complex(theta[1], theta[2])])
         return s.but(s.y + self._last[1] @ coefficients)
 
@@ -63,7 +63,7 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
             scale.columns,
             "a point mass at (x, y) of the last link, whose axes are level and up where all angles are zero",
             parameters,
-            _Payload(dynamics.signs, dynamics.links),
+            _Payload(dynamics),
             "the arm moves against gravity, and fast enough for its inertia to show",
             starts=[np.array([0.3, *(arm * np.array(at))]) for at in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))],
         )

@@ -3,25 +3,26 @@
 Inverse dynamics are linear in the inertial parameters (Atkeson, An, Hollerbach, Estimation of inertial parameters of
 manipulator loads and links, IJRR 5, 1986). `chain_columns` holds for hinges with parallel axes, in absolute angles
 phi_i = sum of +-q_j, j <= i, of the links: D_i (kg m²) of a link, H_ij = conj(P_i) A_j (kg m²) between two, A_i (kg m)
-against gravity, with P_i the vector of a link in its own plane as a complex number. `general_columns` holds for other arms:
+against gravity, with P_i the vector of a link in its own plane as a complex number. `general_factors` holds for other arms:
 accelerations, products of velocities and gravity, each times sines and cosines of sums of angles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from imutool.array_types import Complex128, Float64
+from imutool.array_types import Complex128, Float64, Int64
 from imutool.sensor.robot_effects.signal_samples import Column, Columns, State
 
 GRAVITY_M_S2 = 9.81
 MOST_JOINTS = 7
 MOST_COMBINED = 3  # joints up to which all sums of angles are tried
 RIDGE = 1e-9
+SCREENED = 1000  # samples that refute a wrong set of signs
 WELL_DETERMINED = 0.02  # of the efforts' size that a fit may leave
 STEEP = 0.01  # of a velocity's size, within which its sign turns
 
@@ -31,20 +32,32 @@ class Dynamics:
     """Efforts of an arm as a function of its motion (`q0`, `dq0`, `ddq0`, ...).
 
     `signs` are those of the angles of a chain of parallel hinges, empty for any other arm; `left` is the standard deviation
-    of what the fit did not explain, by joint.
+    of what the fit did not explain, by joint; `order` are the joints from base to tip, which a log need not keep.
     """
 
     joints: int
     signs: tuple[int, ...]
     coefficients: Float64[np.ndarray, "_ _"]
     left: tuple[float, ...]
+    order: tuple[int, ...]
 
     def __call__(self, state: State) -> Columns:
         """Efforts of all joints."""
+        n, in_order = self.joints, _in_order(state, self.order)
         if self.signs:
-            columns = np.concatenate([chain_columns(state, self.signs), own_columns(state, self.joints)], axis=2)
-            return np.asarray(columns @ self.coefficients[0])
-        return np.stack([general_columns(state, self.joints, k) @ self.coefficients[k] for k in range(self.joints)], axis=1)
+            columns = np.concatenate([chain_columns(in_order, self.signs), own_columns(in_order, n)], axis=2)
+            efforts = np.asarray(columns @ self.coefficients[0])
+        else:
+            trig, factors = general_factors(in_order, n)
+            weights = self.coefficients[:, :-2].reshape(n * factors.shape[1], trig.shape[1])
+            efforts = ((trig @ weights.T).reshape(len(trig), n, -1) * factors[:, None, :]).sum(axis=2)
+            for k in range(n):
+                efforts[:, k] += np.stack(_rates(in_order, k), axis=1) @ self.coefficients[k, -2:]
+        return np.asarray(efforts[:, np.argsort(self.order)])
+
+    def chain(self, state: State) -> Float64[np.ndarray, "_ _ _"]:
+        """Efforts of a chain for each coefficient, joints in the order of the log."""
+        return chain_columns(_in_order(state, self.order), self.signs)[:, np.argsort(self.order)]
 
     @property
     def links(self) -> tuple[complex, ...]:
@@ -119,17 +132,25 @@ def _own(state: State, k: int) -> Iterator[Column]:
     yield np.ones(len(velocity))
 
 
-def general_columns(state: State, n: int, joint: int) -> Float64[np.ndarray, "_ _"]:
-    """Terms of the effort of one joint of any arm."""
+def _rates(state: State, k: int) -> list[Column]:
+    """Damping and friction of one joint."""
+    return list(_own(state, k))[1:3]
+
+
+def _in_order(state: State, order: Sequence[int]) -> State:
+    """State of the joints from base to tip."""
+    return {f"{kind}{n}": state[f"{kind}{k}"] for n, k in enumerate(order) for kind in ("q", "dq", "ddq", "v")}
+
+
+def general_factors(state: State, n: int) -> tuple[Float64[np.ndarray, "_ t"], Float64[np.ndarray, "_ f"]]:
+    """Sines and cosines of sums of angles, and their factors, for the effort of any arm."""
     rows = [np.ones(len(state["q0"]))]
     for weights in _sums(n):
         angle = np.sum([w * state[f"q{k}"] for k, w in enumerate(weights)], axis=0)
         rows += [np.cos(angle), np.sin(angle)]
-    trig = np.stack(rows, axis=1)
     velocities = [state[f"dq{i}"] * state[f"dq{j}"] for i in range(n) for j in range(i, n)]
-    factors = [np.ones(len(trig)), *(state[f"ddq{k}"] for k in range(n)), *velocities]
-    own = np.stack(list(_own(state, joint))[1:3], axis=1)
-    return np.concatenate([trig * factor[:, None] for factor in factors] + [own], axis=1)
+    factors = [np.ones(len(rows[0])), *(state[f"ddq{k}"] for k in range(n)), *velocities]
+    return np.stack(rows, axis=1), np.stack(factors, axis=1)
 
 
 def _sums(n: int) -> Iterator[tuple[int, ...]]:
@@ -144,29 +165,70 @@ def _sums(n: int) -> Iterator[tuple[int, ...]]:
 
 
 def identified(state: State, efforts: Columns) -> Dynamics | None:
-    """Dynamics of a simulated arm; None where its efforts follow from no motion."""
+    """Dynamics of a simulated arm; None where its efforts follow from no motion.
+
+    The joints are tried in the order of the log, and in that of their efforts: a base carries what a tip does.
+    """
     n, size = efforts.shape[1], np.maximum(efforts.std(axis=0), 1e-12)
     if n > MOST_JOINTS:
         return None
-    best: Dynamics | None = None
+    orders = dict.fromkeys((tuple(range(n)), tuple(np.argsort(-size).tolist())))
+
+    def found(find: Callable[..., Dynamics | None]) -> Iterator[Dynamics]:
+        each = (find(_in_order(state, order), efforts[:, order], size[list(order)], order) for order in orders)
+        yield from (dynamics for dynamics in each if dynamics is not None)
+
+    chains = list(found(_chain))
+    return min(chains, key=lambda chain: max(np.array(chain.left) / size)) if chains else next(found(_general), None)
+
+
+def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
+    """A chain of parallel hinges, in its order."""
+    n, best = len(order), None
+    few = {name: values[:: max(1, len(efforts) // SCREENED)] for name, values in state.items()}
+    sets = [(few, efforts[:: max(1, len(efforts) // SCREENED)]), (state, efforts)]  # most signs fail in a few samples
     for tail in product((1, -1), repeat=n - 1):
-        columns = np.concatenate([chain_columns(state, (1, *tail)), own_columns(state, n)], axis=2)
-        theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (efforts / size).ravel())
-        left = (efforts - columns @ theta).std(axis=0)
-        if (left < WELL_DETERMINED * size).all() and (best is None or (left / size).max() < max(best.left / size)):
-            best = Dynamics(n, (1, *tail), theta[None], tuple(left.tolist()))
-    if best is not None:
-        return best
-    each = [general_columns(state, n, k) for k in range(n)]
-    solved = [_solved(columns, efforts[:, k]) for k, columns in enumerate(each)]
-    left = np.array(
-        [(efforts[:, k] - columns @ theta).std() for k, (columns, theta) in enumerate(zip(each, solved, strict=True))]
-    )
-    return Dynamics(n, (), np.stack(solved), tuple(left.tolist())) if (left < WELL_DETERMINED * size).all() else None
+        for motion, wanted in sets:
+            columns = np.concatenate([chain_columns(motion, (1, *tail)), own_columns(motion, n)], axis=2)
+            theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (wanted / size).ravel()[:, None])[:, 0]
+            left = (wanted - columns @ theta).std(axis=0)
+            if (left > WELL_DETERMINED * size).any():
+                break
+        else:
+            if best is None or (left / size).max() < best[0]:
+                best = (left / size).max(), (1, *tail), theta[None], left
+    return None if best is None else Dynamics(n, best[1], best[2], _by_joint(best[3], order), order)
 
 
-def _solved(A: Float64[np.ndarray, "m p"], b: Float64[np.ndarray, " m"]) -> Float64[np.ndarray, " p"]:
+def _general(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
+    """Any other arm, its joints from base to tip."""
+    n = len(order)
+    trig, factors = general_factors(state, n)
+    common = (factors[:, :, None] * trig[:, None, :]).reshape(len(trig), -1)
+    rates = [column for k in range(n) for column in _rates(state, k)]
+    columns, own = np.concatenate([common, np.stack(rates, axis=1)], axis=1), np.arange(2)
+    kept = [np.concatenate([np.arange(common.shape[1]), common.shape[1] + 2 * k + own]) for k in range(n)]
+    theta = _solved_each(columns, efforts, kept)
+    left = np.array([(efforts[:, k] - columns[:, kept[k]] @ theta[k]).std() for k in range(n)])
+    return Dynamics(n, (), theta, _by_joint(left, order), order) if (left < WELL_DETERMINED * size).all() else None
+
+
+def _by_joint(values: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> tuple[float, ...]:
+    """Values of joints from base to tip, in the order of the log."""
+    return tuple(values[np.argsort(order)].tolist())
+
+
+def _solved(A: Float64[np.ndarray, "m p"], b: Float64[np.ndarray, "m k"]) -> Float64[np.ndarray, "p k"]:
     """Least squares with a small ridge on columns of equal length."""
+    return _solved_each(A, b, [np.arange(A.shape[1])] * b.shape[1]).T
+
+
+def _solved_each(
+    A: Float64[np.ndarray, "m p"], b: Float64[np.ndarray, "m k"], kept: Sequence[Int64[np.ndarray, " q"]]
+) -> Float64[np.ndarray, "k q"]:
+    """Least squares of each right side on some of the columns."""
     length = np.maximum(np.linalg.norm(A, axis=0), 1e-12)
-    A = A / length
-    return np.asarray(np.linalg.solve(A.T @ A + RIDGE * np.eye(A.shape[1]), A.T @ b) / length)
+    gram, sides = A.T @ A / np.outer(length, length), A.T @ b / length[:, None]
+    ridge = RIDGE * np.eye(len(kept[0]))
+    solved = [np.linalg.solve(gram[np.ix_(k, k)] + ridge, side[k]) / length[k] for k, side in zip(kept, sides.T, strict=True)]
+    return np.stack(solved)

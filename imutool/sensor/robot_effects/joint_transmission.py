@@ -8,12 +8,12 @@ Controlling mechanical systems with backlash, Automatica 38, 2002).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.fft import next_fast_len, rfft
 
-from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
@@ -21,7 +21,9 @@ from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, Si
 MOST_TEETH, LEAST_TURNS = 120.0, 3.0  # ripples a turn that are tried, and how many of them the motion has to show
 STARTS = 2
 BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
+MOST_BINS, FINER = 2**19, 7  # some 500 turns; so much closer than they are told apart are ripples tried
 PLAUSIBLE_RAD = 0.05
+GAPS = (0.3, 1.0, 1.5)  # of a joint's play to start from, over twice the deviation of the misfit
 
 
 # ── in the effort ──
@@ -35,11 +37,6 @@ class _Ripple:
         angle = theta[2] * s.state[f"q{self.joint}"]
         return s.with_added(self.joint, theta[0] * np.sin(angle) + theta[1] * np.cos(angle))
 
-    def grid(self, q: Samples) -> Float64[np.ndarray, " _"]:
-        """Ripples a turn, as close as the range of the angle tells them apart."""
-        turn = max(float(np.ptp(q)), 1e-9)
-        return np.arange(max(2.0, LEAST_TURNS * 2.0 * np.pi / turn), MOST_TEETH, 1.0 / turn)
-
     def starts(self, ideal: IdealSignal, real: Any) -> list[Theta]:
         """The strongest ripples of what smooth terms leave."""
         s = ideal.sample(real.stamp_s, real.stamp_s)
@@ -49,14 +46,17 @@ class _Ripple:
         )
         left = real.y[:, self.joint] - s.x[:, self.joint]
         left = left - smooth @ np.linalg.lstsq(smooth, left, rcond=None)[0]
-        grid = self.grid(q)
-        if not len(grid):
+        bins = np.floor((q - q.min()) * BINS_A_RADIAN)
+        near, shift = bins < MOST_BINS, float(q.min()) + 0.5 / BINS_A_RADIAN
+        sums = np.bincount(bins[near].astype(int), left[near])
+        length = next_fast_len(FINER * len(sums), real=True)
+        per_turn = 2.0 * np.pi * BINS_A_RADIAN / length * np.arange(length // 2 + 1)
+        tried = (per_turn >= max(2.0, LEAST_TURNS * 2.0 * np.pi * BINS_A_RADIAN / len(sums))) & (per_turn < MOST_TEETH)
+        if not tried.any():
             return [np.array([0.0, 0.0, 2.0])]
-        bins = np.unique(np.floor(q * BINS_A_RADIAN).astype(int), return_inverse=True)[1]
-        angle, sums = np.bincount(bins, q) / np.bincount(bins), np.bincount(bins, left)
-        waves = np.exp(1j * np.outer(grid, angle)) @ sums * 2.0 / len(q)
-        best = np.argsort(-np.abs(waves))[:STARTS]
-        return [np.array([waves[b].imag, waves[b].real, grid[b]]) for b in best]
+        waves = (np.conj(rfft(sums, length)) * np.exp(1j * per_turn * shift))[tried] * 2.0 / near.sum()
+        best, per_turn = np.argsort(-np.abs(waves))[:STARTS], per_turn[tried]
+        return [np.array([waves[b].imag, waves[b].real, per_turn[b]]) for b in best]
 
 
 # ── in the angle that the encoder reads: the motion itself is another ──
@@ -139,18 +139,24 @@ def play(x: Samples, width: float) -> Samples:
     return out
 
 
+def _gaps(ideal: IdealSignal, real: Any) -> list[Theta]:
+    """Gaps to start from: with play the misfit is half a gap, on either side."""
+    gap = 2.0 * float((real.y[:, 0] - ideal.sample(real.stamp_s, real.stamp_s).x[:, 0]).std())
+    return [np.array([share * gap]) for share in GAPS]
+
+
 def position_effects(scale: Scale) -> Iterator[Effect]:
     """Backlash, compliance and eccentricity of a joint whose position alone is compared."""
     size = scale.size[0]
-    yield scale.effect(
+    backlash = scale.effect(
         "backlash",
         (0,),
         "the position rests until the drive has crossed the gap",
         (Parameter("gap", scale.units[0], size, positive=True, step=0.02),),
         lambda s, theta: s.with_column(0, play(s.y[:, 0], theta[0])),
         "the joint turns both ways",
-        starts=[np.array([share * size]) for share in (0.02, 0.1, 0.4)],
     )
+    yield replace(backlash, linear=False, starts=_gaps)
     waves = (Parameter("sine", scale.units[0], PLAUSIBLE_RAD), Parameter("cosine", scale.units[0], PLAUSIBLE_RAD))
     yield scale.effect(
         "eccentricity",

@@ -61,3 +61,16 @@ class Scale:
 def moved(values: Any) -> float:
     """Standard deviation of a state, or a tiny number for a constant one."""
     return max(float(np.std(values)), 1e-12)
+
+
+def delay_of_all(scale: Scale, name: str) -> Effect:
+    """A delay of all columns together."""
+    step = 0.005 * min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))
+    starts = [np.zeros(1)] if abs(scale.lag_s) < 1e-9 else [np.zeros(1), np.array([scale.lag_s])]
+    text, needs = "y(t) = x(t - delay)", "it moves"
+    number = (Parameter("delay", "s", max(0.2, abs(scale.lag_s)), step=step),)
+    return scale.effect(name, scale.columns, text, number, _late, needs, stage=Stage.CLOCK, starts=starts)
+
+
+def _late(taken_s: np.ndarray, theta: Theta) -> np.ndarray:
+    return np.asarray(taken_s - theta[0])

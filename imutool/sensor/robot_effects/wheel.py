@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.robot_effects.scale import Scale, delay_of_all
 from imutool.sensor.robot_effects.signal_samples import Columns, IdealSignal, SignalSamples, State
 
 FORWARD, TURN = 0, 1
@@ -43,7 +43,7 @@ def _slip(s: SignalSamples, theta: Theta) -> SignalSamples:
 
 
 def effects(scale: Scale) -> Iterator[Effect]:
-    """Radius of each wheel, track and slip."""
+    """Radius of each wheel, track, slip, and the time by which the speeds come after the wheels."""
     wheels = [name for name in scale.state if name.startswith("w")]
     yield scale.effect(
         "wheel_radius",
@@ -72,3 +72,4 @@ def effects(scale: Scale) -> Iterator[Effect]:
         _slip,
         "the vehicle speeds up and brakes while it moves",
     )
+    yield delay_of_all(scale, "delay")

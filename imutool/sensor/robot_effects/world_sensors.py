@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.scale import Scale
+from imutool.sensor.effect import Effect, Parameter, Theta
+from imutool.sensor.robot_effects.scale import Scale, delay_of_all
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
 from imutool.units import AXES
 
@@ -83,7 +83,7 @@ def magnetometer_effects(scale: Scale) -> Iterator[Effect]:
             "it rolls or pitches as well as it turns",
             starts=[np.zeros(1)],
         )
-    yield _delay(scale, "delay")
+    yield delay_of_all(scale, "delay")
 
 
 @dataclass(frozen=True)
@@ -122,17 +122,4 @@ def gnss_effects(scale: Scale) -> Iterator[Effect]:
     if "R00" in scale.state:
         numbers = tuple(Parameter(axis, "m", 1.0) for axis in AXES)
         yield scale.effect("gnss_lever_arm", scale.columns, "position += R_wb r", numbers, _arm, "it turns")
-    yield _delay(scale, "latency")
-
-
-def _delay(scale: Scale, name: str) -> Effect:
-    """A delay of all columns together."""
-    step = 0.005 * min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))
-    starts = [np.zeros(1)] if abs(scale.lag_s) < 1e-9 else [np.zeros(1), np.array([scale.lag_s])]
-    text, needs = "y(t) = x(t - delay)", "it moves"
-    number = (Parameter("delay", "s", max(0.2, abs(scale.lag_s)), step=step),)
-    return scale.effect(name, scale.columns, text, number, _late, needs, stage=Stage.CLOCK, starts=starts)
-
-
-def _late(taken_s: np.ndarray, theta: Theta) -> np.ndarray:
-    return np.asarray(taken_s - theta[0])
+    yield delay_of_all(scale, "latency")

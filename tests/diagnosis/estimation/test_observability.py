@@ -14,7 +14,7 @@ from imutool.diagnosis.estimation.observability import (
     below_model_error,
     beyond_the_band,
     unobservable,
-    with_steady_clock,
+    with_plainer_effects,
 )
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
@@ -135,7 +135,7 @@ def test_a_clock_that_jumps_right_after_the_start_has_an_offset(truth: dict[str,
     logs = [planted.weighed(planted.pair(planted.rich(), truth))]
     jump, *others = catalogue.diagnosed(["clock_jump", "clock_offset", "clock_skew"])
     found = fit(logs, ((jump, np.array([1.0 if named == "clock_offset" else 6.0, 0.01])),))
-    simpler = with_steady_clock(logs, found, (jump, *others), {})
+    simpler = with_plainer_effects(logs, found, (jump, *others))
     assert simpler.keys == (named,)
     assert simpler.chosen[0][1][-1] == pytest.approx(0.01, abs=1e-4)
 
@@ -145,6 +145,34 @@ def test_a_clock_that_runs_fast_is_no_jump_in_the_middle_of_the_log() -> None:
     middle_s = 0.5 * float(logs[0].pair.stamp_s[-1])
     jump, *others = catalogue.diagnosed(["clock_jump", "clock_offset", "clock_skew"])
     found = fit(logs, ((jump, np.array([middle_s, 2e-4 * middle_s])),))
-    simpler = with_steady_clock(logs, found, (jump, *others), {})
+    simpler = with_plainer_effects(logs, found, (jump, *others))
     assert simpler.keys == ("clock_skew",)
     assert simpler.chosen[0][1][0] == pytest.approx(2e-4, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("truth", "begun", "named"),
+    [
+        ({"gravity": [-0.02, 0.0, 0.0]}, ("accel_scale", [-2e-3] * 3), "gravity"),
+        ({"accel_scale": [-2e-3, 2e-3, -2e-3]}, ("accel_scale", [-2e-3, 2e-3, -2e-3]), "accel_scale"),
+        ({"accel_scale": [0.02, 0.02, 0.02]}, ("accel_scale", [0.02] * 3), "accel_scale"),  # of no place on Earth
+    ],
+)
+def test_three_equal_scales_are_gravity_within_what_the_earth_has(
+    truth: dict[str, list[float]], begun: tuple[str, list[float]], named: str
+) -> None:
+    logs = [planted.weighed(planted.pair(planted.rich(), truth))]
+    effects = catalogue.diagnosed(["accel_scale", "gravity"])
+    found = fit(logs, ((effects[0], np.array(begun[1])),))
+    assert with_plainer_effects(logs, found, effects).keys == (named,)
+
+
+def test_a_drift_that_follows_the_logs_temperature_has_that_name() -> None:
+    felt = planted.rich()
+    warm = {"temperature": 20.0 + 15.0 * (1.0 - np.exp(-felt.t_s / 5.0))}
+    truth = {"gyro_bias_drift": [0.02, -0.01, 0.015, 5.0]}
+    drift, temperature = catalogue.diagnosed(["gyro_bias_drift", "temperature"])
+    for channels, named in ((warm, "temperature"), ({"temperature": 25.0 + np.sin(felt.t_s)}, "gyro_bias_drift")):
+        logs = [planted.weighed(planted.pair(replace(felt, channels=channels), truth))]
+        found = fit(logs, ((drift, np.array(truth["gyro_bias_drift"])),))
+        assert with_plainer_effects(logs, found, (drift, temperature)).keys == (named,)

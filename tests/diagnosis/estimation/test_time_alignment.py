@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import periodogram
+from scipy.spatial.transform import Rotation
 from support import planted
 
 from imutool.diagnosis.estimation.aligned_log import Pair, split
@@ -125,6 +127,30 @@ def test_poses_that_disagree_with_the_simulations_samples_do_not_stand_in_for_th
     other = planted.poses(planted.moving(9), planted.clock(24.0, 200.0))
     (pair,) = with_simulation(real, replace(sim, truths={"/ground_truth/pose": other}))
     assert (left(pair).std(axis=0) < 1.15 * planted.NOISE).all()
+
+
+def test_poses_that_stand_in_have_the_simulators_own_gravity() -> None:
+    """9.79 m/s²: with another, every scale of an accelerometer would be three thousandths off."""
+    real, sim = logs(with_poses=True)
+    poses, _ = sim.truth.at(sim.imu.t_ns)
+    up = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+    (pair,) = with_simulation(real, replace(sim, imu=replace(sim.imu, accel=sim.imu.accel - 0.02 * up)))
+    assert not pair.sim_noise.any()  # the poses
+    (before,) = with_simulation(real, sim)
+    inner, R_wb = slice(50, -50), pair.ideal.R_wb
+    assert R_wb is not None
+    less = np.einsum("nij,nj->ni", R_wb, pair.ideal.accel - before.ideal.accel)[inner]
+    np.testing.assert_allclose(less, np.broadcast_to([0.0, 0.0, -0.02], less.shape), atol=1e-4)  # the same noise in both
+
+
+def test_poses_do_not_stand_in_for_samples_with_a_vibration_that_poses_do_not_show() -> None:
+    """The noise that a calm second difference finds has this line in it."""
+    real, sim = logs(with_poses=True)
+    line = np.outer(np.sin(2.0 * np.pi * 70.0 * planted.clock(24.0, 200.0)), [0.02, 0.01, 0.0])
+    (pair,) = with_simulation(real, replace(sim, imu=replace(sim.imu, gyro=sim.imu.gyro + line)))
+    f_hz, power = periodogram(pair.ideal.gyro, pair.ideal.rate_hz, "hann", axis=0)
+    close = np.abs(f_hz - 70.0) < 0.2
+    np.testing.assert_allclose(2.0 * power[close].sum(axis=0) * f_hz[1], [0.02**2, 0.01**2, 0.0], rtol=0.05, atol=1e-6)
 
 
 def test_clocks_of_one_epoch_are_left_alone_so_that_an_offset_between_them_shows() -> None:

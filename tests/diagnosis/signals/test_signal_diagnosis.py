@@ -300,3 +300,19 @@ def test_gaps_of_either_are_left_out() -> None:
     d = compared(Fields(real.t_ns[keep], real.values[keep]), Fields(sim.t_ns[there], sim.values[there]), others)
     assert names(d) == {"gain"}
     within(d, "gain", {"gain": 1.05})
+
+
+def test_a_hard_iron_is_what_is_added_behind_the_soft_iron() -> None:
+    """m = S m_0 + h, as magnetometers are calibrated, and not S (m_0 + h)."""
+    rng, field, hard = np.random.default_rng(5), 5e-5, np.array([6e-6, -4e-6, 3e-6])
+    t, t_sim = 3.0 + np.arange(4000) / 80.0, np.arange(6000) / 100.0
+    soft = np.array([[1.1, 0.03, -0.02], [0.03, 0.92, 0.04], [-0.02, 0.04, 1.05]])
+    real, sim = (field * np.stack([Motion(seed)(at) for seed in (1, 2, 3)], axis=1) for at in (t, t_sim))
+    real = real @ soft + hard + 1e-7 * rng.normal(size=real.shape)
+    stamps = [fields(at, at).t_ns for at in (t, t_sim)]
+    names = tuple(f"/mag.magnetic_field.{axis}" for axis in "xyz")
+    d = diagnose_signal(SignalPair("/mag", names, ("T",) * 3, stamps[0], real, stamps[1], sim, "magnetic"), {})
+    assert {finding.effect for finding in d.findings} == {"soft_iron", "hard_iron"}
+    (found,) = (finding for finding in d.findings if finding.effect == "hard_iron")
+    for planted, estimate in zip(hard, found.parameters.values(), strict=True):
+        assert abs(estimate.value - planted) < SURE * estimate.std < 0.01 * abs(planted)

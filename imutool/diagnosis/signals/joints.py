@@ -1,0 +1,166 @@
+"""Joints of two logs by their names: efforts with motion, wheels with their vehicle."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
+from imutool.diagnosis.signals.quantities import unwrapped
+from imutool.mcap_io.fields import Fields
+from imutool.mcap_io.log import Log
+from imutool.recording import seconds
+
+JOINTS = "sensor_msgs/msg/JointState"
+JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+SPEEDS = ("twist.twist.linear.x", "twist.twist.angular.z")
+LEAST_MOVED = 1e-3  # rad or m: a joint that moves less shows nothing of its dynamics
+LEAST_EFFORTS = 0.5  # of the joints, that have efforts where efforts are compared
+DRIVES = 0.05  # of a vehicle's speed or turning, that a wheel makes
+
+
+def joint_names(log: Log, topic: str) -> list[list[str]]:
+    """Names of the joints in a topic's messages: one list, or those of several publishers."""
+    found = dict[tuple[str, ...], None]()
+    for _, rows in log.rows([topic]):
+        names, end = _names(rows.payload[0].tobytes())
+        found[tuple(names)] = None
+        differ = (rows.payload[:, 12:end] != rows.payload[0, 12:end]).any(axis=1)
+        for row in rows.payload[differ]:
+            found[tuple(_names(row.tobytes())[0])] = None
+    return [list(names) for names in found]
+
+
+def _names(payload: bytes) -> tuple[list[str], int]:
+    """Names in a message, and where they end."""
+    order, at = "<" if payload[1] else ">", 12
+    texts, count = list[str](), 1  # the frame of the header, and then the names
+    try:
+        while len(texts) < count:
+            (size,) = struct.unpack_from(f"{order}I", payload, at)
+            texts.append(payload[at + 4 : at + 4 + max(size - 1, 0)].decode(errors="replace"))
+            at += 4 + size + (-size) % 4
+            if len(texts) == 1:
+                (names,) = struct.unpack_from(f"{order}I", payload, at)
+                count, at = 1 + names, at + 4
+    except struct.error:
+        return [], 12
+    return texts[1:], at
+
+
+def by_joint(fields: Mapping[str, Fields], wanted: Sequence[str], given: Sequence[str]) -> dict[str, Fields]:
+    """Fields under the indices that another log gives the same joints.
+
+    Where no name is in both logs, the order decides.
+    """
+    index = {f"[{given.index(name)}]": f"[{k}]" for k, name in enumerate(wanted) if name in given}
+    if not index:
+        return dict(fields)
+    split = {path: path.partition("[") for path in fields}
+    return {f"{word}{index[f'[{rest}']}": fields[path] for path, (word, _, rest) in split.items() if f"[{rest}" in index}
+
+
+def joint_remarks(topic: str, mine: Sequence[str], other: Sequence[str]) -> list[str]:
+    """Names of the indices that findings have, and joints of one log alone."""
+    if not mine:
+        return []
+    out = [f"Joints of {topic}: {', '.join(f'[{k}] {name}' for k, name in enumerate(mine))}"]
+    alone = [name for name in mine if name not in other], [name for name in other if name not in mine]
+    if other and len(alone[0]) == len(mine):
+        return [*out, f"No joint of {topic} has a name of the simulation's: joints were compared by their order"]
+    for names, log in zip(alone, ("recording", "simulation"), strict=True):
+        out += [f"Only the {log} has the joints {', '.join(names)}: they were not compared"] if names and other else []
+    return out
+
+
+def joint_pairs(
+    topic: str, mine: Mapping[str, Fields], other: Mapping[str, Fields], wheels: Collection[str]
+) -> Iterator[SignalPair]:
+    """Efforts with the motion of the joints where both logs have both, else each number alone.
+
+    `wheels` are indices of joints that are compared with the vehicle.
+    """
+    both = [path for path in other if path in mine and not path.endswith(tuple(wheels))]  # in the order of the model
+    joints = [path.removeprefix("position") for path in both if path.startswith("position")]
+    driven = [k for k in joints if f"effort{k}" in both]
+    moving = [k for k in driven if min(np.ptp(side[f"position{k}"].values) for side in (mine, other)) > LEAST_MOVED]
+    if moving and len(driven) >= LEAST_EFFORTS * len(joints):
+        yield _efforts(topic, moving, mine, other)
+        return
+    for path in both:
+        kind = "positions" if path.startswith("position") else "number"
+        effort = mine.get(path.replace("position", "effort"))
+        state = {"effort": effort} if kind == "positions" and effort is not None else {}
+        pair = SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}")
+        yield unwrapped(replace(pair, kind=kind, state=state, units=(JOINT_UNITS[path.partition("[")[0]],)))
+
+
+def _efforts(topic: str, moving: Sequence[str], mine: Mapping[str, Fields], other: Mapping[str, Fields]) -> SignalPair:
+    """Efforts of the joints that move, with the motion of all of them, at the stamps that all fields have."""
+    states, sides = list[dict[str, Fields]](), list[dict[str, Fields]]()
+    for side in (mine, other):
+        paths = [f"{word}{k}" for k in moving for word in JOINT_UNITS if f"{word}{k}" in side]
+        t_ns, values = stacked([side[path] for path in paths])
+        known = {path: Fields(t_ns, column) for path, column in zip(paths, values.T, strict=True)}
+        sides.append(known)
+        words = (("q", "position"), ("dq", "velocity"))
+        named = {f"{short}{n}": f"{word}{k}" for n, k in enumerate(moving) for short, word in words}
+        states.append({name: known[path] for name, path in named.items() if path in known})
+    efforts = tuple(f"effort{k}" for k in moving)
+    return SignalPair.of_columns(topic, efforts, "efforts", (JOINT_UNITS["effort"],) * len(efforts), *sides, *states)
+
+
+def wheel_pair(
+    topic: str,
+    mine: Mapping[str, Fields],
+    other: Mapping[str, Fields],
+    joints: tuple[Mapping[str, Fields], Mapping[str, Fields]],
+) -> tuple[SignalPair, list[str]] | None:
+    """Speeds of a vehicle with those of the joints that drive it, and their indices.
+
+    None where a log lacks one or the other, or where fewer than two joints drive.
+    """
+    if not all(path in side for path in SPEEDS for side in (mine, other)):
+        return None
+    speeds = [_speeds(side) for side in joints]
+    shared = [k for k in speeds[0] if k in speeds[1]]
+    t_ns, moved = stacked([other[path] for path in SPEEDS])
+    shared = [k for k, drives in zip(shared, _driving([speeds[1][k] for k in shared], t_ns, moved), strict=True) if drives]
+    if len(shared) < 2:
+        return None
+    states = [{f"w{n}": values for n, values in enumerate(_together([side[k] for k in shared]))} for side in speeds]
+    return SignalPair.of_columns(topic, SPEEDS, "wheels", ("m/s", "rad/s"), mine, other, *states), shared
+
+
+def _together(columns: Sequence[Fields]) -> list[Fields]:
+    t_ns, values = stacked(columns)
+    return [Fields(t_ns, column) for column in values.T]
+
+
+def _speeds(side: Mapping[str, Fields]) -> dict[str, Fields]:
+    """Speeds of joints by index: as logged, else the slope of their angles."""
+    out = dict[str, Fields]()
+    for path, values in side.items():
+        word, _, rest = path.partition("[")
+        if word == "velocity":
+            out[f"[{rest}"] = values
+        elif word == "position" and f"velocity[{rest}" not in side and len(values) > 2:
+            t_s = seconds(values.t_ns, int(values.t_ns[0]))
+            out[f"[{rest}"] = Fields(values.t_ns, np.gradient(np.unwrap(values.values), t_s))
+    return out
+
+
+def _driving(speeds: Sequence[Fields], t_ns: np.ndarray, moved: Float64[np.ndarray, "n k"]) -> list[bool]:
+    """Whether each joint makes a good part of a vehicle's motion, in the simulation."""
+    if not speeds:
+        return []
+    start_ns = int(t_ns[0])
+    at = np.stack([np.interp(seconds(t_ns, start_ns), seconds(own.t_ns, start_ns), own.values) for own in speeds], axis=1)
+    weights = np.linalg.lstsq(at, moved, rcond=None)[0]
+    return [
+        bool(np.any(np.abs(w) * column.std() > DRIVES * moved.std(axis=0))) for w, column in zip(weights, at.T, strict=True)
+    ]

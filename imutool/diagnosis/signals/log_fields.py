@@ -1,0 +1,91 @@
+"""Varying numbers of two logs, read for comparison: topics that correspond, names of joints."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imutool.diagnosis.signals.joints import JOINTS, joint_names
+from imutool.location import Location
+from imutool.mcap_io.codec.schemas import IMU, POSE, TF, TWIST
+from imutool.mcap_io.fields import Fields, others
+from imutool.mcap_io.log import Log
+from imutool.recording.columns import longest_run
+
+MOST_READ = 400  # fields of a log to compare, and as many that may drive them
+ELSEWHERE = frozenset(
+    {IMU, POSE, TF, TWIST, "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"}
+)
+
+
+@dataclass(frozen=True)
+class LogFields:
+    """One log: schemas by topic, varying fields by topic and path, and names of joints.
+
+    `mixed` are topics of joints on which messages name now these joints, now those: an index there is no one joint.
+    """
+
+    schemas: Mapping[str, str]
+    fields: Mapping[str, Mapping[str, Fields]]
+    joints: Mapping[str, list[str]]
+    mixed: Sequence[str]
+
+    @classmethod
+    def of(cls, path: Location, schemas: Mapping[str, str], compared: Collection[str]) -> LogFields:
+        """Fields of a log, those of the topics that are `compared` first.
+
+        Raises:
+            ConfigError, LogError: the log cannot be opened, or is damaged.
+        """
+        with Log(path) as log:
+            named = {name: joint_names(log, name) for name, schema in schemas.items() if schema == JOINTS}
+        mixed = {name for name, lists in named.items() if len(lists) > 1}
+        joints = {name: lists[0] if len(lists) == 1 else [] for name, lists in named.items()}
+        found: dict[str, dict[str, Fields]] = {}
+        for skipped in (set(schemas) - set(compared), set(compared)):
+            for name, values in others(path, "", MOST_READ, skip=skipped | mixed, gaps=True).items():
+                topic = max((topic for topic in schemas if name.startswith(f"{topic}.")), key=len)
+                found.setdefault(topic, {})[name[len(topic) + 1 :]] = on_one_clock(values)
+        return cls(schemas, {name: found[name] for name in schemas if name in found}, joints, sorted(mixed))
+
+
+def read_both(real: Location, sim: Location) -> tuple[LogFields, LogFields, dict[str, str]]:
+    """Fields of both logs, and the simulation's topic for each topic of the recording.
+
+    Raises:
+        ConfigError, LogError: a log cannot be opened, or is damaged.
+    """
+    schemas = []
+    for path in (real, sim):
+        with Log(path) as log:
+            schemas.append({name: topic.schema_name for name, topic in log.topics.items()})
+    topics = dict(_corresponding(*schemas))
+    own, other = LogFields.of(real, schemas[0], topics), LogFields.of(sim, schemas[1], set(topics.values()))
+    return own, other, {topic: theirs for topic, theirs in topics.items() if topic in own.fields and theirs in other.fields}
+
+
+def _corresponding(real: Mapping[str, str], sim: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Topics of one message: of one name, in another namespace, or the only ones in both logs."""
+    for topic, schema in real.items():
+        if schema in ELSEWHERE:
+            continue
+        if sim.get(topic) == schema:
+            yield topic, topic
+            continue
+        theirs = [name for name, other in sim.items() if other == schema and real.get(name) != schema]
+        mine = [name for name, other in real.items() if other == schema and sim.get(name) != schema]
+        moved = [name for name in theirs if name.endswith(topic) or topic.endswith(name)]
+        if len(moved) == 1:
+            yield topic, moved[0]
+        elif len(theirs) == len(mine) == 1 and not schema.startswith("std_msgs/"):
+            yield topic, theirs[0]
+
+
+def on_one_clock(values: Fields) -> Fields:
+    """Longest stretch without a jump of the clock, of stamps that increase."""
+    run = longest_run(values.t_ns)
+    t_ns, numbers = values.t_ns[run], values.values[run]
+    late = np.append(True, t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]) if len(t_ns) else np.zeros(0, bool)
+    return replace(values, t_ns=t_ns[late], values=numbers[late])

@@ -1,0 +1,187 @@
+"""What a recording and its simulation share, as robots log it: joints by name, gaps, units, other namespaces."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from support.robot_cases.log import write
+
+from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.lag import lag_at_first_sight
+from imutool.diagnosis.signals.pairing import Pairing, paired
+from imutool.diagnosis.signals.quantities import in_one_unit
+from imutool.errors import DataError
+from imutool.mcap_io.fields import Fields
+
+JOINTS, NUMBER, ODOMETRY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64", "nav_msgs/msg/Odometry"
+T = np.arange(2000) / 100.0
+EXACT = 1e-12
+
+
+def wave(seed: int, t: np.ndarray = T) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.asarray(np.sin(np.outer(t, rng.uniform(0.5, 4.0, 6)) + rng.uniform(0.0, 6.0, 6)).sum(axis=1))
+
+
+def joints(*positions: np.ndarray, effort: Sequence[np.ndarray] = ()) -> np.ndarray:
+    """Rows of positions, velocities and efforts."""
+    speeds = [np.gradient(q, T) for q in positions]
+    return np.stack([*positions, *speeds, *(effort or np.zeros((len(positions), len(T))))], axis=1)
+
+
+def logged(
+    folder: Path, real: dict[str, object], sim: dict[str, object], names: Sequence[str], others: Sequence[str]
+) -> Pairing:
+    write(folder / "real.mcap", real, names)  # type: ignore[arg-type]  # topics as `write` takes them
+    write(folder / "sim.mcap", sim, others)  # type: ignore[arg-type]  # as above
+    return paired(folder / "real.mcap", folder / "sim.mcap")
+
+
+def test_a_joint_of_one_log_alone_is_left_out_and_the_others_are_paired_by_name(tmp_path: Path) -> None:
+    """A gripper that the simulation lacks moves no other joint to its place."""
+    hip, knee = wave(1), wave(2)
+    real = {"/joint_states": (JOINTS, T, joints(wave(3), hip, knee))}
+    sim = {"/joint_states": (JOINTS, T, joints(1.1 * knee, 1.1 * hip))}
+    pairing = logged(tmp_path, real, sim, ("finger", "hip", "knee"), ("knee", "hip"))
+    positions = {pair.name: pair.sim[:, 0] for pair in pairing.pairs if "position" in pair.name}
+    assert set(positions) == {"/joint_states.position[1]", "/joint_states.position[2]"}
+    assert np.allclose(positions["/joint_states.position[1]"], 1.1 * hip, atol=EXACT)
+    assert np.allclose(positions["/joint_states.position[2]"], 1.1 * knee, atol=EXACT)
+    assert "Joints of /joint_states: [0] finger, [1] hip, [2] knee" in pairing.remarks
+    assert any("Only the recording has the joints finger" in remark for remark in pairing.remarks)
+
+
+@pytest.mark.parametrize("effort", [0.0, np.nan])
+def test_a_gripper_without_effort_leaves_the_arm_its_efforts(effort: float, tmp_path: Path) -> None:
+    hip, finger = wave(1), 0.04 + 0.01 * np.sign(wave(2))
+    rows = joints(hip, finger, effort=(wave(3), np.full(len(T), effort)))
+    sim = joints(wave(5), finger, effort=(wave(4), np.zeros(len(T))))
+    topic = "/joint_states"
+    pairing = logged(tmp_path, {topic: (JOINTS, T, rows)}, {topic: (JOINTS, T, sim)}, ("hip", "finger"), ("hip", "finger"))
+    (efforts,) = (pair for pair in pairing.pairs if pair.kind == "efforts")
+    assert efforts.names == ("/joint_states.effort[0]",)
+    assert set(efforts.state) == {"q0", "dq0"}
+
+
+def test_wheels_are_paired_by_name_and_a_caster_is_no_wheel(tmp_path: Path) -> None:
+    left, right = 5.0 + wave(1), 5.0 + wave(2)
+    still = np.zeros((len(T), 13))
+
+    def odometry(forward: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        rows = still.copy()
+        rows[:, 6], rows[:, 7], rows[:, 12] = 1.0, forward, turn
+        return rows
+
+    def rows(*speeds: np.ndarray) -> np.ndarray:
+        turned = [np.cumsum(speed) * 0.01 for speed in speeds]
+        return np.stack([*turned, *speeds, *np.zeros((len(speeds), len(T)))], axis=1)
+
+    moved = odometry(0.05 * (left + right), 0.2 * (right - left))
+    real = {"/odom": (ODOMETRY, T, moved), "/joint_states": (JOINTS, T, rows(wave(4), left, right))}
+    simulated = odometry(0.05 * (left + right) + 1e-6 * wave(6), 0.2 * (right - left))
+    sim = {"/odom": (ODOMETRY, T, simulated), "/joint_states": (JOINTS, T, rows(1.001 * right, 1.001 * left, wave(5)))}
+    pairing = logged(tmp_path, real, sim, ("caster", "left", "right"), ("right", "left", "caster"))
+    (wheels,) = (pair for pair in pairing.pairs if pair.kind == "wheels")
+    assert set(wheels.state) == {"w0", "w1"}
+    assert np.allclose(wheels.state["w0"].values, left)
+    assert np.allclose(wheels.sim_state["w0"].values, 1.001 * left)
+
+
+def test_readings_without_a_number_are_gaps(tmp_path: Path) -> None:
+    """A range beyond its maximum is infinite: the rest is compared."""
+    distance = 3.0 + wave(1)
+    beyond = np.where(distance > 5.0, np.inf, distance)[:, None]
+    kind = "sensor_msgs/msg/Range"
+    real, sim = {"/sonar": (kind, T, beyond)}, {"/sonar": (kind, T, 1.01 * distance[:, None])}
+    pairing = logged(tmp_path, real, sim, (), ())
+    (pair,) = pairing.pairs
+    assert len(pair.real) == int((distance <= 5.0).sum())
+    assert any(f"{int((distance > 5.0).sum())} of /sonar.range" in remark for remark in pairing.remarks)
+
+
+def test_topics_in_another_namespace_are_paired_and_a_dead_field_is_told(tmp_path: Path) -> None:
+    a, b = wave(1)[:, None], wave(2)[:, None]
+    real = {"/left/speed": (NUMBER, T, a), "/right/speed": (NUMBER, T, b), "/load": (NUMBER, T, np.ones((len(T), 1)))}
+    sim = {"/robot/left/speed": (NUMBER, T, 1.1 * a), "/robot/right/speed": (NUMBER, T, 1.1 * b), "/load": (NUMBER, T, a)}
+    real["/load"] = (NUMBER, T, np.ones((len(T), 1)))
+    pairing = logged(tmp_path, real, sim, (), ())
+    assert {pair.name for pair in pairing.pairs} == {"/left/speed.data", "/right/speed.data"}
+
+
+def test_joints_of_two_publishers_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
+    """An index is now the finger, now the hip."""
+    write(tmp_path / "both.mcap", {"/joint_states": (JOINTS, T, joints(wave(1)))}, ("hip",))
+    write(tmp_path / "finger.mcap", {"/joint_states": (JOINTS, T + 0.003, joints(wave(2)))}, ("finger",))
+    merged = tmp_path / "real.mcap"
+    with merged.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "two publishers")
+        channel = None
+        for name in ("both.mcap", "finger.mcap"):
+            for schema, _, message in make_reader(io.BytesIO((tmp_path / name).read_bytes())).iter_messages():
+                assert schema is not None
+                if channel is None:
+                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channel = writer.register_channel("/joint_states", "cdr", known)
+                writer.add_message(channel, message.log_time, message.data, message.publish_time)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap has no annotation for it
+    write(tmp_path / "sim.mcap", {"/joint_states": (JOINTS, T, joints(wave(1)))}, ("hip",))
+    pairing = paired(merged, tmp_path / "sim.mcap")
+    assert not pairing.pairs
+    assert pairing.remarks == ("Not compared, for its messages name now these joints and now those: /joint_states",)
+
+
+def fields_of_other_topics(count: int) -> dict[str, object]:
+    return {f"/aaa{k:03d}": (NUMBER, T[::100], wave(k)[::100, None]) for k in range(count)}
+
+
+def test_hundreds_of_other_topics_hide_no_signal(tmp_path: Path) -> None:
+    real = {**fields_of_other_topics(420), "/speed": (NUMBER, T, wave(1)[:, None])}
+    pairing = logged(tmp_path, real, {"/speed": (NUMBER, T, 1.1 * wave(1)[:, None])}, (), ())
+    assert [pair.name for pair in pairing.pairs] == ["/speed.data"]
+
+
+UNITS = (
+    ("magnetic", 5e-5, 1.0, 1e4, 1.0),
+    ("magnetic", 5e-5, 1e6, 1.0, 1e-6),
+    ("pressure", 1e5, 1.0, 0.01, 1.0),
+    ("number", 2.0, 1000.0, 1.0, 1e-3),
+    ("number", 2.0, 1.0, 1000.0, 1000.0),
+)
+
+
+@pytest.mark.parametrize(("kind", "size", "real", "sim", "by"), UNITS)
+def test_units_of_either_log_are_brought_to_the_message_or_to_the_simulation(
+    kind: str, size: float, real: float, sim: float, by: float
+) -> None:
+    """Also beside a gain of 1.15, as no sensor's own gain is a thousand."""
+    values = (size + 0.1 * size * wave(1))[:, None]
+    t_ns = (T * 1e9).astype(np.int64)
+    given = SignalPair.of_fields(Fields(t_ns, 1.15 * real * values[:, 0]), Fields(t_ns, sim * values[:, 0]), "/x.y")
+    pair, remark = in_one_unit(SignalPair(**{**vars(given), "kind": kind}))
+    assert np.allclose(pair.real, 1.15 * real * by * values, rtol=EXACT)
+    assert np.allclose(pair.real, 1.15 * pair.sim, rtol=EXACT)
+    assert "as in another unit" in remark
+
+
+def test_a_gain_is_no_unit() -> None:
+    t_ns = (T * 1e9).astype(np.int64)
+    given = SignalPair.of_fields(Fields(t_ns, 1.5 * wave(1)), Fields(t_ns, wave(1)), "/x.y")
+    assert in_one_unit(given) == (given, "")
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_two_motions_are_not_taken_for_one(seed: int) -> None:
+    """Slow signals correlate by chance, the more so at any lag."""
+    rng = np.random.default_rng(seed)
+    f, p = rng.uniform(0.03, 0.4, (2, 5)), rng.uniform(0.0, 6.0, (2, 5))
+    real, sim = (np.sin(2.0 * np.pi * np.outer(T * 3.0, f[k]) + p[k]).sum(axis=1)[:, None] for k in (0, 1))
+    with pytest.raises(DataError, match="not alike"):
+        lag_at_first_sight(T * 3.0, real, T * 3.0, sim, ("/x.y",), DiagnoseSettings())

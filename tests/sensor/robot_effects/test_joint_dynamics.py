@@ -1,0 +1,64 @@
+"""Dynamics of an arm that are learnt from its motion, whatever the order of its joints in a log."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics, chain_columns, identified, mass_coefficients
+
+SIGNS = (1, 1, -1)
+CLOSE = 1e-4  # of the efforts: the ridge of the fit
+T = np.arange(3000) / 100.0
+
+
+def motion(seed: int, joints: int = 3) -> dict[str, np.ndarray]:
+    """Angles, speeds and accelerations of sums of cosines."""
+    rng, out = np.random.default_rng(seed), {}
+    for k in range(joints):
+        w, p = rng.uniform(0.5, 4.0, 6), rng.uniform(0.0, 6.0, 6)
+        phase = np.outer(T, w) + p
+        out[f"q{k}"] = 0.6 * np.sin(phase).sum(axis=1)
+        out[f"dq{k}"] = out[f"v{k}"] = 0.6 * (w * np.cos(phase)).sum(axis=1)
+        out[f"ddq{k}"] = -0.6 * (w**2 * np.sin(phase)).sum(axis=1)
+    return out
+
+
+def logged(state: dict[str, np.ndarray], order: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """The state with joint `order[n]` of the arm at place n of the log."""
+    return {f"{kind}{n}": state[f"{kind}{k}"] for n, k in enumerate(order) for kind in ("q", "dq", "ddq", "v")}
+
+
+def efforts(state: dict[str, np.ndarray]) -> np.ndarray:
+    """Three links of 0.4, 0.3 and 0.2 m with a mass at the end of each."""
+    links = (0.4 + 0j, 0.3 + 0j, 0.2 + 0j)
+    each = [np.array(mass_coefficients(mass, [*links[: k + 1], *[0j] * (2 - k)])) for k, mass in enumerate((3.0, 2.0, 1.0))]
+    return np.asarray(chain_columns(state, SIGNS) @ np.sum(each, axis=0))
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_a_chain_is_found_in_any_order_of_its_joints(order: tuple[int, ...]) -> None:
+    """Logs sort joints by the alphabet; the base carries the largest effort."""
+    own, other = motion(1), motion(2)
+    found = identified(logged(own, order), efforts(own)[:, order])
+    assert found is not None
+    assert found.signs == SIGNS
+    assert np.abs(np.abs(found.links) - (0.4, 0.3)).max() < CLOSE
+    wanted = efforts(other)[:, order]
+    assert np.abs(found(logged(other, order)) - wanted).max() < CLOSE * np.abs(wanted).max()
+
+
+def test_any_other_arm_is_the_sum_of_its_factors() -> None:
+    """Two hinges across each other: a centrifugal term and a pendulum."""
+    own, other = motion(3, 2), motion(4, 2)
+
+    def torques(s: dict[str, np.ndarray]) -> np.ndarray:
+        turned = (1.0 + np.cos(s["q1"]) ** 2) * s["ddq0"] - np.sin(2.0 * s["q1"]) * s["dq0"] * s["dq1"]
+        return np.stack([turned, s["ddq1"] + 0.5 * np.sin(2.0 * s["q1"]) * s["dq0"] ** 2 + 5.0 * np.cos(s["q1"])], axis=1)
+
+    found = identified(own, torques(own))
+    assert isinstance(found, Dynamics)
+    assert not found.signs
+    assert np.abs(found(other) - torques(other)).max() < CLOSE * np.abs(torques(other)).max()
