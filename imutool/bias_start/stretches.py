@@ -88,7 +88,7 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
 
 
 def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
-    """A recording without the IMU samples that `measured_imu` leaves out, or that repeat."""
+    """A recording without the IMU samples that are no measurement, or repeat the one before."""
     imu = measured_imu(recording.imu, recording.name, free_fall=free_fall)
     again = repeated(np.concatenate([imu.gyro, imu.accel], axis=1))
     if again.any():
