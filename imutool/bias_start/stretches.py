@@ -16,6 +16,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
+from imutool.cleaning.rules.stuck import repeated
 from imutool.errors import ConfigError, LogError
 from imutool.location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -23,7 +24,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import CLEAN_FIX
-from imutool.recording import Imu, Recording, nanoseconds
+from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.recording.columns import MOST_GAP_S, jump_warnings
 
 MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
@@ -87,8 +88,14 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
 
 
 def measured_recording(recording: Recording, *, free_fall: bool = False) -> Recording:
-    """A recording without the IMU samples that are no measurement, as `measured_imu`."""
-    return replace(recording, imu=measured_imu(recording.imu, recording.name, free_fall=free_fall))
+    """A recording without the IMU samples that are no measurement, or repeat the one before."""
+    imu = measured_imu(recording.imu, recording.name, free_fall=free_fall)
+    again = repeated(np.concatenate([imu.gyro, imu.accel], axis=1))
+    if again.any():
+        stuck = f"{recording.name}: the sensor was stuck: %d samples that repeat the one before are left out, from %.3f s on"
+        logger.warning(stuck, again.sum(), seconds(imu.t_ns[again][:1], int(imu.t_ns[0]))[0])
+        imu = imu.rows(~again)
+    return replace(recording, imu=imu)
 
 
 def longest_stretch(recording: Recording) -> Recording:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from imutool.bias.io import load
 from imutool.bias.model import BiasModel
 from imutool.bias_start.correction import OnlineDebiaser, apply_with_std
 from imutool.bias_start.initial_bias import tracked_from_prior
-from imutool.bias_start.stretches import Sieve, StretchClock, measured, read_stretches
+from imutool.bias_start.stretches import Sieve, StretchClock, measured, measured_recording, read_stretches
 from imutool.debiasing import DebiasedBlock, DebiasReport, debias
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.evaluation import evaluate
@@ -277,3 +278,16 @@ def test_a_log_of_nothing_but_zeros_is_refused(batch: ImuBatch) -> None:
     with pytest.raises(ConfigError, match="no sample is a measurement"):
         sieve.refuse_nothing()
     assert not measured(zeros, zeros).any()
+
+
+def test_samples_of_a_stuck_sensor_are_left_out_and_those_of_one_without_noise_stay(caplog: pytest.LogCaptureFixture) -> None:
+    recording = flight(1, duration_s=5.0)
+    gyro, accel = recording.imu.gyro.copy(), recording.imu.accel.copy()
+    gyro[400:460], accel[400:460] = gyro[400], accel[400]
+    held = replace(recording, imu=replace(recording.imu, gyro=gyro, accel=accel))
+    left = measured_recording(held)
+    np.testing.assert_array_equal(left.imu.t_ns, np.delete(recording.imu.t_ns, np.s_[401:460]))
+    assert "59 samples that repeat the one before are left out, from 2.005 s on" in caplog.text
+    still = replace(recording, imu=replace(recording.imu, gyro=0.0 * gyro, accel=0.0 * accel + 1.0))
+    assert measured_recording(recording).imu is recording.imu
+    assert measured_recording(still).imu is still.imu

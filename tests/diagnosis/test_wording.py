@@ -128,6 +128,10 @@ def test_a_place_without_a_name_is_not_passed_over() -> None:
     assert "What remains of the accel is 0.2 against 0.05 m/s² of noise, and has no explanation yet." in said
 
 
+def test_where_nothing_was_compared_it_is_not_said_that_nothing_is_missing() -> None:
+    assert conclusion(replace(diagnoses.NOTHING, unexplained={}, sim="sim.mcap")).startswith("Nothing could be compared")
+
+
 def test_a_finding_of_a_message_explains_its_fields() -> None:
     """A wheel's radius is a finding of /odom: its speeds do not differ without a name."""
     wheels = finding("wheel_radius", {"wheel_0": Estimate(0.02, 0.001, "-")}, signal="/odom")
@@ -219,9 +223,9 @@ def test_what_is_on_both_sensors_is_said_of_the_sensor() -> None:
 
 
 def test_any_other_signal_goes_by_its_own_name() -> None:
-    one = finding("gain", {"gain": Estimate(0.05, 0.002, "-")}, "/odom.twist.twist.linear.x")
+    one = finding("gain", {"gain": Estimate(1.05, 0.002, "-")}, "/odom.twist.twist.linear.x")
     said = conclusion(replace(diagnoses.ARM, located=(), findings=(one,)))
-    assert said.startswith("/odom.twist.twist.linear.x differs: its gain is off by 5.0 ± 0.2 % (gain);")
+    assert said.startswith("/odom.twist.twist.linear.x differs: its gain is off by 1.050 ± 0.002 (gain);")
 
 
 def test_lines_hold_each_finding_place_gain_and_remark() -> None:

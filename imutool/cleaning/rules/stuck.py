@@ -39,11 +39,8 @@ class Stuck(Rule):
     def __call__(self, stream: Iterable[Samples]) -> Iterator[Samples]:
         """Yield the samples without repeats."""
         for around, core in padded(stream, LEAST):
-            same = np.concatenate([[False], (np.diff(around.values, axis=0) == 0).all(axis=1)])
+            same, again = _repeats(around.values)
             self._noisy = _noisy(around.values[~same], self._noisy)
-            again = np.zeros(len(same), bool)
-            for first, end in true_ranges(same):
-                again[first:end] = end - first >= LEAST - 1
             samples, repeated = around.where(core), again[core]
             self._equal += int(same[core].sum())
             self._pairs += len(repeated)
@@ -120,6 +117,21 @@ class _Axis:
             self.places.add_run(self._numbers, self._stamps, self._count)
             self.still_s += lasted_s
         self._count = 0
+
+
+def repeated(values: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+    """Samples that repeat the one before, in runs of `LEAST` and more, of a sensor with noise."""
+    same, again = _repeats(values)
+    return again & _noisy(values[~same], before=False)
+
+
+def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Samples that repeat the one before, and those of them in runs of `LEAST` and more."""
+    same = np.concatenate([[False], (np.diff(values, axis=0) == 0).all(axis=1)])[: len(values)]
+    again = np.zeros(len(same), bool)
+    for first, end in true_ranges(same):
+        again[first:end] = end - first >= LEAST - 1
+    return same, again
 
 
 def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:

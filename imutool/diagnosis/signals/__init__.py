@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.ideal_signal import SignalPair, without_others
 from imutool.diagnosis.signals.log_fields import on_one_clock
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
@@ -58,7 +58,10 @@ def _compared(diagnosis: Diagnosis, pair: SignalPair, pairing: Pairing, settings
     try:
         return _with_signal(diagnosis, diagnose_signal(pair, drivers, settings))
     except DataError as error:
-        return replace(diagnosis, remarks=(*diagnosis.remarks, f"{pair.name} was not compared: {error.what}"))
+        rest = without_others(pair, settings)
+        left_out = ", ".join(name for name in pair.names if rest is not None and name not in rest.names) or pair.name
+        told = replace(diagnosis, remarks=(*diagnosis.remarks, f"{left_out} was not compared: {error.what}"))
+        return told if rest is None else _compared(told, rest, pairing, settings)
 
 
 def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:

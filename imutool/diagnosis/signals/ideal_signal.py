@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any
 
@@ -18,7 +18,7 @@ from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
-from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamics, identified
+from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamics, following, identified
 from imutool.sensor.robot_effects.signal_samples import IdealSignal
 from imutool.sensor.robot_effects.wheel import WheelRelation
 
@@ -108,6 +108,26 @@ def at_recorded_motion(
     first_s = float(seconds(next(iter(pair.state.values())).t_ns[:1], int(pair.real_ns[0]))[0])
     ideal = IdealSignal(float(t_s[0]) + first_s - ahead_s, rate_hz, relation(state), channels, state, relation)
     return ideal, 2.0 * float(np.median(np.diff(own_s))) * left.var(axis=0)
+
+
+def without_others(pair: SignalPair, settings: DiagnoseSettings) -> SignalPair | None:
+    """Efforts of the joints that follow from the motion, without those of a gripper."""
+    if pair.kind != "efforts":
+        return None
+    sim_s, _, state = motion(pair.sim_state, settings)
+    own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
+    inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
+    at = {name: np.interp(own_s[inside], sim_s, values) for name, values in state.items()}
+    kept = following(at, pair.sim[inside])
+    if not 0 < len(kept) < len(pair.names):
+        return None
+    states = [
+        {f"{kind}{n}": side[f"{kind}{k}"] for n, k in enumerate(kept) for kind in ("q", "dq") if f"{kind}{k}" in side}
+        for side in (pair.state, pair.sim_state)
+    ]
+    names, units = (tuple(of[k] for k in kept) for of in (pair.names, pair.units))
+    real, sim = pair.real[:, kept], pair.sim[:, kept]
+    return replace(pair, names=names, units=units, real=real, sim=sim, state=states[0], sim_state=states[1])
 
 
 def _ahead_s(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], t_s: Float64[np.ndarray, " n"]) -> float:

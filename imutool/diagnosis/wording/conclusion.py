@@ -18,6 +18,7 @@ QUIET = "nothing else stands above the noise"
 UNKNOWN = "This log has no usable reference, and its samples alone show no defect."
 NULL = "Nothing but a constant bias and noise separates the two."
 SHOWN = 3  # intervals in a line
+NOT_COMPARED = "Nothing could be compared with the simulation."
 WITH_ALL = "With everything that was found"
 AGAIN = "Simulated again with everything that was found"
 ABOVE = 1.1  # times the noise from which a residual stands above it
@@ -39,7 +40,7 @@ def conclusion(d: Diagnosis) -> str:
 def headline(d: Diagnosis) -> str:
     """Answer in one sentence: what differs, how much the findings remove, what is left."""
     if not d.mismatch:
-        return NULL if d.unexplained else UNKNOWN
+        return NULL if d.unexplained else NOT_COMPARED if d.sim is not None else UNKNOWN
     unnamed = _unnamed_place(d)
     parts = [_only_finding(d) if len(d.findings) == 1 else _all_findings(d)] if d.findings else []
     if unnamed:

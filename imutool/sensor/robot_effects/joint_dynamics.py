@@ -200,9 +200,25 @@ def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], orde
     return None if best is None else Dynamics(n, best[1], best[2], _by_joint(best[3], order), order)
 
 
+def following(state: State, efforts: Columns) -> list[int]:
+    """Joints whose efforts follow from the motion of all joints."""
+    n = efforts.shape[1]
+    if n > MOST_JOINTS:
+        return []
+    left = _general_fit(state, efforts)[1]
+    return np.flatnonzero(left < WELL_DETERMINED * np.maximum(efforts.std(axis=0), 1e-12)).tolist()
+
+
 def _general(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
     """Any other arm, its joints from base to tip."""
-    n = len(order)
+    theta, left = _general_fit(state, efforts)
+    well = (left < WELL_DETERMINED * size).all()
+    return Dynamics(len(order), (), theta, _by_joint(left, order), order) if well else None
+
+
+def _general_fit(state: State, efforts: Columns) -> tuple[Float64[np.ndarray, "n p"], Float64[np.ndarray, " n"]]:
+    """Coefficients by joint, and what they leave of the efforts."""
+    n = efforts.shape[1]
     trig, factors = general_factors(state, n)
     common = (factors[:, :, None] * trig[:, None, :]).reshape(len(trig), -1)
     rates = [column for k in range(n) for column in _rates(state, k)]
@@ -210,7 +226,7 @@ def _general(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], or
     kept = [np.concatenate([np.arange(common.shape[1]), common.shape[1] + 2 * k + own]) for k in range(n)]
     theta = _solved_each(columns, efforts, kept)
     left = np.array([(efforts[:, k] - columns[:, kept[k]] @ theta[k]).std() for k in range(n)])
-    return Dynamics(n, (), theta, _by_joint(left, order), order) if (left < WELL_DETERMINED * size).all() else None
+    return theta, left
 
 
 def _by_joint(values: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> tuple[float, ...]:

@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from imutool.sensor.robot_effects.joint_dynamics import Dynamics, chain_columns, identified, mass_coefficients
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics, chain_columns, following, identified, mass_coefficients
 
 SIGNS = (1, 1, -1)
 CLOSE = 1e-4  # of the efforts: the ridge of the fit
@@ -48,6 +48,17 @@ def test_a_chain_is_found_in_any_order_of_its_joints(order: tuple[int, ...]) -> 
     assert np.abs(np.abs(found.links) - (0.4, 0.3)).max() < CLOSE
     wanted = efforts(other)[:, order]
     assert np.abs(found(logged(other, order)) - wanted).max() < CLOSE * np.abs(wanted).max()
+
+
+def test_a_gripper_follows_from_no_motion_and_the_arm_does() -> None:
+    """It holds what it has: its effort steps, its finger hardly moves."""
+    own = motion(1)
+    finger = motion(7)
+    own |= {f"{kind}3": 0.01 * finger[f"{kind}0"] for kind in ("q", "dq", "ddq", "v")}
+    held = 5.0 * np.sign(np.sin(0.3 * T) + 0.2)
+    every = np.column_stack([efforts(own), held])
+    assert identified(own, every) is None
+    assert following(own, every) == [0, 1, 2]
 
 
 def test_any_other_arm_is_the_sum_of_its_factors() -> None:
