@@ -20,12 +20,11 @@ demo: $(READY_DEMO)  ## the whole way on a made-up recording: convert, train, de
 	@echo "demo: runs on made-up flights; everything goes to $(DEMO)"
 	@$(BIN)/imutool demo --output $(DEMO) --overwrite
 
-# a fresh clone has no cache of types to read, and to write one takes mypy a sixth of its time
 test: viewers  ## format, lint, then every test with warnings as errors, types beside them
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@echo "test: mypy --strict and pytest, side by side"
-	@$(BIN)/python -m mypy $(if $(CI),--cache-dir=/dev/null) & types=$$!; \
+	@$(BIN)/python -m mypy & types=$$!; \
 	$(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist worksteal; tests=$$?; \
 	wait $$types || { echo "test: mypy found what it says above" >&2; exit 1; }; exit $$tests
 
