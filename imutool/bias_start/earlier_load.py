@@ -18,10 +18,11 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.bias.model import BiasModel
 from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples
-from imutool.bias_start.fitness import head, innovations, student
+from imutool.bias_start.fitness import head, innovations
 from imutool.bias_start.initial_bias import bias_prior
 from imutool.errors import ConfigError
 from imutool.inertial.inertial_filter import STILL, FilterSettings
+from imutool.inertial.innovations import Innovations
 from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 
 # T: a few seconds also imitate what a model misses of a cold start; after the last the slowest state has settled
@@ -94,7 +95,7 @@ def _log_likelihood(model: BiasModel, samples: Samples, first_ns: int | None) ->
     gyro, accel = gyro - bias[:, :3], accel - bias[:, 3:]
     filter_ = BiasFilter(prior, ahead=True)
     blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
-    return float(innovations(blocks, prior.settings)[1].sum()) + _at_rest(
+    return float(innovations(blocks, prior.settings).log_likelihood.sum()) + _at_rest(
         [block for block in blocks if block.resting], t_s, gyro
     )
 
@@ -107,4 +108,4 @@ def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gy
         missed[k] = own.mean(axis=0) - expected.rest_bias(True)[:3]
         noise = own.var(axis=0) / len(own) + FilterSettings().rest_rad_s ** 2
         covariances[k] = STILL @ expected.P @ STILL.T + np.diag(noise)
-    return float(student(missed, covariances)[1].sum())
+    return float(Innovations(missed, covariances).log_likelihood.sum())

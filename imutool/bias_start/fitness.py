@@ -3,22 +3,25 @@
 The inertial filter predicts the samples of each half second: at rest no velocity and no rate, in motion a bounded velocity,
 which ties the gyro to the direction of gravity. Under a model that fits, the innovations e of the bounded velocity are small,
 e^T S^-1 e ~ chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking
-and Navigation, 2001, sec. 5.4), and the bias that the log shows by itself lies within the prior of the training runs. Where one
-of the two fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant bias: the
-model is unfit if even from its start in this log it explains the samples worse than no model.
+and Navigation, 2001, sec. 5.4), and the bias that the log shows by itself lies within the prior of the training runs. And the
+innovations of the raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`). The
+sensor's own model has this right whatever bias a new switching-on gave; a log that asks for less than half is another unit's.
+Where one of the three fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant
+bias: the model is unfit if even from its start in this log it explains the samples worse than no model, or if its bias and its
+correction are both another unit's.
 
-The thresholds come from `tests/bench/fit.py`: pieces of the training logs of the models that ship, and logs of other sensors.
+The thresholds come from `tests/bench/fit.py`, on pieces of the training logs of the models that ship and on logs of other
+sensors, and from made-up sensors as those of `tests/bench/units.py`.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
@@ -27,23 +30,23 @@ from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std
 from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
+from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
 from imutool.recording.columns import quantile
 
 CHECKED_S = 120.0  # of a log that the check reads
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
-SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds
 MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
 TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
-DEPENDENT = (
-    2.0  # ratio of the shown bias's deviation to the filter's, whose velocities are independent; a circling hand's are not
-)
+DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
 MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
 MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
-STUDENT = 7.0  # degrees of freedom of the innovations' likelihood, so that one jolt does not decide
+HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
+LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
+SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
 GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 
 
@@ -59,6 +62,7 @@ class _Evidence:
     difference: Vector6
     variance: Vector6
     stops: tuple[tuple[float, float], ...] = ()
+    innovations: Innovations = field(default_factory=lambda: Innovations(np.zeros((0, 3)), np.zeros((0, 3, 3))))
 
 
 def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], about: Mapping[str, str]) -> Fitness:
@@ -80,32 +84,37 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     found = _evidence(corrected, prior)
     supported = supported_std(prior.std, prior.least_std, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
-    none = None
     most = np.full(6, MOST_DEVIATIONS) if prior.least_std is None else MOST_OF_GUESS
-    if (_deviations(found, prior) > most).any() or found.surprising > MOST_SURPRISING:
-        none = _evidence(samples, replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least_std=None))
-    contradictions = [] if none is None else _contradictions(found, prior, none, most)
-    if none is not None and contradictions:
+    unknown = replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least_std=None)
+    none = _evidence(samples, unknown)
+    share = share_of_correction(none.innovations, _evidence(corrected, unknown).innovations)
+    confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
+    other_bias = list(_other_bias(found, prior, most))
+    refuted = list(_refuted(share))
+    contradictions = [*other_bias, *_disagreement(found, none), *refuted]
+    if contradictions:
         used = _started(start, prior)
         same = np.array_equal(used.mean, prior.mean)
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
-        if worse:
+        if worse or (other_bias and refuted):
             return Fitness("unfit", (*contradictions, *worse))
     doubts = [
-        *contradictions,
+        *(sentence for sentence in contradictions if not confirmed or sentence not in other_bias),
         *_changed_at_rest(corrected, found.stops, prior),
         *model.remarks,
         *_other_conditions(model, samples),
         *_other_unit(model, about),
     ]
-    if not doubts and not _same_unit(model, about) and not _telling(found, prior):
+    telling = (_shown_std(found, prior) < TELLING / 2.0).any()
+    if not (doubts or telling or confirmed or _same_unit(model, about)):
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:
         return Fitness("doubtful", tuple(doubts))
+    agreement = _asked(share) if confirmed else _agreement(found, prior)
     followed = [] if model.log_drift is None else [f"its bias follows {model.log_drift.name}"]
     if model.load_before is not None:
         followed.append("the sensor was in use before the log, so that its drift does not begin cold")
-    return Fitness("fits", (_agreement(found, prior), *followed))
+    return Fitness("fits", (agreement, *other_bias, *followed))
 
 
 def _prior(model: BiasModel) -> BiasPrior:
@@ -151,7 +160,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    chi_square, log_likelihood = innovations(blocks, prior.settings)
+    found = innovations(blocks, prior.settings)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -159,8 +168,8 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     gain = np.where(shown, 1.0 - after / before, 1.0)
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
-    surprising = float((chi_square > SURPRISING).mean())
-    return _Evidence(float(log_likelihood.sum()), surprising, difference, variance, _stops(blocks))
+    surprising = float((found.chi_square > SURPRISING).mean())
+    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, _stops(blocks), found)
 
 
 def _stops(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
@@ -187,23 +196,15 @@ def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], pri
             return
 
 
-def innovations(
-    blocks: Sequence[FilteredBlock], s: FilterSettings
-) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
-    """Chi-square and Student's log-likelihood of each block's velocity."""
+def innovations(blocks: Sequence[FilteredBlock], s: FilterSettings) -> Innovations:
+    """Innovations of each block's velocity."""
+    R_bw = np.array([block.step.expected.R_wb.T for block in blocks])
     v = np.array([block.step.expected.v_w for block in blocks])
     S = np.array([block.step.expected.P[VELOCITY, VELOCITY] for block in blocks])
     bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s
     noise = np.array([s.rest_m_s**2 if b.resting else bounded / (b.end_s - b.start_s) for b in blocks])
-    return student(v, S + noise[:, None, None] * np.eye(3))
-
-
-def student(
-    e: Float64[np.ndarray, "m 3"], S: Float64[np.ndarray, "m 3 3"]
-) -> tuple[Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
-    """Chi-square and Student's log-likelihood of innovations e with covariances S."""
-    chi_square = (e * np.linalg.solve(S, e[..., None])[..., 0]).sum(axis=1)
-    return chi_square, -0.5 * (STUDENT + 3.0) * np.log1p(chi_square / STUDENT) - 0.5 * np.linalg.slogdet(S)[1]
+    S = S + noise[:, None, None] * np.eye(3)
+    return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
 
 
 def _deviations(found: _Evidence, prior: BiasPrior) -> Vector6:
@@ -216,22 +217,36 @@ def _shown_std(found: _Evidence, prior: BiasPrior) -> Vector6:
     return np.asarray(np.sqrt(prior.std**2 + DEPENDENT**2 * found.variance + AT_REST_STD**2))
 
 
-def _contradictions(found: _Evidence, prior: BiasPrior, none: _Evidence, most: Vector6) -> list[str]:
-    """Sentences on what in a log contradicts a prior and the correction, unless no model does better."""
-    sentences, deviations = [], _deviations(found, prior)
+def _other_bias(found: _Evidence, prior: BiasPrior, most: Vector6) -> Iterator[str]:
+    """Sentences on biases that are not those of a prior."""
+    deviations = _deviations(found, prior)
     for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
         axis = int(np.argmax(deviations[columns])) + columns.start
         if deviations[axis] > most[axis]:
-            sentences.append(
+            yield (
                 f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the training"
                 f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another switching-on"
             )
+
+
+def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
+    """Sentence on samples that contradict each other after the correction, unless those of no model do."""
     if found.surprising > MOST_SURPRISING + none.surprising:  # fast vehicles surprise without a model, too
-        sentences.append(
+        yield (
             f"gyro and gravity disagree after the correction in {found.surprising:.0%} of the half seconds, before it in"
             f" {none.surprising:.0%}"
         )
-    return sentences
+
+
+def _refuted(share: Share) -> Iterator[str]:
+    """Sentence on a correction of which the log asks for less than half."""
+    if LEAST_SHARE < share.value < HALF - SURE * share.std:
+        yield f"{_asked(share)}: its scale and misalignment are another unit's"
+
+
+def _asked(share: Share) -> str:
+    """Share of the correction that the log asks for, in words."""
+    return f"gravity and stops ask for {share.value:.0%} ± {share.std:.0%} of the model's correction in motion"
 
 
 def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:
@@ -251,7 +266,7 @@ def _other_conditions(model: BiasModel, samples: Samples) -> list[str]:
     noise = white_noise(np.concatenate([samples[1], samples[2]], axis=1))
     known = model.noise_std > 0
     ratio = float((noise[known] / model.noise_std[known]).max()) if known.any() else 0.0
-    if ratio > MOST_NOISE:
+    if ratio > MOST_NOISE:  # less noise is no doubt: a drone in the hand has a tenth of that in flight
         sentences.append(f"the samples are {ratio:.0f} times as noisy as in the training runs: another sensor, or vibration")
     rate_hz = 1.0 / float(quantile(np.diff(samples[0]), 0.5))
     if model.rate_hz and abs(rate_hz / model.rate_hz - 1.0) > MOST_RATE:
@@ -271,11 +286,6 @@ def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
     """Whether the log is of the very unit for which a model ships, or was in its training."""
     names = [log.get("name") for log in model.card.get("logs", ()) if isinstance(log, dict)]
     return model.card.get("name") in shipped_for(about) or about.get("sequence") in names
-
-
-def _telling(found: _Evidence, prior: BiasPrior) -> bool:
-    """Whether the log would show the bias of another sensor."""
-    return bool((_shown_std(found, prior) < TELLING / 2.0).any())
 
 
 def _agreement(found: _Evidence, prior: BiasPrior) -> str:

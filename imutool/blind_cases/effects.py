@@ -266,6 +266,11 @@ def warm_up(values: Three, theta: Theta, t_s: Times) -> Three:
     return np.asarray(values + rise * theta[:3])
 
 
+def dead_band(values: Three, width: Theta, t_s: Times) -> Three:
+    """Zero below the width."""
+    return np.where(np.abs(values) < width[0], 0.0, values)
+
+
 def g_sensitivity(reading: Reading, theta: Theta) -> Six:
     """Gyro + G f."""
     out = reading.signal.copy()

@@ -58,6 +58,8 @@ from imutool.sensor.effect import Effect
 from imutool.sensor.effects import clock_wander
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
+NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
+NEEDS_SIMULATION = "gyro_dead_band"  # a zero crossing takes milliseconds, beyond what poses know
 Tell = Callable[[int, int, str], None]
 
 
@@ -217,7 +219,7 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
         return all(attitude if need == "attitude" else any(need in name for name in channels) for need in effect.needs)
 
     exact = all(pair.exact for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
-    left_out = {*SHOWN_BY_SAMPLES, *([clock_wander.EFFECT.name] if exact else ())}  # one clock cannot wander against itself
+    left_out = {*SHOWN_BY_SAMPLES, NEEDS_POSES if exact else NEEDS_SIMULATION}
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
     effects = _until_the_end(effects, pairs)
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]

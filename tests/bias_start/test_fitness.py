@@ -17,9 +17,11 @@ from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.errors import ModelError
+from imutool.inertial.stationary import white_noise
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 
+WRONG = np.array([[0.04, -0.02, 0.01], [0.02, -0.05, 0.03], [-0.03, 0.02, 0.04]])
 MADE_FOR = {"sensor": "made up", "dataset": "flights"}
 
 
@@ -36,7 +38,7 @@ def model(recording: Recording) -> BiasModel:
     statistics = {
         "prior_mean": rest,
         "prior_std": np.array([1e-3] * 3 + [0.05] * 3),
-        "noise_std": np.array([5e-3] * 3 + [0.1] * 3),
+        "noise_std": white_noise(np.concatenate([recording.imu.gyro, recording.imu.accel], axis=1)),
     }
     made = linear.Model(linear.Config(), 1.0 / recording.imu.period_s, statistics)
     made.card = {"name": "own", "logs": [{}] * 3, **MADE_FOR}
@@ -79,6 +81,57 @@ def test_another_switching_on_is_doubtful_not_unfit(model: BiasModel, recording:
     found = judged(model, shifted, MADE_FOR)
     assert found.verdict == "doubtful"
     assert "about y differs by" in found.reasons[0]
+
+
+@pytest.fixture(scope="module")
+def scaled(recording: Recording) -> Imu:
+    """Samples of a gyro whose scale and axes are wrong by some percent."""
+    return replace(recording.imu, gyro=recording.imu.gyro @ (np.eye(3) + WRONG).T)
+
+
+def corrects(model: BiasModel, wrong: np.ndarray) -> BiasModel:
+    """Model that also removes an error of scale and axes."""
+    W = np.eye(3) - np.linalg.inv(np.eye(3) + wrong)
+    made = linear.Model(linear.Config(), model.rate_hz, dict(model.tensors) | {"W.gyro": W})
+    made.card = model.card
+    return made
+
+
+def test_gravity_confirms_the_sensors_own_correction(model: BiasModel, scaled: Imu) -> None:
+    found = judged(corrects(model, WRONG), scaled)
+    assert found.verdict == "fits"
+    assert "% of the model's correction" in found.reasons[0]
+
+
+def test_the_correction_of_another_unit_is_caught_though_its_bias_agrees(
+    model: BiasModel, recording: Recording, scaled: Imu
+) -> None:
+    """On samples that need none, and on samples that need the opposite."""
+    for imu, wrong in ((recording.imu, WRONG), (scaled, -WRONG)):
+        found = judged(corrects(model, wrong), imu)
+        assert found.verdict != "fits"
+        assert "another unit's" in " ".join(found.reasons)
+
+
+def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(model: BiasModel, scaled: Imu) -> None:
+    shifted = replace(scaled, gyro=scaled.gyro + np.array([0.0, 0.015, 0.0]))
+    found = judged(corrects(model, WRONG), shifted)
+    assert found.verdict == "fits"
+    assert "about y differs by" in found.reasons[1]
+    assert judged(corrects(model, -WRONG), shifted).verdict == "unfit"
+
+
+def test_more_noise_is_doubtful_and_less_is_not(model: BiasModel, recording: Recording) -> None:
+    """A vehicle with its motors off is quieter than in training."""
+    more, less = (
+        linear.Model(linear.Config(), model.rate_hz, dict(model.tensors) | {"noise_std": times * model.noise_std})
+        for times in (0.2, 10.0)
+    )
+    more.card = less.card = model.card
+    assert judged(less, recording.imu).verdict == "fits"
+    found = judged(more, recording.imu)
+    assert found.verdict == "doubtful"
+    assert "5 times as noisy" in found.reasons[0]
 
 
 def test_an_unfit_model_is_refused_unless_forced_and_a_doubtful_one_is_used(

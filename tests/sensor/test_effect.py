@@ -168,6 +168,7 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {
+        "gyro_dead_band",
         "gyro_delay",
         "clock_offset",
         "clock_skew",
@@ -339,6 +340,21 @@ def test_a_late_gyro_has_the_phase_of_its_delay_and_the_rest_stays(f_hz: float, 
     assert abs(response(out.gyro[:, 0], f_hz, felt.t_s) / exact - 1.0) < promised(f_hz)
     assert out.accel is felt.accel
     assert out.alpha is felt.alpha
+
+
+@pytest.mark.parametrize("width", [0.02, 0.3])
+def test_a_dead_band_starts_at_its_width_beside_a_bias_and_noise(width: float) -> None:
+    felt = lively()
+    noise = np.random.default_rng(1).normal(0.0, 0.003, felt.gyro.shape)
+    gyro = np.where(np.abs(felt.gyro) < width, 0.0, felt.gyro) + noise + np.array([0.01, -0.02, 0.005])
+    read = felt.sample(felt.t_s, felt.t_s).with_readings(gyro)
+    starts = only("gyro_dead_band").starts
+    assert starts is not None
+    (start,) = starts(felt, read)
+    assert start[0] == pytest.approx(width, rel=0.2)
+    out = act("gyro_dead_band", felt.sample(felt.t_s, felt.t_s), width)
+    assert (out.gyro[np.abs(felt.gyro) < 0.98 * width] == 0.0).all()
+    close(out.gyro[np.abs(felt.gyro) > 1.02 * width], felt.gyro[np.abs(felt.gyro) > 1.02 * width])
 
 
 @pytest.mark.parametrize("f_hz", [0.5, 3.0, 11.0, 27.0, 50.0])

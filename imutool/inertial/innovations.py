@@ -1,0 +1,64 @@
+"""Innovations of the filter's velocity, and the share of a correction they ask for."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from imutool.array_types import Float64
+
+STUDENT = 7.0  # degrees of freedom of the likelihood, so that one jolt does not decide
+SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: above, it gets less weight
+LAGS = 6  # blocks over which innovations depend on each other: the bounded velocity is no white noise
+
+
+class Innovations(NamedTuple):
+    """Innovations of velocity by block in body axes, and their covariances."""
+
+    e: Float64[np.ndarray, "m 3"]
+    S: Float64[np.ndarray, "m 3 3"]
+
+    @property
+    def chi_square(self) -> Float64[np.ndarray, " m"]:
+        """Chi-square e^T S^-1 e of each block."""
+        return np.asarray((self.e * np.linalg.solve(self.S, self.e[..., None])[..., 0]).sum(axis=1))
+
+    @property
+    def log_likelihood(self) -> Float64[np.ndarray, " m"]:
+        """Student's log-likelihood of each block."""
+        fit = -0.5 * (STUDENT + 3.0) * np.log1p(self.chi_square / STUDENT)
+        return np.asarray(fit - 0.5 * np.linalg.slogdet(self.S)[1])
+
+
+class Share(NamedTuple):
+    """Share of a correction that innovations ask for, with its deviation; infinite if unknown."""
+
+    value: float
+    std: float
+
+
+def share_of_correction(without: Innovations, corrected: Innovations) -> Share:
+    """Share of a correction that best explains the innovations, by weighted least squares.
+
+    A correction changes the innovations e of the raw samples by d to those of the corrected. The share a minimises
+    sum (e - a d)^T S^-1 (e - a d): the sensor's own correction has 1, one of an unrelated sensor 0, and above one half a
+    correction does more good than harm. The deviation allows for dependent innovations (Newey and West, "A simple, positive
+    semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 1987).
+    """
+    if not len(without.e):
+        return Share(0.0, math.inf)
+    S = 0.5 * (without.S + corrected.S)
+    d = without.e - corrected.e
+    weight = 1.0 / np.maximum(1.0, np.minimum(without.chi_square, corrected.chi_square) / SURPRISING)
+    Sd = weight[:, None] * np.linalg.solve(S, d[..., None])[..., 0]
+    size = float((d * Sd).sum())
+    if size <= 0.0:
+        return Share(0.0, math.inf)
+    value = float((without.e * Sd).sum()) / size
+    score = ((without.e - value * d) * Sd).sum(axis=1)
+    variance = score @ score
+    for lag in range(1, min(LAGS, len(score) - 1) + 1):
+        variance += 2.0 * (1.0 - lag / (LAGS + 1.0)) * (score[lag:] @ score[:-lag])
+    return Share(value, math.sqrt(max(float(variance), 0.0)) / size)
