@@ -128,6 +128,7 @@ def audit(
         str, typer.Option(metavar="NAME|FILE.toml", help="Its noise: adis16448, bmi160, or a TOML file.")
     ] = "none",
     imu: Imu = None,
+    truth: Truth = None,
     overwrite: Overwrite = False,
     json_to: Json = None,
     verbose: Verbose = False,
@@ -143,7 +144,7 @@ def audit(
 
     with progress("Auditing", verbose, quiet) as tell:
         tell(0, 1, "reading")
-        report = run(sim, real, noise=noise, imu=imu)
+        report = run(sim, real, noise=noise, imu=imu, truth=truth)
     if not write_json(report, json_to, overwrite=overwrite):
         for line in lines(report):
             say(with_flags(line))

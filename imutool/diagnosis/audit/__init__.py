@@ -14,6 +14,7 @@ from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import Expected, noise_faults
+from imutool.diagnosis.audit.simulation import read_simulation
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
@@ -45,17 +46,28 @@ class AuditReport(Report, frozen=True, tag="imutool.audit/1"):
     not_tested: Mapping[str, str]
 
 
-def audit(sim: Location, real: Location | None = None, *, noise: str | Path = "none", imu: str | None = None) -> AuditReport:
+def audit(
+    sim: Location,
+    real: Location | None = None,
+    *,
+    noise: str | Path = "none",
+    imu: str | None = None,
+    truth: str | None = None,
+) -> AuditReport:
     """Faults of a simulator's IMU, by its own poses, a data sheet's `noise` and a recording.
+
+    `truth` is the topic of the poses, where there are several. They are moved to the sensor where /tf_static states its mount.
 
     Raises:
         ConfigError, LogError: a log or the data sheet cannot be read.
         DataError: the simulation has no poses that can be differentiated.
     """
-    simulated = measured_recording(longest_stretch(read(sim, imu=imu)), free_fall=True)
+    simulated, mount = read_simulation(sim, imu=imu, truth=truth)
     recording = None if real is None else measured_recording(longest_stretch(read(real, imu=imu)))
     sheet = datasheet.read(noise)
     faults = simulator_faults(simulated, recording, sheet)
+    if mount.arm_m > LEAST_ARM_M:  # the sensor is not at the body's centre
+        faults = [fault for fault in faults if fault.fault != "body_centre"]
     not_tested = dict(_not_tested(recording, sheet))
     tested = tuple(name for name in FAULTS if name not in not_tested)
     return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested)
@@ -89,7 +101,7 @@ def simulator_remarks(sim: Recording) -> list[str]:
         faults = simulator_faults(sim, None, datasheet.read("none"))
     except ImutoolError:
         return []
-    return [f"The simulation is wrong by itself: {fault.sentence} ({fault.fault})" for fault in faults]
+    return [f"The simulation is wrong by itself: {fault.sentence} ({fault.fault}){_unless(fault)}" for fault in faults]
 
 
 def lines(report: AuditReport) -> list[str]:
@@ -103,8 +115,13 @@ def lines(report: AuditReport) -> list[str]:
         numbers = ", ".join(quantity.labelled for quantity in grouped(fault.parameters))
         out.append(f"{fault.fault}: {fault.sentence}{f' ({numbers})' if numbers else ''}.")
         out.append(f"    {fault.equation}; reported in {fault.source}")
+        out += [f"    No fault if {fault.unless}."] if fault.unless else []
     out += [f"Not tested: {', '.join(names)}: {why}." for why, names in _grouped(report.not_tested).items()]
     return out
+
+
+def _unless(fault: FaultFound) -> str:
+    return f", unless {fault.unless}" if fault.unless else ""
 
 
 def _has_noise(sheet: datasheet.Noise) -> bool:

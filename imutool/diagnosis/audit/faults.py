@@ -11,11 +11,12 @@ from imutool.report import Section
 
 @dataclass(frozen=True)
 class Fault:
-    """Fault of a simulator: what it does, as an equation, and where it was reported."""
+    """Fault of a simulator: its equation, where it was reported, what would make it right."""
 
     sentence: str
     equation: str
     source: str
+    unless: str = ""
 
 
 GITHUB = "https://github.com"
@@ -32,6 +33,7 @@ FAULTS: Mapping[str, Fault] = {
         "holds gravity with the wrong sign: at rest it reads g down",
         "accel = R_wb^T (a_w + g_w)",
         f"{GITHUB}/Field-Robotics-Japan/UnitySensors/issues/116",
+        unless="the z axis of the poses points down: name their frame NED (odom_ned)",
     ),
     "gravity_only": Fault(
         "holds gravity alone, no acceleration", "accel = -R_wb^T g_w", f"{GITHUB}/gazebosim/gz-sim/issues/2974"
@@ -45,6 +47,7 @@ FAULTS: Mapping[str, Fault] = {
         "is that of another point than the one of the poses",
         "accel += alpha x r + omega x (omega x r)",
         f"{GITHUB}/isaac-sim/IsaacSim/issues/825",
+        unless="the sensor sits there: state its mount on /tf_static",
     ),
     "body_centre": Fault(
         "is that of the body's centre; the recording's sensor sits off it",
@@ -55,6 +58,7 @@ FAULTS: Mapping[str, Fault] = {
         "is a backward difference, half a step late",
         "x(t) = (y(t) - y(t - T)) / T, late by T / 2",
         f"{GITHUB}/ethz-asl/rotors_simulator/pull/272",
+        unless="the integrator is semi-implicit Euler: then the poses are half a step early",
     ),
     "step_delay": Fault("comes one step late", "x(t) = x_true(t - T)", f"{GITHUB}/PegasusSimulator/PegasusSimulator/pull/147"),
     "early_stamps": Fault(
@@ -72,6 +76,7 @@ FAULTS: Mapping[str, Fault] = {
         "has permuted axes",
         "x = P x_body, P a signed permutation, det P > 0",
         f"{GITHUB}/fsstudio-team/ZeroSimROSUnity/issues/9",
+        unless="the sensor is mounted so: state its mount on /tf_static",
     ),
     "noise_absent": Fault("has no noise", "x = x_true", f"{GITHUB}/PX4/PX4-gazebo-models/pull/33"),
     "noise_per_sample": Fault(
@@ -120,6 +125,11 @@ class FaultFound(Section, frozen=True):
         both = self.signal == "both"
         text = FAULTS[self.fault].sentence
         return f"{'Each of gyro and accel' if both else f'The {self.signal}'} {text}"
+
+    @property
+    def unless(self) -> str:
+        """What would make it no fault; mostly empty."""
+        return FAULTS[self.fault].unless
 
 
 def found(fault: str, signal: str, **parameters: Estimate) -> FaultFound:

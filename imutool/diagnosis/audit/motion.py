@@ -33,11 +33,13 @@ Matrix = Float64[np.ndarray, "3 3"]
 JERK_S = 1e-3  # half of the step of a central difference
 BLOCK_S = 2.0  # of the robust covariance
 MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
+BIAS_RIDGE = 1e-6  # of a bias: a body that stays level shows it and gravity alike, and gravity is the larger
 CLEARLY = 0.5  # of the squares of the body frame and its axes, up to which others are chosen
 ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
 CERTAIN = 6.0  # standard deviations
 NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
 LEAST_DELAY = 0.05  # of a sample period: less is rounding
+LEAST_GYRO_DELAY = 0.3  # of a sample period: half of a finer step is that of a semi-implicit integrator
 PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
 LEAST_ARM_M = 5e-3
 LEAST_S = 5.0
@@ -156,7 +158,8 @@ def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[Faul
     """Delays of the gyro, of the acceleration and of its attitude, in sample periods."""
     gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
     late = {"gyro": gyro, "accel": accel}
-    steps = {signal: _delay(tau, period_s) for signal, tau in late.items()}
+    least = {"gyro": LEAST_GYRO_DELAY, "accel": LEAST_DELAY}
+    steps = {signal: _delay(tau, period_s, least[signal]) for signal, tau in late.items()}
     together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
     out = []
     for name in ("step_delay", "early_stamps"):
@@ -171,12 +174,12 @@ def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[Faul
     return out
 
 
-def _delay(tau: Estimate, period_s: float) -> str:
+def _delay(tau: Estimate, period_s: float, least: float) -> str:
     """Name of a delay: half a step or less, a whole step, a step early; empty for none or another."""
     steps = tau.value / period_s if _clear(tau) else 0.0
     if abs(steps) > WHOLE:
         return "step_delay" if steps > 0.0 else "early_stamps"
-    return "backward_difference" if LEAST_DELAY <= steps < PART else ""
+    return "backward_difference" if least <= steps < PART else ""
 
 
 def _which(flags: tuple[bool, ...]) -> list[str]:
@@ -207,7 +210,7 @@ def _frame(k: Kinematics, y: Vectors, body: Float64[np.ndarray, "n 3 p"], *, fre
     for world, x in ((False, body), (True, np.einsum("nij,njp->nip", k.R_wb, body))):
         for rank, P in enumerate(PERMUTATIONS):
             squares.append((_squares(y @ P, x, free_bias=free_bias), rank + len(PERMUTATIONS) * world, world, P))
-    least = min(entry[0] for entry in squares)
+    least = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
     if least > CLEARLY * squares[0][0]:
         return False, np.eye(3)
     chosen = min((entry for entry in squares if entry[0] <= ALIKE * least), key=lambda entry: entry[1])
@@ -242,8 +245,9 @@ def _solved(
     size[size < 1e-9 * size.max()] = np.inf
     A = A / size
     weight = np.ones(len(y))
+    ridge = np.diag([1e-9] * p + [BIAS_RIDGE] * 3)
     for _ in range(3):
-        H = np.einsum("n,nap,naq->pq", weight, A, A) + 1e-9 * np.eye(p + 3)
+        H = np.einsum("n,nap,naq->pq", weight, A, A) + ridge
         theta = np.linalg.solve(H, np.einsum("n,nap,na->p", weight, A, target))
         left = target - A @ theta
         length = np.sqrt((left**2).sum(axis=1))

@@ -7,18 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.signal import welch
+from scipy.signal import spectrogram, welch
 from scipy.stats import chi2
 
-from imutool.array_types import Float64
+from imutool.array_types import Bool, Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.estimation.timestamps import grid, limits
 from imutool.diagnosis.result import Estimate
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu
+from imutool.recording.columns import true_ranges
 from imutool.units import SENSORS, UNITS, Sensor
 
 Six = Float64[np.ndarray, "n 6"]
+Line = Float64[np.ndarray, " f"]
 ABSENT = 0.02  # of the expected noise: less is none
 ALIKE = 1.35  # factor between two densities that are one: a data sheet is typical
 SAME_SAMPLE = 1.12  # factor between the noise of two samples that was meant to be one
@@ -33,9 +35,14 @@ CONSEQUENCES = {
 }
 LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
 LINES_P_VALUE = 1e-9
+AROUND = (31, 13)  # bins whose medians a line exceeds: a hump is wider
+LEAST_LINE: dict[Sensor, float] = {"gyro": 1e-5, "accel": 1e-4}  # amplitude, rad/s and m/s²: less is rounding
+STEADY = 0.45  # of its mean, the scatter of a line from segment to segment; of noise on three axes 0.58
+HANN = 1.5  # bins of noise in one of a Hann window
 LINES_FROM = 0.15  # of the rate: below, motion is left
 SEGMENT = 1024
 REPEATED = 0.08  # of the samples
+REST = 20  # equal samples in a row
 WALK_BLOCKS, WALK_P_VALUE, WALK_FACTOR = 8, 1e-4, 4.0  # blocks of a log; the walk has to be so many times the white noise
 
 
@@ -74,7 +81,7 @@ def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndar
 def noise_faults(imu: Imu, residual: Six, expected: list[Expected]) -> list[FaultFound]:
     """Faults of the noise; `residual` is what the motion leaves of the samples."""
     rate_hz, samples = 1.0 / imu.period_s, np.concatenate([imu.gyro, imu.accel], axis=1)
-    out = [*_lines(residual, rate_hz), *_repeated(samples)]
+    out = [*_lines(samples, residual, rate_hz), *_repeated(samples)]
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
         own = float(np.median(fast_noise(residual[:, part], rate_hz)))
@@ -167,25 +174,41 @@ def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> t
 BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
 
 
-def _lines(residual: Six, rate_hz: float) -> Iterator[FaultFound]:
-    """Lines in the spectrum of what the motion leaves, above the frequencies of a body's motion."""
+def _lines(samples: Six, residual: Float64[np.ndarray, "m 6"], rate_hz: float) -> Iterator[FaultFound]:
+    """Lines in the spectrum of what the motion leaves, above the frequencies of a body's motion.
+
+    They are lines of the samples, too: a curve through slow poses has some of its own.
+    """
     size = min(SEGMENT, len(residual) // 4)
     for k, sensor in enumerate(SENSORS):
-        x = residual[:, 3 * k : 3 * k + 3]
-        f_hz, power = welch(x, rate_hz, nperseg=size, axis=0)
-        segments = 2.0 * len(x) / size - 1.0
-        freedom = 3.0 * 2.0 * segments * 9.0 / 11.0  # of half-overlapping Hann segments, three axes
-        total = power.sum(axis=1)
-        ratio = total / np.maximum(median_filter(total, 31, mode="nearest"), 1e-300)
+        part = slice(3 * k, 3 * k + 3)
+        (f_hz, power, ratio, steady), (_, _, ratio_all, _) = (_peaks(x[:, part], rate_hz, size) for x in (residual, samples))
         above = (f_hz > LINES_FROM * rate_hz) & (f_hz < 0.99 * rate_hz / 2.0)
-        logs = chi2.logsf(ratio * freedom, freedom)
-        lines = np.flatnonzero(above & (logs < np.log(LINES_P_VALUE)) & (ratio > 3.0))
+        above &= np.sqrt(2.0 * HANN * power * rate_hz / size) > LEAST_LINE[sensor]
+        lines = np.flatnonzero(above & steady & (np.minimum(ratio, ratio_all) > 3.0))
         if len(lines):
             f = float(f_hz[lines[np.argmax(ratio[lines])]])
             yield found("step_lines", sensor, f=Estimate(f, rate_hz / size, "Hz"))
 
 
+def _peaks(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> tuple[Line, Line, Line, Bool[np.ndarray, " f"]]:
+    """Frequencies, power, power beside the medians around each, and whether it is no chance and lasts as a motion does not."""
+    f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=size, noverlap=size // 2, axis=0)
+    by_segment = parts.sum(axis=1)
+    total = by_segment.mean(axis=1)
+    freedom = 3.0 * 2.0 * by_segment.shape[1] * 9.0 / 11.0  # of half-overlapping Hann segments, three axes
+    around = np.maximum(*(median_filter(total, bins, mode="nearest") for bins in AROUND))
+    ratio = total / np.maximum(around, 1e-300)
+    lasts = by_segment.std(axis=1) < STEADY * total
+    return f_hz, total, ratio, np.asarray(lasts & (chi2.logsf(ratio * freedom, freedom) < np.log(LINES_P_VALUE)))
+
+
 def _repeated(samples: Six) -> Iterator[FaultFound]:
-    share = float((np.diff(samples, axis=0) == 0.0).all(axis=1).mean())
+    """Samples held for some periods; runs of `REST` are the rest of a body without noise."""
+    equal = (np.diff(samples, axis=0) == 0.0).all(axis=1)
+    for start, end in true_ranges(equal):
+        if end - start >= REST:
+            equal[start:end] = False
+    share = float(equal.mean())
     if share > REPEATED and np.ptp(samples, axis=0).max() > 0.0:
         yield found("repeated_samples", "both", share=Estimate(share, 0.0, "-"))

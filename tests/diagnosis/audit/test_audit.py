@@ -8,16 +8,25 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.report_schema import assert_valid
 from support.seeds import seeds
 
-from imutool.diagnosis.audit import simulator_faults, simulator_remarks
+from imutool.diagnosis.audit import audit, lines, simulator_faults, simulator_remarks
 from imutool.diagnosis.audit.faults import FAULTS
-from imutool.mcap_io.write import write
+from imutool.diagnosis.audit.motion import kinematic_fit, kinematics, motion_faults
+from imutool.diagnosis.audit.noise import noise_faults
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu, encode_transform
+from imutool.mcap_io.write import Series, chunks, write
+from imutool.mcap_io.writer import LogWriter
+from imutool.recording import Imu, Poses, Recording
 
 PATH = Path(__file__).parents[2] / "bench" / "audit.py"
 SPEC = importlib.util.spec_from_file_location("audit_bench", PATH)
@@ -65,3 +74,59 @@ def test_the_command_says_the_fault_its_equation_and_its_source(tmp_path: Path, 
     report = json.loads(imutool("audit", "sim.mcap", "--json", "-", cwd=tmp_path).stdout)
     assert_valid(report)
     assert report["faults"][0]["parameters"]["missing"]["value"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_rest_repeats_no_samples_and_a_burst_is_no_line() -> None:
+    t, rng = np.arange(6000) / 100.0, np.random.default_rng(4)
+    moves = np.sin(2 * np.pi * 0.7 * np.maximum(t - 30.0, 0.0))[:, None] * np.ones(6)
+    imu = Imu((t * 1e9).astype(np.int64), moves[:, :3], moves[:, 3:])
+    assert noise_faults(imu, moves + 1e-3 * rng.normal(size=moves.shape), []) == []
+    held = moves[np.arange(len(t)) // 2 * 2]
+    assert [f.fault for f in noise_faults(Imu(imu.t_ns, held[:, :3], held[:, 3:]), held, [])] == ["repeated_samples"]
+    burst = 0.01 * (np.sin(2 * np.pi * 31.0 * t) * np.exp(-((t - 40.0) ** 2) / 8.0))[:, None] * np.ones(6)
+    shaken = burst + 1e-4 * rng.normal(size=burst.shape)
+    assert noise_faults(Imu(imu.t_ns, shaken[:, :3], shaken[:, 3:]), shaken, []) == []
+
+
+def test_gravity_left_out_is_found_in_the_plane_too() -> None:
+    """There a bias would explain it as well."""
+    sim, _, _ = bench.made("null", 3, DURATION_S)
+    yaw = Rotation.from_quat(sim.truth.q_wb_wxyz, scalar_first=True).as_euler("ZYX")[:, 0]
+    level = Poses(
+        sim.truth.t_ns, sim.truth.p_wb * [1.0, 1.0, 0.0], Rotation.from_euler("Z", yaw[:, None]).as_quat(scalar_first=True)
+    )
+    k = kinematics(replace(sim, truths={"/pose": level}))
+    coordinate = k.to_body(k.a_w)
+    flat = replace(k, gyro=k.omega, accel=coordinate)
+    assert {fault.fault for fault in motion_faults(flat, kinematic_fit(flat))} == {"coordinate_acceleration"}
+    right = replace(flat, accel=coordinate + np.array([0.05, -0.1, 9.91]))
+    assert motion_faults(right, kinematic_fit(right)) == []
+
+
+def written(path: Path, sim: Recording, world: str, body: Poses, mount: Poses) -> None:
+    """A simulator's log in ROS 2: its IMU, /tf of the body, /tf_static of the sensor."""
+    with LogWriter(path) as log:
+        imu = (sim.imu.t_ns, sim.imu.gyro, sim.imu.accel)
+        series = [Series(log.channel("/imu", schemas.IMU), imu[0], imu, partial(encode_imu, frame_id="imu_link"))]
+        for topic, poses, frames in (("/tf", body, (world, "base")), ("/tf_static", mount, ("base", "imu_link"))):
+            encode = partial(encode_transform, frame_id=frames[0], child_frame_id=frames[1])
+            columns = (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
+            series.append(Series(log.channel(topic, schemas.TF), poses.t_ns, columns, encode))
+        for chunk in chunks(series):
+            log.chunk(chunk)
+
+
+@pytest.mark.parametrize(("world", "accused"), [("world", set()), ("odom_ned", set()), ("map", {"gravity_sign"})])
+def test_poses_on_tf_a_stated_mount_and_a_world_named_ned_are_right(tmp_path: Path, world: str, accused: set[str]) -> None:
+    sim, _, _ = bench.made("null", 3, DURATION_S)
+    R_bs, arm = Rotation.from_euler("xyz", [170.0, 5.0, 90.0], degrees=True), np.array([0.1, -0.2, 0.05])
+    R_wb = Rotation.from_quat(sim.truth.q_wb_wxyz, scalar_first=True) * R_bs.inv()
+    p_wb, turned = sim.truth.p_wb - R_wb.apply(arm), Rotation.identity()
+    if world != "world":
+        turned = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    body = Poses(sim.truth.t_ns, turned.apply(p_wb), (turned * R_wb).as_quat(scalar_first=True))
+    mount = Poses(sim.imu.t_ns[:1], arm[None], R_bs.as_quat(scalar_first=True)[None])
+    written(tmp_path / "sim.mcap", sim, world, body, mount)
+    report = audit(tmp_path / "sim.mcap")
+    assert {fault.fault for fault in report.faults} == accused
+    assert ("odom_ned" in "\n".join(lines(report))) == bool(accused)
