@@ -1,7 +1,7 @@
-"""Efforts of a chain of parallel hinges, in absolute angles phi_i = sum of +-q_j, j <= i, of the links.
+"""Efforts of a chain of parallel hinges, linear in the moments of its links.
 
-They are linear in D_i (kg m²) of a link, H_ij = conj(P_i) A_j (kg m²) between two, and A_i (kg m) against gravity, with P_i
-the vector of a link in its own plane as a complex number.
+Links have absolute angles phi_i = sum of +-q_j, j <= i. Efforts are linear in D_i (kg m²) of a link, H_ij = conj(P_i) A_j
+(kg m²) between two, and A_i (kg m) against gravity, with P_i the vector of a link in its own plane as a complex number.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Dynamics of a chain of hinges whose axes point anywhere, linear in what its links weigh.
+"""Efforts of a chain of hinges across each other, linear in the moments of its links.
 
 A point of link i at x is at the sum of R_j r_j over the links before, and R_i x. With E the columns of all R_i side by side,
 efforts are those of d²E/dt² S and of gravity on A, where S (kg m²) and A (kg m) are the second and first moments of all
 links, one symmetric matrix and one vector (principle of d'Alembert). The part of R_i along its own axis moves with link i - 1:
-two columns a link are left, and they are independent. Only the directions of the axes are searched for.
+two columns a link are left. The directions of the axes alone are searched for, at right angles or parallel.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ Cost = Callable[[Axes], float]
 
 @dataclass(frozen=True, eq=False)
 class SpatialChain:
-    """Axes of the joints from base to tip, as they point where all angles are zero; the third direction is up."""
+    """Axes of the joints from base to tip.
+
+    They are as they point where all angles are zero; the third direction is up.
+    """
 
     axes: Axes
 
@@ -133,7 +136,10 @@ class Moved:
 
 
 def searched(n: int, cost: Cost, enough: float) -> Axes | None:
-    """Axes whose cost is below enough, found by turning one axis at a time from random ones; None if none are."""
+    """Axes whose cost is below enough, by turning one at a time from random ones.
+
+    None where none are found.
+    """
     rng = np.random.default_rng(SEED)
     for _ in range(STARTS):
         axes, best = _descended(DIRECTIONS[rng.integers(0, len(DIRECTIONS), n)], cost)
