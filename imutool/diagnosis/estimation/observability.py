@@ -95,10 +95,12 @@ class FixedParameters:
 
 
 def with_free(effect: Effect, free: Sequence[int]) -> Effect:
-    """Effect with only some free parameters, by index; itself if they are all."""
+    """Effect with only some free parameters, by index, on their sensors; itself if they are all."""
     if len(free) == len(effect.parameters):
         return effect
-    return replace(effect, parameters=tuple(effect.parameters[k] for k in free), forward=FixedParameters(effect, free))
+    left = tuple(effect.parameters[k] for k in free)
+    sensors = tuple(s for s in effect.sensors if any(n.name.startswith(f"{s}_") for n in left)) or effect.sensors
+    return replace(effect, sensors=sensors, parameters=left, forward=FixedParameters(effect, free))
 
 
 def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
@@ -205,14 +207,11 @@ def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
 
 
 def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
-    """Unidentified parameters `effect.parameter`: as unsure as their prior, or fixed.
-
-    Coefficients of a curve are not named.
-    """
+    """Unidentified `effect.parameter`: as unsure as their prior, or fixed; none of a curve."""
     for parameter, s in zip(effect.parameters, std, strict=True):
         if s > (log_prior if parameter.positive else parameter.plausible) and not curve:
             yield f"{effect.key}.{parameter.name}"
-    if isinstance(effect.forward, FixedParameters):
+    if isinstance(effect.forward, FixedParameters) and effect.sensors == effect.forward.effect.sensors:
         free = {parameter.name for parameter in effect.parameters}
         yield from (f"{effect.key}.{n.name}" for n in effect.forward.effect.parameters if n.name not in free)
 

@@ -90,10 +90,11 @@ def at_recorded_motion(
     sim_s, _, sim_state = motion(pair.sim_state, settings)
     own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
     inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
-    ahead_s, relation, simulated = 0.0, None, dict[str, Column]()
+    ahead_s, simulated = 0.0, dict[str, Column]()
+    relation: Dynamics | WheelRelation | None = None
     for _ in range(STEP_ROUNDS):  # a simulator holds its efforts for a step, so they come half a step before their motion
         simulated = {name: np.interp(own_s[inside] + ahead_s, sim_s, values) for name, values in sim_state.items()}
-        relation = RELATIONS[pair.kind](simulated, pair.sim[inside])
+        relation = RELATIONS[pair.kind](simulated, pair.sim[inside], relation)
         if relation is None:
             raise DataError(
                 f"the {pair.kind} of {pair.name} do not follow from the motion in the simulation",
@@ -171,14 +172,14 @@ def _slope(t_s: Column, values: Column) -> Column:
     return np.asarray(make_interp_spline(t_s, values, k=5)(t_s, 1))
 
 
-def _wheels(state: Mapping[str, Column], columns: Float64[np.ndarray, "_ k"]) -> WheelRelation | None:
+def _wheels(state: Mapping[str, Column], columns: Float64[np.ndarray, "_ k"], _: WheelRelation | None) -> WheelRelation | None:
     speeds = np.stack(list(state.values()), axis=1)
-    weights, *_ = np.linalg.lstsq(speeds, columns, rcond=None)
+    weights = np.linalg.lstsq(speeds, columns, rcond=None)[0]
     left = (columns - speeds @ weights).std(axis=0)
     return WheelRelation(weights) if (left < WELL_DETERMINED * columns.std(axis=0)).all() else None
 
 
-RELATIONS: Mapping[str, Callable[[Any, Any], Dynamics | WheelRelation | None]] = {"efforts": identified, "wheels": _wheels}
+RELATIONS: Mapping[str, Callable[[Any, Any, Any], Dynamics | WheelRelation | None]] = {"efforts": identified, "wheels": _wheels}
 
 
 def state_on(ideal: IdealSignal, state: Mapping[str, Fields], start_ns: int) -> dict[str, Column]:

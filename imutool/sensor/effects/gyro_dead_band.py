@@ -12,6 +12,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples
 
 STEEP = 0.02  # of the width, in which a reading sets in: a derivative needs an edge that some samples lie on
 WIDTHS = 20  # that differ: halves and doubles of one have other samples in the band
+LEAST_RAD_S = 1e-6  # of a start: no digit of any gyro is finer
 LOG_STEP = 0.02  # of the derivative by the width
 
 
@@ -29,7 +30,7 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     error = error - np.median(error, axis=0)
     rate, better = np.abs(ideal).ravel(), (error**2 - (error + ideal) ** 2).ravel()
     order = np.argsort(rate)
-    return [np.array([max(float(rate[order][np.argmax(np.cumsum(better[order]))]), np.finfo(np.float64).tiny)])]
+    return [np.array([max(float(rate[order][np.argmax(np.cumsum(better[order]))]), LEAST_RAD_S)])]
 
 
 EFFECT = Effect(

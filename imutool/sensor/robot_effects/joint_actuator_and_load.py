@@ -10,34 +10,33 @@ Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.joint_dynamics import Dynamics, mass_coefficients
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 from imutool.sensor.robot_effects.scale import Scale
-from imutool.sensor.robot_effects.signal_samples import Samples, SignalSamples, State
+from imutool.sensor.robot_effects.signal_samples import Columns, Samples, SignalSamples, State
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
 LIMITS = (1.0, 1.5, 2.0)
+AXES = {2: "whose axes are level and up", 3: "whose third axis is up"}
 
 
 class _Payload:
     def __init__(self, dynamics: Dynamics) -> None:
-        self.dynamics, self.links = dynamics, dynamics.links
-        self._last: tuple[State, Float64[np.ndarray, "_ _ _"]] | None = None
+        self.dynamics = dynamics
+        self._last: tuple[State, Callable[[Theta], Columns]] | None = None
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         if self._last is None or self._last[0] is not s.state:  # a fit asks for other masses at the same motion
-            self._last = s.state, self.dynamics.chain(s.state)
-        coefficients = mass_coefficients(theta[0], [*self.links, complex(theta[1], theta[2])])
-        return s.but(s.y + self._last[1] @ coefficients)
+            self._last = s.state, self.dynamics.loaded(s.state)
+        return s.but(s.y + self._last[1](theta))
 
 
 @dataclass(frozen=True)
@@ -50,22 +49,19 @@ class _Rotor:
 
 def load_effects(scale: Scale) -> Iterator[Effect]:
     """Payload of a chain of hinges, and a rotor of each joint."""
-    n, dynamics = len(scale.names), scale.dynamics
-    if dynamics is not None and dynamics.signs and (n == 1 or dynamics.links):
-        arm = float(np.mean(np.abs(dynamics.links))) if dynamics.links else USUAL_ARM_M
-        parameters = (
-            Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01),
-            Parameter("x", "m", max(arm, 0.1)),
-            Parameter("y", "m", max(arm, 0.1)),
-        )
+    dynamics = scale.dynamics
+    if dynamics is not None and (reach := dynamics.reach) is not None:
+        arm, letters = reach or USUAL_ARM_M, "xy" if dynamics.spatial is None else "xyz"
+        place = tuple(Parameter(letter, "m", max(arm, 0.1)) for letter in letters)
+        axes = np.eye(len(letters))
         yield scale.effect(
             "payload",
             scale.columns,
-            "a point mass at (x, y) of the last link, whose axes are level and up where all angles are zero",
-            parameters,
+            f"a point mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero",
+            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place),
             _Payload(dynamics),
             "the arm moves against gravity, and fast enough for its inertia to show",
-            starts=[np.array([0.3, *(arm * np.array(at))]) for at in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))],
+            starts=[np.array([0.3, *(arm * at)]) for axis in axes for at in (axis, -axis)],
         )
     for k in scale.columns:
         yield scale.effect(

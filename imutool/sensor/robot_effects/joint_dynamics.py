@@ -1,10 +1,9 @@
 """Dynamics of jointed arms, identified from a simulation's own efforts and motion.
 
 Inverse dynamics are linear in the inertial parameters (Atkeson, An, Hollerbach, Estimation of inertial parameters of
-manipulator loads and links, IJRR 5, 1986). `chain_columns` holds for hinges with parallel axes, in absolute angles
-phi_i = sum of +-q_j, j <= i, of the links: D_i (kg m²) of a link, H_ij = conj(P_i) A_j (kg m²) between two, A_i (kg m)
-against gravity, with P_i the vector of a link in its own plane as a complex number. `general_factors` holds for other arms:
-accelerations, products of velocities and gravity, each times sines and cosines of sums of angles.
+manipulator loads and links, IJRR 5, 1986). `chain_columns` holds for hinges with parallel axes, `SpatialChain` for hinges whose
+axes point anywhere. `general_factors` holds for other arms of few joints: accelerations, products of velocities and gravity,
+each times sines and cosines of sums of angles.
 """
 
 from __future__ import annotations
@@ -15,14 +14,17 @@ from itertools import product
 
 import numpy as np
 
-from imutool.array_types import Complex128, Float64, Int64
+from imutool.array_types import Float64, Int64
+from imutool.sensor.effect import Theta
+from imutool.sensor.robot_effects.planar_chain import GRAVITY_M_S2, chain_columns, mass_coefficients, unpacked
 from imutool.sensor.robot_effects.signal_samples import Column, Columns, State
+from imutool.sensor.robot_effects.spatial_chain import Axes, SpatialChain, searched
 
-GRAVITY_M_S2 = 9.81
 MOST_JOINTS = 7
 MOST_COMBINED = 3  # joints up to which all sums of angles are tried
 RIDGE = 1e-9
 SCREENED = 1000  # samples that refute a wrong set of signs
+SEARCHED = 250  # samples that tell axes apart
 WELL_DETERMINED = 0.02  # of the efforts' size that a fit may leave
 STEEP = 0.01  # of a velocity's size, within which its sign turns
 
@@ -31,8 +33,9 @@ STEEP = 0.01  # of a velocity's size, within which its sign turns
 class Dynamics:
     """Efforts of an arm as a function of its motion (`q0`, `dq0`, `ddq0`, ...).
 
-    `signs` are those of the angles of a chain of parallel hinges, empty for any other arm; `left` is the standard deviation
-    of what the fit did not explain, by joint; `order` are the joints from base to tip, which a log need not keep.
+    `signs` are those of the angles of a chain of parallel hinges, empty for any other arm; `spatial` has the axes of another
+    chain of hinges. `left` is the standard deviation of what the fit did not explain, by joint; `order` are the joints from
+    base to tip, which a log need not keep.
     """
 
     joints: int
@@ -40,6 +43,7 @@ class Dynamics:
     coefficients: Float64[np.ndarray, "_ _"]
     left: tuple[float, ...]
     order: tuple[int, ...]
+    spatial: SpatialChain | None = None
 
     def __call__(self, state: State) -> Columns:
         """Efforts of all joints."""
@@ -47,6 +51,11 @@ class Dynamics:
         if self.signs:
             columns = np.concatenate([chain_columns(in_order, self.signs), own_columns(in_order, n)], axis=2)
             efforts = np.asarray(columns @ self.coefficients[0])
+        elif self.spatial is not None:
+            theta = self.coefficients[0]
+            efforts = self.spatial.efforts(self.spatial.moved(in_order), *self.spatial.unpacked(theta))
+            for k, own in enumerate(theta[self.spatial.moments :].reshape(n, -1)):
+                efforts[:, k] += sum(c * row for c, row in zip(own, _own(in_order, k), strict=True))
         else:
             trig, factors = general_factors(in_order, n)
             weights = self.coefficients[:, :-2].reshape(n * factors.shape[1], trig.shape[1])
@@ -55,9 +64,28 @@ class Dynamics:
                 efforts[:, k] += np.stack(_rates(in_order, k), axis=1) @ self.coefficients[k, -2:]
         return np.asarray(efforts[:, np.argsort(self.order)])
 
-    def chain(self, state: State) -> Float64[np.ndarray, "_ _ _"]:
-        """Efforts of a chain for each coefficient, joints in the order of the log."""
-        return chain_columns(_in_order(state, self.order), self.signs)[:, np.argsort(self.order)]
+    def loaded(self, state: State) -> Callable[[Theta], Columns]:
+        """Efforts that a point mass on the last link adds, by its mass and place."""
+        in_order, sorted_ = _in_order(state, self.order), np.argsort(self.order)
+        if self.spatial is None:
+            columns, links = chain_columns(in_order, self.signs)[:, sorted_], self.links
+            return lambda theta: columns @ mass_coefficients(theta[0], [*links, complex(theta[1], theta[2])])
+        chain, moved, origin = self.spatial, self.spatial.moved(in_order), self.spatial.origin(self.coefficients[0])
+        assert origin is not None, "a payload needs the lengths of the links"
+
+        def added(theta: Theta) -> Columns:
+            at = origin + chain.of_link(theta[1:])
+            return chain.efforts(moved, theta[0] * np.outer(at, at), theta[0] * at)[:, sorted_]
+
+        return added
+
+    @property
+    def reach(self) -> float | None:
+        """Mean length of a link (m), zero where there is one joint; None where gravity shows no lengths."""
+        if self.spatial is None:
+            return float(np.mean(np.abs(self.links))) if self.links else 0.0 if self.signs and self.joints == 1 else None
+        origin = self.spatial.origin(self.coefficients[0])
+        return None if origin is None else float(np.linalg.norm(origin)) / np.sqrt(self.joints)
 
     @property
     def links(self) -> tuple[complex, ...]:
@@ -70,49 +98,6 @@ class Dynamics:
         if abs(A[-1]) * np.sqrt(GRAVITY_M_S2) < 0.02 * size:
             return ()
         return tuple(np.conj(H[i, n - 1] / A[-1]) for i in range(n - 1))
-
-
-def unpacked(
-    theta: Float64[np.ndarray, " _"], n: int
-) -> tuple[Float64[np.ndarray, " _"], Complex128[np.ndarray, "_ _"], Complex128[np.ndarray, " _"]]:
-    """D, H and A of a chain from its coefficients; H and A are complex."""
-    H, at = np.zeros((n, n), complex), n
-    for i in range(n):
-        for j in range(i + 1, n):
-            H[i, j] = theta[at] + 1j * theta[at + 1]
-            at += 2
-    A = theta[at : at + 2 * n : 2] + 1j * theta[at + 1 : at + 2 * n : 2]
-    return theta[:n], H, A
-
-
-def mass_coefficients(mass: float, links: Sequence[complex]) -> Float64[np.ndarray, " _"]:
-    """Coefficients that a point mass adds at the end of some links."""
-    n = len(links)
-    pairs = [mass * np.conj(links[i]) * links[j] for i in range(n) for j in range(i + 1, n)]
-    out = [mass * abs(link) ** 2 for link in links]
-    return np.array([*out, *(part for z in [*pairs, *(mass * link for link in links)] for part in (z.real, z.imag))])
-
-
-def chain_columns(state: State, signs: Sequence[int]) -> Float64[np.ndarray, "_ _ _"]:
-    """Efforts of a chain of parallel hinges for each coefficient: rows, joints, coefficients."""
-    n = len(signs)
-    phi, dphi, ddphi = (
-        np.cumsum([sign * state[f"{kind}{k}"] for k, sign in enumerate(signs)], axis=0) for kind in ("q", "dq", "ddq")
-    )
-    out: list[dict[int, Column]] = [{i: ddphi[i]} for i in range(n)]
-    for i in range(n):
-        for j in range(i + 1, n):
-            angle = phi[j] - phi[i]
-            for c, slope in ((np.cos(angle), -np.sin(angle)), (-np.sin(angle), -np.cos(angle))):
-                out.append({i: c * ddphi[j] + slope * dphi[j] ** 2, j: c * ddphi[i] - slope * dphi[i] ** 2})
-    for i in range(n):
-        out += [{i: GRAVITY_M_S2 * np.cos(phi[i])}, {i: -GRAVITY_M_S2 * np.sin(phi[i])}]
-    columns = np.zeros((len(phi[0]), n, len(out)))
-    for p, rows in enumerate(out):
-        for i, row in rows.items():
-            for k in range(i + 1):  # a torque about an absolute angle acts on every joint before it
-                columns[:, k, p] += signs[k] * row
-    return columns
 
 
 def own_columns(state: State, n: int) -> Float64[np.ndarray, "_ _ _"]:
@@ -164,14 +149,18 @@ def _sums(n: int) -> Iterator[tuple[int, ...]]:
     yield from (tuple(2 * (k == j) for k in range(n)) for j in range(n))
 
 
-def identified(state: State, efforts: Columns) -> Dynamics | None:
+def identified(state: State, efforts: Columns, near: Dynamics | None = None) -> Dynamics | None:
     """Dynamics of a simulated arm; None where its efforts follow from no motion.
 
-    The joints are tried in the order of the log, and in that of their efforts: a base carries what a tip does.
+    The joints are tried in the order of the log, and in that of their efforts: a base carries what a tip does. `near` are the
+    dynamics at nearly the same motion.
     """
     n, size = efforts.shape[1], np.maximum(efforts.std(axis=0), 1e-12)
     if n > MOST_JOINTS:
         return None
+    if near is not None and near.spatial is not None:
+        order = near.order
+        return _spatial(near.spatial, _in_order(state, order), efforts[:, order], size[list(order)], order)
     orders = dict.fromkeys((tuple(range(n)), tuple(np.argsort(-size).tolist())))
 
     def found(find: Callable[..., Dynamics | None]) -> Iterator[Dynamics]:
@@ -179,7 +168,43 @@ def identified(state: State, efforts: Columns) -> Dynamics | None:
         yield from (dynamics for dynamics in each if dynamics is not None)
 
     chains = list(found(_chain))
-    return min(chains, key=lambda chain: max(np.array(chain.left) / size)) if chains else next(found(_general), None)
+    if chains:
+        return min(chains, key=lambda chain: max(np.array(chain.left) / size))
+    return next((dynamics for find in (_hinges, _general) for dynamics in found(find)), None)
+
+
+def _hinges(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
+    """A chain of hinges with axes at right angles or parallel, in its order."""
+    if len(order) == 1:
+        return None
+    every = max(1, len(efforts) // SEARCHED)
+    few, wanted = {name: values[::every] for name, values in state.items()}, efforts[::every]
+    own, enough = own_columns(few, len(order)), WELL_DETERMINED**2
+
+    def cost(axes: Axes) -> float:
+        _, left = _fitted(SpatialChain(axes).columns(few), own, wanted, size)
+        return float(((left / size) ** 2).mean())
+
+    axes = searched(len(order), cost, enough)
+    return None if axes is None else _spatial(SpatialChain(axes), state, efforts, size, order)
+
+
+def _spatial(
+    chain: SpatialChain, state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]
+) -> Dynamics | None:
+    """A chain of hinges with known axes."""
+    theta, left = _fitted(chain.columns(state), own_columns(state, len(order)), efforts, size)
+    well = (left < WELL_DETERMINED * size).all()
+    return Dynamics(len(order), (), theta[None], _by_joint(left, order), order, chain) if well else None
+
+
+def _fitted(
+    columns: Float64[np.ndarray, "_ _ _"], own: Float64[np.ndarray, "_ _ _"], efforts: Columns, size: Float64[np.ndarray, " n"]
+) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " n"]]:
+    """Coefficients that all joints share, and what they leave of the efforts."""
+    columns = np.concatenate([columns, own], axis=2)
+    theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (efforts / size).ravel()[:, None])[:, 0]
+    return theta, (efforts - columns @ theta).std(axis=0)
 
 
 def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
@@ -189,9 +214,7 @@ def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], orde
     sets = [(few, efforts[:: max(1, len(efforts) // SCREENED)]), (state, efforts)]  # most signs fail in a few samples
     for tail in product((1, -1), repeat=n - 1):
         for motion, wanted in sets:
-            columns = np.concatenate([chain_columns(motion, (1, *tail)), own_columns(motion, n)], axis=2)
-            theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (wanted / size).ravel()[:, None])[:, 0]
-            left = (wanted - columns @ theta).std(axis=0)
+            theta, left = _fitted(chain_columns(motion, (1, *tail)), own_columns(motion, n), wanted, size)
             if (left > WELL_DETERMINED * size).any():
                 break
         else:
@@ -210,7 +233,9 @@ def following(state: State, efforts: Columns) -> list[int]:
 
 
 def _general(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
-    """Any other arm, its joints from base to tip."""
+    """Any other arm, its joints from base to tip; of more joints the sums of angles are too many to be tried."""
+    if len(order) > MOST_COMBINED:
+        return None
     theta, left = _general_fit(state, efforts)
     well = (left < WELL_DETERMINED * size).all()
     return Dynamics(len(order), (), theta, _by_joint(left, order), order) if well else None

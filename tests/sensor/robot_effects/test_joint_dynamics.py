@@ -7,7 +7,9 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from imutool.sensor.robot_effects.joint_dynamics import Dynamics, chain_columns, following, identified, mass_coefficients
+from imutool.sensor.robot_effects.joint_dynamics import Dynamics, following, identified
+from imutool.sensor.robot_effects.planar_chain import chain_columns, mass_coefficients
+from imutool.sensor.robot_effects.spatial_chain import SpatialChain
 
 SIGNS = (1, 1, -1)
 CLOSE = 1e-4  # of the efforts: the ridge of the fit
@@ -73,3 +75,32 @@ def test_any_other_arm_is_the_sum_of_its_factors() -> None:
     assert isinstance(found, Dynamics)
     assert not found.signs
     assert np.abs(found(other) - torques(other)).max() < CLOSE * np.abs(torques(other)).max()
+
+
+def test_axes_that_point_anywhere_are_found_and_hold_at_another_motion() -> None:
+    """A shoulder, an elbow and a wrist across each other, with their lengths."""
+    own, other = motion(5), motion(6)
+    arm = SpatialChain(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]))
+    theta = np.zeros(arm.moments)
+    upper, tip = arm.of_link(np.array([0.0, 0.0, 0.4]), 1), arm.of_link(np.array([0.0, 0.1, 0.2]))
+    S, A = (
+        sum(m * f for m, f in each)
+        for each in (
+            [(2.0, np.outer(upper, upper)), (1.0, np.outer(upper + tip, upper + tip))],
+            [(2.0, upper), (1.0, upper + tip)],
+        )
+    )
+    theta[:] = np.append(np.asarray(S)[np.triu_indices(6)], A)
+    found = identified(own, arm.columns(own) @ theta)
+    assert found is not None
+    assert found.spatial is not None
+    wanted = arm.columns(other) @ theta
+    assert np.abs(found(other) - wanted).max() < CLOSE * np.abs(wanted).max()
+    assert np.allclose(wanted, arm.efforts(arm.moved(other), *arm.unpacked(theta)))
+    lengths = arm.origin(theta)
+    assert lengths is not None
+    assert np.allclose(lengths, upper)
+    more, moved = upper + tip, arm.moved(other)
+    added = arm.efforts(moved, 0.5 * np.outer(more, more), 0.5 * more)
+    masses = Dynamics(3, (), theta[None], (0.0,) * 3, (0, 1, 2), arm).loaded(other)
+    assert np.allclose(masses(np.array([0.5, 0.0, 0.1, 0.2])), added)

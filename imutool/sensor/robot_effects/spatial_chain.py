@@ -1,0 +1,171 @@
+"""Efforts of a chain of hinges across each other, linear in the moments of its links.
+
+A point of link i at x is at the sum of R_j r_j over the links before, and R_i x. With E the columns of all R_i side by side,
+efforts are those of d²E/dt² S and of gravity on A, where S (kg m²) and A (kg m) are the second and first moments of all
+links, one symmetric matrix and one vector (principle of d'Alembert). The part of R_i along its own axis moves with link i - 1:
+two columns a link are left. The directions of the axes alone are searched for, at right angles or parallel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.sensor.robot_effects.planar_chain import GRAVITY_M_S2
+from imutool.sensor.robot_effects.signal_samples import State
+
+DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])  # of an axis where all angles are zero: arms are built square
+STARTS, SEED = 10, 0
+LEAST_MOMENT = 0.02  # of the tip against gravity, over the arm's size, that shows the links' lengths
+Axes = Float64[np.ndarray, "n 3"]
+UNSURE = 1e-3  # weight of a length that a product of inertia hides
+Cost = Callable[[Axes], float]
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialChain:
+    """Axes of the joints from base to tip.
+
+    They are as they point where all angles are zero; the third direction is up.
+    """
+
+    axes: Axes
+
+    @cached_property
+    def bases(self) -> Float64[np.ndarray, "n 3 2"]:
+        """Two directions of each link, at right angles to its axis."""
+        return np.stack([np.linalg.svd(axis[None])[2][1:].T for axis in self.axes])
+
+    @property
+    def moments(self) -> int:
+        """Number of coefficients: those of S, and those of A."""
+        n = 2 * len(self.axes)
+        return n * (n + 3) // 2
+
+    def unpacked(self, theta: Float64[np.ndarray, " _"]) -> tuple[Float64[np.ndarray, "u u"], Float64[np.ndarray, " u"]]:
+        """S and A from coefficients."""
+        n = 2 * len(self.axes)
+        S, (a, b) = np.zeros((n, n)), np.triu_indices(n)
+        S[a, b] = S[b, a] = theta[: len(a)]
+        return S, np.asarray(theta[len(a) : self.moments])
+
+    def moved(self, state: State) -> Moved:
+        """Directions of links and axes in the world, with their accelerations."""
+        n, length = len(self.axes), len(state["q0"])
+        R, speed, spin = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, length)), np.zeros((3, length)), np.zeros((3, length))
+        axes, E, bent = np.empty((n, 3, length)), np.empty((2 * n, 3, length)), np.empty((2 * n, 3, length))
+        for k, (axis, basis) in enumerate(zip(self.axes, self.bases, strict=True)):
+            q, dq, ddq = (state[f"{kind}{k}"] for kind in ("q", "dq", "ddq"))
+            along = np.einsum("cdn,d->cn", R, axis)
+            spin = spin + along * ddq + _cross(speed, along) * dq
+            speed = speed + along * dq
+            turned = [np.einsum("cdn,d->cn", R, v) for v in np.eye(3)]
+            c, s, fixed = np.cos(q), np.sin(q), along * (1.0 - np.cos(q))
+            R = np.stack([c * v + s * _cross(along, v) + fixed * axis[j] for j, v in enumerate(turned)], axis=1)
+            axes[k] = along
+            for j, v in enumerate(basis.T):
+                E[2 * k + j] = e = np.einsum("cdn,d->cn", R, v)
+                bent[2 * k + j] = _cross(spin, e) + _cross(speed, _cross(speed, e))
+        return Moved(axes, E, bent)
+
+    def efforts(self, moved: Moved, S: Float64[np.ndarray, "u u"], A: Float64[np.ndarray, " u"]) -> Float64[np.ndarray, "n k"]:
+        """Efforts of all joints for some moments."""
+        force = np.tensordot(S, moved.bent, axes=1)
+        force[:, 2] += GRAVITY_M_S2 * A[:, None]
+        turning = _cross(moved.E.swapaxes(0, 1), force.swapaxes(0, 1))
+        links = turning[:, ::2] + turning[:, 1::2]
+        beyond = np.cumsum(links[:, ::-1], axis=1)[:, ::-1]  # a joint carries all links behind it
+        return np.asarray(np.einsum("kcn,ckn->nk", moved.axes, beyond))
+
+    def columns(self, state: State) -> Float64[np.ndarray, "_ _ _"]:
+        """Efforts for each coefficient: rows, joints, coefficients."""
+        moved, n = self.moved(state), len(self.axes)
+        a, b = np.triu_indices(2 * n)
+        weights = np.where(a == b, 0.5, 1.0)
+        out = np.zeros((moved.E.shape[2], n, self.moments))
+        for k in range(n):
+            arm = _cross(moved.axes[k][:, None], moved.E[2 * k :].swapaxes(0, 1)).transpose(2, 1, 0)
+            G = np.zeros((len(arm), 2 * n, 2 * n))
+            G[:, 2 * k :] = arm @ moved.bent.transpose(2, 1, 0)
+            out[:, k, : len(a)] = weights * (G + G.swapaxes(1, 2))[:, a, b]
+            out[:, k, len(a) + 2 * k :] = GRAVITY_M_S2 * arm[:, :, 2]
+        return out
+
+    def of_link(self, x: Float64[np.ndarray, " 3"], link: int = -1) -> Float64[np.ndarray, " u"]:
+        """A vector of a link, the last one, in the directions of all links."""
+        out, left = np.zeros(2 * len(self.axes)), np.asarray(x, float)
+        for k in reversed(range(len(self.axes))[: link + 1 or None]):
+            out[2 * k : 2 * k + 2] = self.bases[k].T @ left
+            left = self.axes[k] * float(self.axes[k] @ left)
+        return out
+
+    def origin(self, theta: Float64[np.ndarray, " _"]) -> Float64[np.ndarray, " u"] | None:
+        """Place of the last joint (m), in the directions of all links; None where gravity shows no lengths.
+
+        S between links i < j is r_i A_j. What link j weighs along its own axis moves with a link before: there S has a
+        product of inertia too, and says little of a length.
+        """
+        S, A = self.unpacked(theta)
+        n, size = len(self.axes), float(np.sqrt(np.abs(np.diag(S)).max()))
+        S, A = S.reshape(n, 2, n, 2), A.reshape(n, 2)
+        if float(np.linalg.norm(A[-1])) * np.sqrt(GRAVITY_M_S2) < LEAST_MOMENT**2 * size:
+            return None
+        out = np.zeros((n, 2))
+        for i in range(n - 1):
+            N, g = np.zeros((2, 2)), np.zeros(2)
+            for j in range(i + 1, n):
+                along = self.of_link(self.axes[j], j).reshape(n, 2)[i]
+                P = np.eye(2) - (1.0 - UNSURE) * np.outer(along, along)
+                N += float(A[j] @ A[j]) * P
+                g += P @ S[i, :, j] @ A[j]
+            out[i] = np.linalg.solve(N, g)
+        return out.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """World directions of the axes and of the links' two directions, and accelerations of those."""
+
+    axes: Float64[np.ndarray, "k 3 n"]
+    E: Float64[np.ndarray, "u 3 n"]
+    bent: Float64[np.ndarray, "u 3 n"]
+
+
+def searched(n: int, cost: Cost, enough: float) -> Axes | None:
+    """Axes whose cost is below enough, by turning one at a time from random ones.
+
+    None where none are found.
+    """
+    rng = np.random.default_rng(SEED)
+    for _ in range(STARTS):
+        axes, best = _descended(DIRECTIONS[rng.integers(0, len(DIRECTIONS), n)], cost)
+        if best < enough:
+            return axes
+    return None
+
+
+def _descended(axes: Axes, cost: Cost) -> tuple[Axes, float]:
+    best, turned = cost(axes), True
+    while turned:
+        turned = False
+        for other in _neighbours(axes):
+            if (now := cost(other)) < best:
+                axes, best, turned = other, now, True
+    return axes, best
+
+
+def _neighbours(axes: Axes) -> Iterator[Axes]:
+    for k in range(len(axes)):
+        for direction in DIRECTIONS:
+            if not np.array_equal(direction, axes[k]):
+                out = axes.copy()
+                out[k] = direction
+                yield out
+
+
+def _cross(a: Float64[np.ndarray, "..."], b: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
