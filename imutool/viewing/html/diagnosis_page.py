@@ -149,14 +149,18 @@ def _locations(d: Diagnosis) -> Iterator[str]:
 
 
 def _closed(first: Diagnosis, again: Diagnosis) -> Diagnosis:
-    """The first findings with samples of both: expected by the first simulation before, and by the second after."""
+    """The first findings with samples of both: expected by the first simulation before, and by the second after.
+
+    The ideal sensor is that of the first: samples of the second have the bias of physics.toml.
+    """
     traces = []
     t_s, expected = (np.concatenate([getattr(trace, name) for trace in first.traces]) for name in ("t_s", "before"))
+    ideals = [trace.ideal for trace in first.traces if trace.ideal is not None]
+    ideal = np.concatenate(ideals) if len(ideals) == len(first.traces) else None
     for after in again.traces:
         of_before, of_after = np.isin(t_s, after.t_s), np.isin(after.t_s, t_s)
         if not of_after.any():
             continue
-        ideal = after.ideal
         traces.append(
             replace(
                 after,
@@ -166,7 +170,7 @@ def _closed(first: Diagnosis, again: Diagnosis) -> Diagnosis:
                 after=after.before[of_after],
                 held_out=after.held_out[of_after],
                 truth=None if after.truth is None else after.truth.rows(of_after),
-                ideal=None if ideal is None else ideal[of_after],
+                ideal=None if ideal is None else ideal[of_before],
             )
         )
     return replace(again, traces=tuple(traces), findings=first.findings, signals={})

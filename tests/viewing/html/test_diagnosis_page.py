@@ -371,3 +371,19 @@ def test_a_missing_matplotlib_says_how_to_get_it(tmp_path: Path, monkeypatch: py
     with pytest.raises(ConfigError, match=r"pip install 'imutool\[report\]'"):
         write(diagnoses.NOTHING, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_paths_of_a_closed_loop_are_those_of_the_first_ideal_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples of the second simulation have a bias: integrated, it would drift away."""
+    drawn: list[np.ndarray | None] = []
+    monkeypatch.setattr(diagnosis_paths, "paths", lambda d: drawn.extend(trace.ideal for trace in d.traces))
+    (trace,) = diagnoses.ARM.traces
+    ideal = trace.before - 0.01
+    again = replace(diagnoses.NOTHING, traces=(replace(trace, ideal=ideal + 0.02),))
+    for expected in (ideal, None):
+        drawn.clear()
+        html(again, first=replace(diagnoses.ARM, traces=(replace(trace, ideal=expected),)))
+        (found,) = drawn
+        assert (found is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_array_equal(found, expected)
