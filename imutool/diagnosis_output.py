@@ -148,7 +148,7 @@ def diagnose(
 
 def _check_close(reals: Sequence[Location], sim: Location | None, folder: Path | None, *, overwrite: bool) -> None:
     if folder is None or len(reals) != 1:
-        raise ConfigError("needs one recording and a folder", where="`close`", fix="Give one recording, and a folder")
+        raise ConfigError("`close` needs one recording and a folder", fix="Give one recording, and a folder")
     inputs = [local(place, "close") for place in (reals[0], sim) if place is not None]
     check_outputs([OutputFile("close", folder, files=(*FILES, CLOSED, CLOSED_LOG))], inputs, overwrite=overwrite)
 

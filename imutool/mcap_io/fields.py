@@ -98,7 +98,7 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     Raises:
         LogError: no definition or another encoding than ros2msg and cdr.
     """
-    definition = _definition(log, log.topics[topic])
+    definition = definition_of(log, log.topics[topic])
     for _, rows in log.rows([topic]):
         with log.named(topic):
             return list(_paths(ros2_definition.Walk(rows.payload[0].tobytes(), definition), long))
@@ -138,7 +138,7 @@ def _offered(log: Log, topic: str) -> list[str]:
         return []
 
 
-def _definition(log: Log, topic: Topic) -> ros2_definition.Definition:
+def definition_of(log: Log, topic: Topic) -> ros2_definition.Definition:
     """Definition of a topic's messages.
 
     Raises:
@@ -186,7 +186,7 @@ class _Reader:
     sequences: list[np.ndarray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.definition = _definition(self.log, self.topic)
+        self.definition = definition_of(self.log, self.topic)
 
     def take(self, rows: Rows) -> None:
         """Takes in the next messages, all of one size."""

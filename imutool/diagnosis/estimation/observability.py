@@ -94,13 +94,12 @@ class FixedParameters:
         return self.effect.forward(signals, every)
 
 
-def with_free(effect: Effect, free: Sequence[int]) -> Effect:
-    """Effect with only some free parameters, by index, on their sensors; itself if they are all."""
+def with_free(effect: Effect, free: Sequence[int], sensors: tuple[str, ...] = ()) -> Effect:
+    """Effect with only some free parameters, by index, and on some sensors; itself if they are all."""
     if len(free) == len(effect.parameters):
         return effect
     left = tuple(effect.parameters[k] for k in free)
-    sensors = tuple(s for s in effect.sensors if any(n.name.startswith(f"{s}_") for n in left)) or effect.sensors
-    return replace(effect, sensors=sensors, parameters=left, forward=FixedParameters(effect, free))
+    return replace(effect, sensors=sensors or effect.sensors, parameters=left, forward=FixedParameters(effect, free))
 
 
 def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
@@ -142,7 +141,8 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[
         sizes = _plainer(complex_one.name, theta, poses=poses)
         rest = tuple(entry for entry in now.chosen if entry[0] is not complex_one)
         plainer = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
-        parts = [(with_free(effect, sizes[effect.name][0]), np.array(sizes[effect.name][1])) for effect in plainer]
+        starts = [sizes[effect.name] for effect in plainer]
+        parts = [(with_free(e, free, complex_one.sensors), np.array(at)) for e, (free, at) in zip(plainer, starts, strict=True)]
         trials = [fit(logs, (*rest, part), near=now) for part in parts]
         margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
         best = min(trials, key=bic, default=now)

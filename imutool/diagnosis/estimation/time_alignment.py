@@ -198,8 +198,9 @@ def _by_poses(
         return None
     there = trajectory.at(t_ns[rows])
     residual = samples[rows] - np.concatenate([there.omega_b, there.specific_force()], axis=1)
-    off = _gravity_error(rotation_matrices(there), residual[:, 3:])
-    residual[:, 3:] -= np.einsum("nji,j->ni", rotation_matrices(there), off)
+    R_wb = rotation_matrices(there)
+    off = _gravity_error(R_wb, residual[:, 3:])
+    residual[:, 3:] -= np.einsum("nji,j->ni", R_wb, off)
     residual = residual - residual.mean(axis=0)
     size, least = own.coarse_samples, np.maximum(noise, LEAST_NOISE)
     coarse = residual[: len(residual) // size * size].reshape(-1, size, 6).mean(axis=1)  # shows a misfit of motion

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
@@ -11,7 +10,9 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.quantities import unwrapped
-from imutool.mcap_io.fields import Fields
+from imutool.errors import LogError
+from imutool.mcap_io.codec.ros2_definition import Definition, Walk
+from imutool.mcap_io.fields import Fields, definition_of
 from imutool.mcap_io.log import Log
 from imutool.recording import seconds
 
@@ -24,32 +25,29 @@ DRIVES = 0.05  # of a vehicle's speed or turning, that a wheel makes
 
 
 def joint_names(log: Log, topic: str) -> list[list[str]]:
-    """Names of the joints in a topic's messages: one list, or those of several publishers."""
+    """Names of a topic's joints: one list, or two of several publishers; none if unreadable."""
     found = dict[tuple[str, ...], None]()
-    for _, rows in log.rows([topic]):
-        names, end = _names(rows.payload[0].tobytes())
-        found[tuple(names)] = None
-        differ = (rows.payload[:, 12:end] != rows.payload[0, 12:end]).any(axis=1)
-        for row in rows.payload[differ]:
-            found[tuple(_names(row.tobytes())[0])] = None
+    try:
+        definition = definition_of(log, log.topics[topic])
+        for _, rows in log.rows([topic]):
+            left = rows.payload
+            while len(left) and len(found) < 2:
+                names = _names(left[0].tobytes(), definition)
+                found[tuple(raw.removesuffix(b"\0").decode(errors="replace") for _, raw in names)] = None
+                same = np.ones(len(left), bool)
+                for at, raw in names:
+                    same &= (left[:, at : at + len(raw)] == np.frombuffer(raw, np.uint8)).all(axis=1)
+                left = left[~same]
+    except LogError:  # its numbers are not read either
+        return []
     return [list(names) for names in found]
 
 
-def _names(payload: bytes) -> tuple[list[str], int]:
-    """Names in a message, and where they end."""
-    order, at = "<" if payload[1] else ">", 12
-    texts, count = list[str](), 1  # the frame of the header, and then the names
-    try:
-        while len(texts) < count:
-            (size,) = struct.unpack_from(f"{order}I", payload, at)
-            texts.append(payload[at + 4 : at + 4 + max(size - 1, 0)].decode(errors="replace"))
-            at += 4 + size + (-size) % 4
-            if len(texts) == 1:
-                (names,) = struct.unpack_from(f"{order}I", payload, at)
-                count, at = 1 + names, at + 4
-    except struct.error:
-        return [], 12
-    return texts[1:], at
+def _names(payload: bytes, definition: Definition) -> list[tuple[int, bytes]]:
+    walk = Walk(payload, definition)
+    for _ in walk.leaves():
+        pass
+    return [(at, raw) for path, at, raw in walk.texts if path == "name"]
 
 
 def by_joint(fields: Mapping[str, Fields], wanted: Sequence[str], given: Sequence[str]) -> dict[str, Fields]:

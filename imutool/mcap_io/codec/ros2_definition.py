@@ -135,7 +135,8 @@ def decodes(payload: bytes, schema_name: str, text: bytes) -> bool:
 class Walk:
     """A walk over one message, in order.
 
-    `constants` are the bytes that another message must share to have the same layout.
+    `constants` are the bytes that another message must share to have the same layout; `texts` are path, place and bytes of each
+    text.
 
     Raises:
         LogError: not plain CDR, or the message ends before its fields do.
@@ -147,6 +148,7 @@ class Walk:
         self.payload, self.definition, self.position = payload, definition, 4
         self.order = "<" if payload[1] else ">"
         self.constants = [(0, payload[:2])]
+        self.texts: list[tuple[str, int, bytes]] = []
 
     def leaves(self) -> Iterator[Leaf]:
         """Every number of the message, rows of numbers as one."""
@@ -171,7 +173,8 @@ class Walk:
             yield Leaf(path, at, kind, count)
         elif field.kind == TEXT:
             for _ in range(self._bounded(1 if count is None else count)):
-                self._skip(self._word())
+                at = self._skip(self._word())
+                self.texts.append((path, at, self.payload[at : self.position]))
         elif field.kind == "wstring":
             raise LogError(f"{path} is a wide string, whose size ROS 2 leaves open", fix="Choose a field before it")
         else:
