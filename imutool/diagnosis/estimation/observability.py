@@ -95,7 +95,7 @@ class FixedParameters:
 
 
 def with_free(effect: Effect, free: Sequence[int], sensors: tuple[str, ...] = ()) -> Effect:
-    """Effect with only some free parameters, by index, and on some sensors; itself if they are all."""
+    """Effect with only some free parameters, by index, on some sensors; itself with all."""
     if len(free) == len(effect.parameters):
         return effect
     left = tuple(effect.parameters[k] for k in free)
