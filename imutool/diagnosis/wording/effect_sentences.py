@@ -107,7 +107,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",
-    "gravity": "gravity differs from what {w.other} takes it for, {w.main.labelled}",
+    "gravity": "gravity differs from that of {w.other}, {w.main.labelled}",
     "earth_rotation": "{w.it} feels the Earth turn, {w.main.labelled}",
     "vibration": "{w.it} vibrates at {w.main}",
     "mount_resonance": _mount_resonance,
