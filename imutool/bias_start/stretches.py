@@ -23,7 +23,7 @@ from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.temperature import with_temperatures
-from imutool.mcap_io.topics import CLEAN_FIX
+from imutool.mcap_io.topics import CLEAN_FIX, UNSET_FIX
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.recording.columns import MOST_GAP_S, jump_warnings
 
@@ -153,7 +153,7 @@ class StretchClock:
                 f"message {self.count + row} has the stamp {stamp_ns[row]} ns, which {how}: "
                 f"the message before has {stamp_ns[row] - step[row]} ns",
                 expected="stamps that increase",
-                fix=CLEAN_FIX,
+                fix=CLEAN_FIX if stamp_ns[row] else UNSET_FIX,
             )
         begins = np.flatnonzero((step > gap_ns) | (step < 0))
         self.stretches += [Stretch(int(stamp_ns[k]), float(step[k]) * 1e-9) for k in begins[:MOST_STRETCHES]]

@@ -32,15 +32,19 @@ class Stamps(NamedTuple):
 
     Attributes:
         batch: mean samples in a batch; 1 where they come one by one.
+        unset: whether all are the same, as a driver leaves them that fills in none.
     """
 
     stamp_ns: Int64[np.ndarray, " n"]
     wraps: Counter[str]
     batch: float
+    unset: bool
 
     @property
     def told(self) -> list[str]:
         """What is wrong, in words."""
+        if self.unset:
+            return [f"the stamps are not set: each is {self.stamp_ns[0]} ns"]
         words = [
             f"the clock of the stamps wraps {count} times, as a counter of {name} does" for name, count in self.wraps.items()
         ]
@@ -62,7 +66,8 @@ def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
     whole = np.concatenate([stamp_ns[:1], stamp_ns[:1] + np.cumsum(steps)]) if len(stamp_ns) else stamp_ns
     near = steps[(steps >= 0) & (steps < GAP_NS)]
     share = float((near < BUNCHED * near.mean()).mean()) if len(near) > WINDOW else 0.0
-    return Stamps(whole, wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0)
+    unset = len(steps) > 0 and not np.diff(stamp_ns).any()
+    return Stamps(whole, wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0, unset)
 
 
 def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:

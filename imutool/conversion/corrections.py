@@ -196,9 +196,12 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 continue
             if STAMPS in wanted:
                 log_ns, before = _times(raw_batches(log, topic))
-                stamps[topic], found = restamped(before), read_stamps(before)
-                moved_s = 1e-9 * float(np.abs(stamps[topic] - before).max(initial=0))
-                line = f"stamps are now on a line under them, moved by {moved_s:.6f} s at most"
+                found = read_stamps(before)
+                late_stamps = log_ns if found.unset else before
+                stamps[topic] = restamped(late_stamps)
+                moved_s = 1e-9 * float(np.abs(stamps[topic] - late_stamps).max(initial=0))
+                under = "the log times" if found.unset else "them"
+                line = f"stamps are now on a line under {under}, moved by {moved_s:.6f} s at most"
                 notes[topic].append("; ".join([*found.told, line]))
                 if found.wraps and not clock:
                     clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
@@ -219,11 +222,12 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             if described.message_encoding in ENCODINGS and described.reflected is None:
                 decode = described.decode_poses if described.schema_name in MESSAGE_POSES else described.decode_scalars
                 log_ns, before = _times(batch for _, rows in log.rows([described.name]) for batch in decode(rows))
-                whole_ns = _unwrapped(log_ns, before, **clock)
+                found = read_stamps(before)
+                whole_ns = log_ns if found.unset else _unwrapped(log_ns, before, **clock)
                 if (whole_ns != before).any():
                     stamps[described.name] = whole_ns
-                    told = "; ".join(read_stamps(before).told) or "stamps start after a wrap"
-                    notes[described.name].append(f"{told}; they run on now")
+                    told = "; ".join(found.told) or "stamps start after a wrap"
+                    notes[described.name].append(f"{told}; they {'are the log times' if found.unset else 'run on'} now")
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
     return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, said)
 

@@ -41,6 +41,7 @@ UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
+UNSET_FIX = "A stamp of 0 is not set: imutool convert LOG OUT --restamp takes the log times"
 
 
 @dataclass(frozen=True)
@@ -187,6 +188,7 @@ class StampCheck:
                 f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
                 f"the message before has {before[row]} ns",
                 expected="stamps that increase",
+                fix="" if stamp_ns[row] else UNSET_FIX,
             )
         self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
@@ -200,7 +202,7 @@ class StampCheck:
             check_finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
             self.check(batch.stamp_ns, batch.sequence)
         except LogError as error:
-            raise LogError(error.what, expected=error.expected, fix=CLEAN_FIX) from error
+            raise LogError(error.what, expected=error.expected, fix=error.fix or CLEAN_FIX) from error
 
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:

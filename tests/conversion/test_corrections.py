@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,10 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
+from imutool.api.models import debias as debias_log
 from imutool.conversion.corrections import RECORD
 from imutool.conversion.run import convert
+from imutool.errors import LogError
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -97,6 +100,37 @@ def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: P
     assert inspect(tmp_path / "even.mcap").warnings == []
 
 
+def with_times(source: Path, target: Path, times: Callable[[int, int], tuple[int, int]]) -> None:
+    """Write a log again, with other header stamps and log times."""
+    with source.open("rb") as file, target.open("wb") as out:
+        reader, writer = make_reader(file), Writer(out)
+        writer.start()
+        ids: dict[str, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic not in ids:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata)
+            seconds, nanos = struct.unpack_from("<iI", message.data, 4)
+            stamp_ns, log_time = times(seconds * 10**9 + nanos, message.log_time)
+            data = bytearray(message.data)
+            struct.pack_into("<iI", data, 4, *divmod(stamp_ns, 10**9))
+            writer.add_message(ids[channel.topic], log_time, bytes(data), log_time)
+        writer.finish()
+
+
+def test_stamps_that_were_never_set_become_the_log_times(made: Recording, tmp_path: Path) -> None:
+    write(made, tmp_path / "made.mcap")
+    with_times(tmp_path / "made.mcap", tmp_path / "unset.mcap", lambda _, log_time: (0, log_time))
+    assert any("the stamps are not set: each is 0 ns; imutool convert" in w for w in inspect(tmp_path / "unset.mcap").warnings)
+    for run in (read, lambda path: debias_log(path, tmp_path / "debiased.mcap", model="static")):
+        with pytest.raises(LogError, match="A stamp of 0 is not set: imutool convert LOG OUT --restamp"):
+            run(tmp_path / "unset.mcap")
+    convert(tmp_path / "unset.mcap", tmp_path / "set.mcap", correct=["stamps"])
+    found = read(tmp_path / "set.mcap")
+    assert np.abs(found.imu.t_ns - made.imu.t_ns).max() <= 1
+    assert (found.truth.t_ns == made.truth.t_ns).all()
+
+
 @pytest.mark.parametrize("late_poses", [False, True], ids=["poses wrap too", "poses start after the wrap"])
 def test_a_counter_that_wraps_runs_on_for_the_imu_and_the_poses_alike(
     made: Recording, tmp_path: Path, late_poses: bool
@@ -106,21 +140,11 @@ def test_a_counter_that_wraps_runs_on_for_the_imu_and_the_poses_alike(
     truth = made.truth.between(wrap_ns + 1_000_000_000, int(made.imu.t_ns[-1])) if late_poses else made.truth
     write(replace(made, truths={"/ground_truth/pose": truth}), tmp_path / "made.mcap")
     rng = np.random.default_rng(2)
-    with (tmp_path / "made.mcap").open("rb") as source, (tmp_path / "wrapped.mcap").open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
-        writer.start()
-        ids: dict[str, int] = {}
-        for schema, channel, message in reader.iter_messages():
-            if channel.topic not in ids:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                ids[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number, channel.metadata)
-            seconds, nanos = struct.unpack_from("<iI", message.data, 4)
-            counted_ns = (seconds * 10**9 + nanos - wrap_ns) // 1000 * 1000 % size_ns
-            data = bytearray(message.data)
-            struct.pack_into("<iI", data, 4, *divmod(counted_ns, 10**9))
-            late_ns = message.log_time + int(rng.integers(0, 3_000_000))
-            writer.add_message(ids[channel.topic], late_ns, bytes(data), late_ns)
-        writer.finish()
+
+    def wrapped(stamp_ns: int, log_time: int) -> tuple[int, int]:
+        return (stamp_ns - wrap_ns) // 1000 * 1000 % size_ns, log_time + int(rng.integers(0, 3_000_000))
+
+    with_times(tmp_path / "made.mcap", tmp_path / "wrapped.mcap", wrapped)
     report = convert(tmp_path / "wrapped.mcap", tmp_path / "whole.mcap", correct=["stamps"])
     whole = read(tmp_path / "whole.mcap")
     origin_ns = wrap_ns - size_ns  # when the counter was at 0
