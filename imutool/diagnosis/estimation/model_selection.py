@@ -96,13 +96,15 @@ def select_effects(
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
     search, settings, waiting, before = replace(first, unnamed=tuple(unnamed)), first.settings, list(later), first.before
+    largest = 0.0  # effect's squares
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
         hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
         hopeless &= before - now.objective < settings.hopeless_share * (before - now.numbers)
         better = search.added(now) if count < settings.most_effects and not hopeless else None
-        if better is not None:
+        if better is not None and now.objective - better.objective >= settings.negligible_share * largest:
+            largest = max(largest, now.objective - better.objective)
             before, now = now.objective, search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
@@ -141,9 +143,8 @@ class _Search:
 
     def added(self, now: Fit) -> Fit | None:
         """The best fit with one more effect; none if chance explains its gain."""
-        share, count = self.settings.rival_share, self.settings.fitted_each_round
-        if self.trials_of is not now:
-            self.trials_of, self.trials = now, {}
+        share, count, settings = self.settings.rival_share, self.settings.fitted_each_round, self.settings
+        self.trials_of, self.trials = now, self.trials if self.trials_of is now else {}
         allowed = self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
         best: tuple[float, Fit] | None = None
         for promised, effect, start, gain in self.candidates.ranked(now, allowed, count)[:count]:
@@ -162,8 +163,7 @@ class _Search:
             best = (log_p, trial) if best is None or log_p < best[0] else best
         if best is None or best[0] > self.threshold:
             return None
-        enough = self.settings.unnamed_share * (self.before - now.numbers)
-        if unnamed_count(best[1]) and now.objective - best[1].objective < enough:
+        if unnamed_count(best[1]) and now.objective - best[1].objective < settings.unnamed_share * (self.before - now.numbers):
             return None  # the rim of something that has no name: a name for it would be wrong
         return self.candidates.jump_on_trend(now, best[1], self.named, self.threshold)
 

@@ -111,6 +111,8 @@ class AlignedSignal(AlignedLog):
         for k, name in enumerate(name for name in sampled.state if name.startswith("v")):
             state[f"noise{k}"] = float(white_noise(sampled.state[name][:, None])[0])
         dynamics = relation if isinstance(relation, Dynamics) else None
+        if dynamics is not None:  # friction may be more than all that the simulation needs
+            size = tuple(np.maximum(size, self.real.std(axis=0)).tolist())
         duration_s = float(self.stamp_s[-1] - self.stamp_s[0])
         return Scale(self.names, self.units, size, slope, self.lag_s, duration_s, state, dynamics)
 

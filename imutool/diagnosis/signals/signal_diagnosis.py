@@ -87,8 +87,8 @@ def diagnose_signal(
     Raises:
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
-    settings = settings or DiagnoseSettings()
-    signal = aligned(pair, others, settings)
+    signal = _with_own_search(aligned(pair, others, settings or DiagnoseSettings()))
+    settings = signal.settings
     lsb = lsb_of(pair, settings)
     always: Chosen = tuple((common.offset(signal, k), np.zeros(1)) for k in range(signal.columns))
     candidates = catalogue(signal)
@@ -103,6 +103,15 @@ def diagnose_signal(
         log = rewhitened  # the effects' own high frequencies were taken for noise
         selection = _selected(log, candidates, always)
     return _summarized(log, candidates, selection, lsb, settings)
+
+
+def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
+    """Signal whose search is for effects of each column, but for those that `_above_model_error` would leave out."""
+    search = signal.settings.search
+    most = max(search.most_effects, search.effects_each_column * signal.columns)
+    least = max(search.negligible_share, 0.0 if signal.band_hz is None else SMALL_GAIN)
+    search = msgspec.structs.replace(search, most_effects=most, negligible_share=least)
+    return replace(signal, settings=msgspec.structs.replace(signal.settings, search=search))
 
 
 def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
@@ -129,11 +138,13 @@ def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) ->
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
     named = _with_stiction(log, select_effects([log], candidates, [driven], always=always), signal.settings)
-    if named.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
+    left, largest = named.whole.objective - named.whole.numbers, max((one.gain for one in named.selected), default=0.0)
+    settings = signal.settings.search
+    if named.whole.reduced_chi_square < settings.explained_chi_square or left < settings.negligible_share * largest:
         return named  # a term may fit as well as a name, and says less
     equations = [effect for k in columns for effect in terms(signal, k)]
     selection = _with_stiction(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
-    if selection.whole.reduced_chi_square < signal.settings.search.explained_chi_square:
+    if selection.whole.reduced_chi_square < settings.explained_chi_square:
         return selection
     curves = [effect for k in columns for effect in common.unknown(signal, k)]
     curved = _with_stiction(log, select_effects([log], candidates, [driven, curves], always=always), signal.settings)
@@ -222,10 +233,10 @@ def _above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selectio
     if pair.band_hz is None or not selection.selected:
         return selection, []
     least, scale = SMALL_GAIN * max(selected.gain for selected in selection.selected), pair.scale()
-    sizes = [_sizes(log, selection, selected) for selected in selection.selected]
-    largest, kept, small = max(float(of.max()) for of in sizes), list[SelectedEffect](), list[SelectedEffect]()
-    for selected, size in zip(selection.selected, sizes, strict=True):
-        clear = (size >= LEARNT_ERROR * np.array(scale.size)).any() and size.max() >= np.sqrt(SMALL_GAIN) * largest
+    sizes = np.stack([_sizes(log, selection, selected) for selected in selection.selected])
+    enough = np.maximum(LEARNT_ERROR * np.array(scale.size), np.sqrt(SMALL_GAIN) * sizes.max(axis=0))
+    kept, small = list[SelectedEffect](), list[SelectedEffect]()
+    for selected, clear in zip(selection.selected, (sizes >= enough).any(axis=1), strict=True):
         (kept if selected.gain >= least and clear else small).append(selected)
     names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names

@@ -22,9 +22,12 @@ from imutool.sensor.robot_effects.signal_samples import Columns, Samples, Signal
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
+OFFSET_M = 0.1  # of two axes of a wrist
+UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
-LIMITS = (1.0, 1.5, 2.0)
+LIMITS = (0.5, 1.0, 1.5, 2.0)
+OFFSETS = "; offsets: lengths before it, which the simulated arm's own weight does not show"
 AXES = {2: "whose axes are level and up", 3: "whose third axis is up"}
 
 
@@ -53,12 +56,13 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
     if dynamics is not None and (reach := dynamics.reach) is not None:
         arm, letters = reach or USUAL_ARM_M, "xy" if dynamics.spatial is None else "xyz"
         place = tuple(Parameter(letter, "m", max(arm, 0.1)) for letter in letters)
-        axes = np.eye(len(letters))
+        offsets = tuple(Parameter(f"offset_{k + 1}", "m", OFFSET_M) for k in range(dynamics.offsets))
+        axes, more = np.eye(len(letters), len(letters) + len(offsets)), OFFSETS if offsets else ""
         yield scale.effect(
             "payload",
             scale.columns,
-            f"a point mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero",
-            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place),
+            f"a point mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero{more}",
+            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place, *offsets),
             _Payload(dynamics),
             "the arm moves against gravity, and fast enough for its inertia to show",
             starts=[np.array([0.3, *(arm * at)]) for axis in axes for at in (axis, -axis)],
@@ -76,7 +80,10 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
 
 @dataclass(frozen=True)
 class _Kept:
-    """What the actuator keeps back of a command: all within `width`, or what is above `limit`."""
+    """What the actuator keeps back of a command: all within `width`, or what is above `limit`.
+
+    What acts has to be like the effort that the motion needs: a command alone would explain itself, and hide a large friction.
+    """
 
     joint: int
     name: str
@@ -85,7 +92,9 @@ class _Kept:
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         u: Samples = s.channel(self.name)
         inside = np.clip(u, -theta[0], theta[0])
-        return s.with_added(self.joint, u - inside if self.limits else inside)
+        kept, needed = (u - inside if self.limits else inside), s.y[:, self.joint]
+        like = np.std(u - kept - needed) < UNLIKE * np.std(needed)
+        return s.with_added(self.joint, kept) if like else s
 
 
 def _delayed(taken_s: Samples, theta: Theta) -> Samples:

@@ -25,6 +25,7 @@ MOST_COMBINED = 3  # joints up to which all sums of angles are tried
 RIDGE = 1e-9
 SCREENED = 1000  # samples that refute a wrong set of signs
 SEARCHED = 250  # samples that tell axes apart
+MOST_OFFSETS = 3  # lengths of an arm that a payload alone may show
 WELL_DETERMINED = 0.02  # of the efforts' size that a fit may leave
 STEEP = 0.01  # of a velocity's size, within which its sign turns
 
@@ -65,27 +66,32 @@ class Dynamics:
         return np.asarray(efforts[:, np.argsort(self.order)])
 
     def loaded(self, state: State) -> Callable[[Theta], Columns]:
-        """Efforts that a point mass on the last link adds, by its mass and place."""
+        """Efforts that a point mass on the last link adds, by its mass and place, and the `offsets` of the joints before."""
         in_order, sorted_ = _in_order(state, self.order), np.argsort(self.order)
         if self.spatial is None:
             columns, links = chain_columns(in_order, self.signs)[:, sorted_], self.links
             return lambda theta: columns @ mass_coefficients(theta[0], [*links, complex(theta[1], theta[2])])
-        chain, moved, origin = self.spatial, self.spatial.moved(in_order), self.spatial.origin(self.coefficients[0])
-        assert origin is not None, "a payload needs the lengths of the links"
+        chain, moved = self.spatial, self.spatial.moved(in_order)
+        origin, unknown = chain.origin(self.coefficients[0])
 
         def added(theta: Theta) -> Columns:
-            at = origin + chain.of_link(theta[1:])
+            at = origin + chain.of_link(theta[1:4]) + unknown @ theta[4:]
             return chain.efforts(moved, theta[0] * np.outer(at, at), theta[0] * at)[:, sorted_]
 
         return added
+
+    @property
+    def offsets(self) -> int:
+        """Lengths of a chain across each other that its own weight does not show, where it has a payload."""
+        return 0 if self.spatial is None else self.spatial.origin(self.coefficients[0])[1].shape[1]
 
     @property
     def reach(self) -> float | None:
         """Mean length of a link (m), zero where there is one joint; None where gravity shows no lengths."""
         if self.spatial is None:
             return float(np.mean(np.abs(self.links))) if self.links else 0.0 if self.signs and self.joints == 1 else None
-        origin = self.spatial.origin(self.coefficients[0])
-        return None if origin is None else float(np.linalg.norm(origin)) / np.sqrt(self.joints)
+        reach = float(np.linalg.norm(self.spatial.origin(self.coefficients[0])[0])) / np.sqrt(self.joints)
+        return reach if self.offsets <= MOST_OFFSETS else None
 
     @property
     def links(self) -> tuple[complex, ...]:
@@ -174,18 +180,17 @@ def identified(state: State, efforts: Columns, near: Dynamics | None = None) -> 
 
 
 def _hinges(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
-    """A chain of hinges with axes at right angles or parallel, in its order."""
+    """A chain of hinges across each other, in its order."""
     if len(order) == 1:
         return None
     every = max(1, len(efforts) // SEARCHED)
     few, wanted = {name: values[::every] for name, values in state.items()}, efforts[::every]
-    own, enough = own_columns(few, len(order)), WELL_DETERMINED**2
+    own = own_columns(few, len(order))
 
-    def cost(axes: Axes) -> float:
-        _, left = _fitted(SpatialChain(axes).columns(few), own, wanted, size)
-        return float(((left / size) ** 2).mean())
+    def residual(axes: Axes) -> Float64[np.ndarray, " _"]:
+        return np.asarray((_fitted(SpatialChain(axes).columns(few), own, wanted, size)[1] / size).ravel())
 
-    axes = searched(len(order), cost, enough)
+    axes = searched(len(order), residual, WELL_DETERMINED)
     return None if axes is None else _spatial(SpatialChain(axes), state, efforts, size, order)
 
 
@@ -193,18 +198,19 @@ def _spatial(
     chain: SpatialChain, state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]
 ) -> Dynamics | None:
     """A chain of hinges with known axes."""
-    theta, left = _fitted(chain.columns(state), own_columns(state, len(order)), efforts, size)
+    theta, residual = _fitted(chain.columns(state), own_columns(state, len(order)), efforts, size)
+    left = residual.std(axis=0)
     well = (left < WELL_DETERMINED * size).all()
     return Dynamics(len(order), (), theta[None], _by_joint(left, order), order, chain) if well else None
 
 
 def _fitted(
     columns: Float64[np.ndarray, "_ _ _"], own: Float64[np.ndarray, "_ _ _"], efforts: Columns, size: Float64[np.ndarray, " n"]
-) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " n"]]:
+) -> tuple[Float64[np.ndarray, " p"], Columns]:
     """Coefficients that all joints share, and what they leave of the efforts."""
     columns = np.concatenate([columns, own], axis=2)
     theta = _solved((columns / size[:, None]).reshape(-1, columns.shape[2]), (efforts / size).ravel()[:, None])[:, 0]
-    return theta, (efforts - columns @ theta).std(axis=0)
+    return theta, np.asarray(efforts - columns @ theta)
 
 
 def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], order: tuple[int, ...]) -> Dynamics | None:
@@ -214,7 +220,8 @@ def _chain(state: State, efforts: Columns, size: Float64[np.ndarray, " n"], orde
     sets = [(few, efforts[:: max(1, len(efforts) // SCREENED)]), (state, efforts)]  # most signs fail in a few samples
     for tail in product((1, -1), repeat=n - 1):
         for motion, wanted in sets:
-            theta, left = _fitted(chain_columns(motion, (1, *tail)), own_columns(motion, n), wanted, size)
+            theta, residual = _fitted(chain_columns(motion, (1, *tail)), own_columns(motion, n), wanted, size)
+            left = residual.std(axis=0)
             if (left > WELL_DETERMINED * size).any():
                 break
         else:

@@ -3,7 +3,7 @@
 A point of link i at x is at the sum of R_j r_j over the links before, and R_i x. With E the columns of all R_i side by side,
 efforts are those of d²E/dt² S and of gravity on A, where S (kg m²) and A (kg m) are the second and first moments of all
 links, one symmetric matrix and one vector (principle of d'Alembert). The part of R_i along its own axis moves with link i - 1:
-two columns a link are left. The directions of the axes alone are searched for, at right angles or parallel.
+two columns a link are left. The directions of the axes alone are searched for: first at right angles or parallel, then near.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
 from imutool.sensor.robot_effects.planar_chain import GRAVITY_M_S2
 from imutool.sensor.robot_effects.signal_samples import State
 
-DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])  # of an axis where all angles are zero: arms are built square
+DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])  # of an axis where all angles are zero: most arms are built square
 STARTS, SEED = 10, 0
+EVALUATIONS = 30  # of a residual, with its derivatives, at most
 LEAST_MOMENT = 0.02  # of the tip against gravity, over the arm's size, that shows the links' lengths
 Axes = Float64[np.ndarray, "n 3"]
-UNSURE = 1e-3  # weight of a length that a product of inertia hides
+APART = 0.2  # of a direction that no place on the last link has
+UNSURE = 1e-3  # square of the sine from which on a product of inertia hides a length
 Cost = Callable[[Axes], float]
 
 
@@ -103,8 +107,8 @@ class SpatialChain:
             left = self.axes[k] * float(self.axes[k] @ left)
         return out
 
-    def origin(self, theta: Float64[np.ndarray, " _"]) -> Float64[np.ndarray, " u"] | None:
-        """Place of the last joint (m), in the directions of all links; None where gravity shows no lengths.
+    def origin(self, theta: Float64[np.ndarray, " _"]) -> tuple[Float64[np.ndarray, " u"], Float64[np.ndarray, "u m"]]:
+        """Place of the last joint (m), in the directions of all links, and the directions in which nothing shows it.
 
         S between links i < j is r_i A_j. What link j weighs along its own axis moves with a link before: there S has a
         product of inertia too, and says little of a length.
@@ -112,18 +116,31 @@ class SpatialChain:
         S, A = self.unpacked(theta)
         n, size = len(self.axes), float(np.sqrt(np.abs(np.diag(S)).max()))
         S, A = S.reshape(n, 2, n, 2), A.reshape(n, 2)
-        if float(np.linalg.norm(A[-1])) * np.sqrt(GRAVITY_M_S2) < LEAST_MOMENT**2 * size:
-            return None
-        out = np.zeros((n, 2))
+        out, unknown = np.zeros((n, 2)), list[Float64[np.ndarray, " u"]]()
         for i in range(n - 1):
-            N, g = np.zeros((2, 2)), np.zeros(2)
+            N, shown, g = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
             for j in range(i + 1, n):
                 along = self.of_link(self.axes[j], j).reshape(n, 2)[i]
-                P = np.eye(2) - (1.0 - UNSURE) * np.outer(along, along)
-                N += float(A[j] @ A[j]) * P
-                g += P @ S[i, :, j] @ A[j]
-            out[i] = np.linalg.solve(N, g)
-        return out.ravel()
+                squared = max(float(along @ along), 1e-300)
+                P, weight = np.outer(along, along) / squared, 1.0 / (1.0 + squared / UNSURE)
+                shown += float(A[j] @ A[j]) * (np.eye(2) - (weight < 0.5) * P)
+                N += float(A[j] @ A[j]) * (np.eye(2) - (1.0 - weight) * P)
+                g += (np.eye(2) - (1.0 - weight) * P) @ S[i, :, j] @ A[j]
+            squares, directions = np.linalg.eigh(shown)
+            known = np.sqrt(GRAVITY_M_S2 * np.maximum(squares, 0.0)) >= LEAST_MOMENT**2 * size
+            kept = directions[:, known]
+            out[i] = kept @ np.linalg.solve(kept.T @ N @ kept, kept.T @ g)
+            unknown += [np.eye(n)[i][:, None].dot(d[None]).ravel() for d in directions[:, ~known].T]
+        return out.ravel(), self._beyond_last_link(unknown)
+
+    def _beyond_last_link(self, unknown: list[Float64[np.ndarray, " u"]]) -> Float64[np.ndarray, "u m"]:
+        """Directions that no place on the last link has."""
+        if not unknown:
+            return np.zeros((2 * len(self.axes), 0))
+        own = np.stack([self.of_link(axis) for axis in np.eye(3)], axis=1)
+        U = np.stack(unknown, axis=1)
+        left, sizes, _ = np.linalg.svd(U - own @ np.linalg.lstsq(own, U, rcond=None)[0], full_matrices=False)
+        return np.asarray(left[:, sizes > APART])
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +152,45 @@ class Moved:
     bent: Float64[np.ndarray, "u 3 n"]
 
 
-def searched(n: int, cost: Cost, enough: float) -> Axes | None:
-    """Axes whose cost is below enough, by turning one at a time from random ones.
+def searched(n: int, residual: Callable[[Axes], Float64[np.ndarray, " _"]], enough: float) -> Axes | None:
+    """Axes whose residual is below enough (root mean square); None where none are found.
 
-    None where none are found.
+    Axes at right angles are turned one at a time from random ones. The best of them are then turned by small angles, and stay
+    square where that explains no more than chance (BIC).
     """
-    rng = np.random.default_rng(SEED)
+    rng, found = np.random.default_rng(SEED), list[tuple[float, Axes]]()
+
+    def cost(axes: Axes) -> float:
+        return float((residual(axes) ** 2).mean())
+
     for _ in range(STARTS):
         axes, best = _descended(DIRECTIONS[rng.integers(0, len(DIRECTIONS), n)], cost)
-        if best < enough:
-            return axes
-    return None
+        found.append((best, axes))
+        if best < enough**2:
+            break
+    best, axes = min(found, key=lambda each: each[0])
+    turned = _turned(axes, residual)
+    rows = len(residual(axes))
+    if rows * np.log(best / cost(turned)) > 2 * n * np.log(rows):
+        best, axes = cost(turned), turned
+    return axes if best < enough**2 else None
+
+
+def _turned(axes: Axes, residual: Callable[[Axes], Float64[np.ndarray, " _"]]) -> Axes:
+    """Axes of the least residual near others, turned about the vertical to be as near to those as they can."""
+    n, bases = len(axes), SpatialChain(axes).bases
+
+    def at(x: Float64[np.ndarray, " _"]) -> Axes:
+        out = axes + np.einsum("kij,kj->ki", bases, x.reshape(n, 2))
+        return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+    def left(x: Float64[np.ndarray, " _"]) -> Float64[np.ndarray, " _"]:
+        return residual(at(x))
+
+    out = at(least_squares(left, np.zeros(2 * n), max_nfev=EVALUATIONS).x)
+    (sx, sy), (ox, oy) = axes[:, :2].T, out[:, :2].T
+    turn = np.arctan2((ox * sy - oy * sx).sum(), (ox * sx + oy * sy).sum())  # gravity does not show it
+    return np.asarray(Rotation.from_euler("z", turn).apply(out))
 
 
 def _descended(axes: Axes, cost: Cost) -> tuple[Axes, float]:

@@ -6,6 +6,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics, following, identified
 from imutool.sensor.robot_effects.planar_chain import chain_columns, mass_coefficients
@@ -77,10 +78,11 @@ def test_any_other_arm_is_the_sum_of_its_factors() -> None:
     assert np.abs(found(other) - torques(other)).max() < CLOSE * np.abs(torques(other)).max()
 
 
-def test_axes_that_point_anywhere_are_found_and_hold_at_another_motion() -> None:
+@pytest.mark.parametrize("wrist", [(1.0, 0.0, 0.0), (0.8, 0.0, 0.6)])
+def test_axes_that_point_anywhere_are_found_and_hold_at_another_motion(wrist: tuple[float, ...]) -> None:
     """A shoulder, an elbow and a wrist across each other, with their lengths."""
     own, other = motion(5), motion(6)
-    arm = SpatialChain(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]))
+    arm = SpatialChain(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], wrist]))
     theta = np.zeros(arm.moments)
     upper, tip = arm.of_link(np.array([0.0, 0.0, 0.4]), 1), arm.of_link(np.array([0.0, 0.1, 0.2]))
     S, A = (
@@ -97,10 +99,42 @@ def test_axes_that_point_anywhere_are_found_and_hold_at_another_motion() -> None
     wanted = arm.columns(other) @ theta
     assert np.abs(found(other) - wanted).max() < CLOSE * np.abs(wanted).max()
     assert np.allclose(wanted, arm.efforts(arm.moved(other), *arm.unpacked(theta)))
-    lengths = arm.origin(theta)
-    assert lengths is not None
-    assert np.allclose(lengths, upper)
+    lengths, unknown = arm.origin(theta)
+    assert unknown.shape[1] == 0
+    of_place = np.stack([arm.of_link(axis) for axis in np.eye(3)], axis=1)
+    place, left, *_ = np.linalg.lstsq(
+        of_place, upper + tip - lengths, rcond=None
+    )  # its zero along the last axis may be another
+    assert np.allclose(left, 0.0)
+    if wrist[2] == 0.0:
+        assert np.allclose(place, [0.0, 0.1, 0.2])
     more, moved = upper + tip, arm.moved(other)
     added = arm.efforts(moved, 0.5 * np.outer(more, more), 0.5 * more)
     masses = Dynamics(3, (), theta[None], (0.0,) * 3, (0, 1, 2), arm).loaded(other)
-    assert np.allclose(masses(np.array([0.5, 0.0, 0.1, 0.2])), added)
+    assert np.allclose(masses(np.append(0.5, place)), added)
+
+
+def test_a_payload_shows_the_lengths_that_a_light_wrist_hides() -> None:
+    """The last link hangs in its own axis, as a flange does, so that its own weight turns no joint."""
+    own = motion(8, 4)
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    arm = SpatialChain(axes)
+    upper = arm.of_link(np.array([0.4, 0.0, 0.0]), 0)
+    fore = upper + arm.of_link(np.array([0.3, 0.1, 0.0]), 1)
+    flange = fore + arm.of_link(np.array([0.05, 0.0, 0.1]), 2)
+    points = [(2.0, upper), (1.0, fore), (0.5, flange)]
+    S = sum(m * np.outer(u, u) for m, u in points)
+    A = sum(m * u for m, u in points)
+    theta = np.append(np.asarray(S)[np.triu_indices(8)], A)
+    dynamics = Dynamics(4, (), theta[None], (0.0,) * 4, (0, 1, 2, 3), arm)
+    assert dynamics.reach is not None
+    assert dynamics.offsets > 0
+    at, masses = flange + arm.of_link(np.array([0.1, 0.0, 0.0])), dynamics.loaded(own)
+    wanted = arm.efforts(arm.moved(own), 0.7 * np.outer(at, at), 0.7 * at)
+
+    def left(x: np.ndarray) -> np.ndarray:
+        return np.asarray((masses(x) - wanted).ravel()[::50])
+
+    found = least_squares(left, np.append([0.3, 0.05, 0.05, 0.05], np.zeros(dynamics.offsets)))
+    assert found.x[0] == pytest.approx(0.7, rel=CLOSE)
+    assert np.abs(found.x[1:3]).max() == pytest.approx(0.1, rel=CLOSE)
