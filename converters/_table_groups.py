@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import re
 
-from ._table_map import DIGITS, POSITION_SI, TIME_NS, TIME_WORDS, Entries, Proposal, name_and_unit, rises, split_name
+from ._table_map import (
+    DIGITS,
+    POSITION_SI,
+    TIME_NS,
+    TIME_WORDS,
+    USUAL_TIME_NS,
+    Entries,
+    Proposal,
+    name_and_unit,
+    rises,
+    split_name,
+)
 from ._table_text import Columns
 
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
@@ -60,28 +71,35 @@ def known_layout(columns: Columns) -> Proposal | None:
 
 
 def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
-    """Entries for sensors in groups with a time of their own: the accelerometer, and poses.
+    """Entries for sensors with a time of their own, the accelerometer and poses, and for poses on the IMU's time.
 
-    Of several groups with poses true ones come first. None are taken whose quaternions have no certain order.
+    Of several groups with poses true ones come first. None are taken whose quaternions have no certain order, and none of
+    the IMU's own group without positions: an orientation alone is one that the sensor itself estimates.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
     found: Entries = {}
     if len(columns.values[entries["accel"][0]]) != len(columns.values[time]):
         other = time_beside(columns, entries["accel"][0], time, unit)
         found = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
-    groups: dict[tuple[str, str], dict[str, str]] = {}
-    for column in columns.values:
+    groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
+    for column, values in columns.values.items():
         beside = time_beside(columns, column, time, unit)
+        if beside is None and len(values) == len(columns.values[time]):
+            beside = time, unit
         if beside is not None and "quaternion_wxyz" not in entries:
-            groups.setdefault(beside, {})[split_name(column.removeprefix(_group(column)))[0]] = column
+            leaf = split_name(column.removeprefix(_group(column)))[0]
+            is_true = any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", _group(column)))
+            name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
+            groups.setdefault((beside, is_true or name != leaf), {})[name] = column
     poses = []
-    for clock, leaves in groups.items():
-        q = {m["axis"]: c for leaf, c in leaves.items() if (m := re.fullmatch(QUATERNION, leaf))}
-        q |= {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
-        p = {m["axis"].translate(DIGITS): c for leaf, c in leaves.items() if (m := re.fullmatch(POSITION, leaf))}
-        is_true = any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", _group(clock[0])))
-        if {*q} == {*"wxyz"}:
-            poses.append((not is_true, clock, [q[a] for a in "wxyz"], [p[a] for a in "xyz"] if {*p} == {*"xyz"} else []))
+    for (clock, is_true), leaves in groups.items():
+        arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
+        q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
+        position = _axes(POSITION, leaves, "xyz")
+        if q and (position or clock[0] != time):
+            poses.append((not is_true, clock, q, position))
+        elif clock[0] == time:
+            continue
         elif array := next((c for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), ""):
             reasons.append(f"{array[:-3]} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them")
     for is_estimate, clock, q_wxyz, position in sorted(poses)[:1]:
@@ -91,6 +109,15 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
             found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
     return found
+
+
+def _axes(pattern: str, leaves: dict[str, str], axes: str) -> list[str]:
+    """Columns of all axes of the first name that has them; `leaves` are columns by their names."""
+    found: dict[str, dict[str, str]] = {}
+    for leaf, column in leaves.items():
+        if match := re.fullmatch(pattern, leaf):
+            found.setdefault(leaf[: match.start("axis")], {})[match["axis"].translate(DIGITS)] = column
+    return next(([columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}), [])
 
 
 def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[str, str] | None:
@@ -114,7 +141,7 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
         return other, stated
     first, last = columns.values[time][[0, -1]].astype(float) * TIME_NS[unit]
     overlap = {}
-    for each, size in TIME_NS.items():
+    for each, size in USUAL_TIME_NS.items():
         start, end = columns.values[other][[0, -1]].astype(float) * size
         overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
     best = max(overlap, key=lambda each: overlap[each])

@@ -19,8 +19,10 @@ from imutool.recording.message_log import KINDS
 
 from ._table_text import Columns
 
-TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
+USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
+XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
+GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
 PLAUSIBLE_HZ = 5.0, 10_000.0
@@ -35,12 +37,13 @@ WORDS = {
 }
 ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
 TIME_WORDS = (
-    r"(times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
-    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed|sample_?time_?fine)"
+    rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
+    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed)"
 )
 UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
     "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps",
+    "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
     "m/s^2": r"m/s(\^|\*\*)?2|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
     "mg": r"mg",
     "g": r"g",
@@ -165,7 +168,9 @@ def split_name(column: str) -> tuple[str, str]:
     if bracket:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
-    if not unit and (end := re.search(r"_(dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)):
+    if not unit and (
+        end := re.search(r"_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
+    ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]
     return name, unit
@@ -175,12 +180,9 @@ def _propose_sensor(
     proposal: Proposal, sensor: str, units: dict[str, float], names: dict[str, tuple[str, str]], columns: Columns
 ) -> None:
     """Columns of the three axes, and their unit."""
-    groups: dict[str, dict[str, str]] = {}
-    for column, (name, _) in names.items():
-        axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?(?P<axis>[xyz012])(_(raw|adc|counts?))?", name)
-        if axis:
-            groups.setdefault(axis[1], {})[axis["axis"].translate(DIGITS)] = column
-    whole = [group for group in groups.values() if set(group) == set("xyz")]
+    whole = _triples(sensor, {column: name for column, (name, _) in names.items()})
+    if not whole:  # UncompGyro_0: a capital begins a word
+        whole = _triples(sensor, {c: split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", c))[0] for c in names})
     if len(whole) != 1:
         proposal.open += [sensor, f"{sensor}_unit"]
         proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}")
@@ -194,6 +196,16 @@ def _propose_sensor(
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
         _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
+
+
+def _triples(sensor: str, names: dict[str, str]) -> list[dict[str, str]]:
+    """Columns of three axes, by the words for a sensor in their names."""
+    groups: dict[str, dict[str, str]] = {}
+    for column, name in names.items():
+        axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?(?P<axis>[xyz012])(_(raw|adc|counts?))?", name)
+        if axis:
+            groups.setdefault(axis[1], {})[axis["axis"].translate(DIGITS)] = column
+    return [group for group in groups.values() if set(group) == set("xyz")]
 
 
 def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
@@ -235,6 +247,7 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     if "gyro" in proposal.entries:
         group = proposal.entries["gyro"][0].rpartition("/")[0]
         found.sort(key=lambda c: c.rpartition("/")[0] != group)
+    found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     if not found and len(rising := [c for c, v in columns.values.items() if length in (None, len(v)) and rises(v)]) == 1:
         proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
         found = rising
@@ -246,9 +259,13 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     if (unit := names[column][1]) in TIME_NS:
         proposal.entries["time_unit"] = unit
         return
+    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
+        proposal.entries["time_unit"] = "100us"
+        proposal.reasons.append(f"{column!r} counts 100 us, as an Xsens sensor does")
+        return
     values = columns.values[column].astype(float)
     step = float(np.median(np.diff(values)))
-    plausible = [u for u, size in TIME_NS.items() if PLAUSIBLE_HZ[0] <= 1e9 / (step * size) <= PLAUSIBLE_HZ[1]]
+    plausible = [u for u, size in USUAL_TIME_NS.items() if PLAUSIBLE_HZ[0] <= 1e9 / (step * size) <= PLAUSIBLE_HZ[1]]
     epochs = [u for u in plausible if 1e18 < values[0] * TIME_NS[u] < 4e18]  # 2001 to 2096
     certain = epochs or plausible
     if len(certain) == 1:

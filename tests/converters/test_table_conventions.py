@@ -1,0 +1,97 @@
+"""Tables of other programs: their names of axes, their units, their times, and poses beside the IMU."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from imutool.converters import table
+
+COUNT = 400
+START_NS = 1_600_000_000_000_000_000
+T_NS = START_NS + np.arange(COUNT) * 5_000_000
+RNG = np.random.default_rng(11)
+GYRO = RNG.normal(0.0, 0.1, (COUNT, 3))
+ACCEL = RNG.normal(0.0, 0.02, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
+P = RNG.normal(0.0, 1.0, (COUNT, 3))
+Q_WXYZ = (raw := RNG.normal(0.0, 1.0, (COUNT, 4))) / np.linalg.norm(raw, axis=1, keepdims=True)
+IMU_NAMES = [*(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"accel_{a} [m/s^2]" for a in "xyz")]
+
+
+def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
+    rows = (",".join(map(repr, row)) for row in zip(*(column.tolist() for column in columns), strict=True))
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    return path
+
+
+def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds(tmp_path):
+    names = ["PacketCounter", "SampleTimeFine", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
+    columns = [np.arange(COUNT), 12_345 + 50 * np.arange(COUNT), *ACCEL.T, *GYRO.T]
+    log = table.read_sequence(table.sequences(written(tmp_path / "xsens.csv", names, columns))[0])
+    assert np.array_equal(np.diff(log.imus["/imu0"].t_ns), np.full(COUNT - 1, 5_000_000))
+    assert "'SampleTimeFine' counts 100 us, as an Xsens sensor does" in log.remarks.notes
+
+
+def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path):
+    names = ["TimeStartup", *(f"UncompAccel_{k}" for k in range(3)), *(f"UncompGyro_{k} [mdps]" for k in range(3))]
+    columns = [T_NS - START_NS + 5_000_000_000, *ACCEL.T, *np.rad2deg(GYRO * 1e3).T]
+    imu = table.read_sequence(table.sequences(written(tmp_path / "vn.csv", names, columns))[0]).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO, rtol=1e-12)
+    np.testing.assert_allclose(imu.accel, ACCEL, rtol=1e-12)
+
+
+@pytest.mark.parametrize("stamp", ["set", "never set"])
+def test_the_stamp_of_a_message_counts_before_the_time_of_its_arrival(tmp_path, stamp):
+    late_ns = T_NS + RNG.integers(0, 3_000_000, COUNT)
+    names = ["%time", "field.header.seq", "field.header.stamp"]
+    names += [*(f"field.angular_velocity.{a}" for a in "xyz"), *(f"field.linear_acceleration.{a}" for a in "xyz")]
+    columns = [late_ns, np.arange(COUNT), T_NS if stamp == "set" else 0 * T_NS, *GYRO.T, *ACCEL.T]
+    imu = table.read_sequence(table.sequences(written(tmp_path / "echo.csv", names, columns))[0]).imus["/imu0"]
+    assert np.array_equal(imu.t_ns, T_NS if stamp == "set" else late_ns)
+
+
+POSES = {
+    "ridi": ([*(f"pos_{a}" for a in "xyz"), *(f"ori_{a}" for a in "wxyz")], "estimate"),
+    "motion capture": ([*(f"vicon_p{a}" for a in "xyz"), *(f"vicon_q{a}" for a in "wxyz")], "truth"),
+    "angles beside": ([*(f"p_{a}" for a in "xyz"), *(f"q_{a}" for a in "wxyz")], "estimate"),
+}
+
+
+@pytest.mark.parametrize("names", POSES)
+def test_poses_on_the_time_of_the_imu_are_poses(tmp_path, names):
+    columns, kind = POSES[names]
+    angles = ["orientation_x", "orientation_y", "orientation_z"] if names == "angles beside" else []
+    path = written(
+        tmp_path / "sim.csv",
+        ["t_ns", *IMU_NAMES, *columns, *angles, "voltage"],
+        [T_NS, *GYRO.T, *ACCEL.T, *P.T, *Q_WXYZ.T, *[P[:, 0]] * len(angles), P[:, 0]],
+    )
+    log = table.read_sequence(table.sequences(path)[0])
+    ((topic, poses),) = log.poses.items()
+    assert log.kinds == {topic: kind}
+    assert np.array_equal(poses.p_wb, P)
+    np.testing.assert_allclose(poses.q_wb_wxyz, Q_WXYZ, atol=1e-15)
+    assert set(log.scalars) == {"/voltage", *(f"/{angle}" for angle in angles)}
+
+
+def test_an_array_of_quaternions_is_poses_by_the_order_in_its_name(tmp_path):
+    with h5py.File(tmp_path / "flight.h5", "w") as file:
+        arrays = {"t_ns": T_NS, "gyro": GYRO, "accel": ACCEL, "pos": P, "quat_xyzw": Q_WXYZ[:, [1, 2, 3, 0]]}
+        for name, values in arrays.items():
+            file[name] = values
+        file["gyro"].attrs["unit"], file["accel"].attrs["unit"] = "rad/s", "m/s^2"
+    log = table.read_sequence(table.sequences(tmp_path / "flight.h5")[0])
+    np.testing.assert_allclose(log.poses["/estimate/pose"].q_wb_wxyz, Q_WXYZ, atol=1e-15)
+    assert np.array_equal(log.poses["/estimate/pose"].p_wb, P)
+
+
+def test_an_orientation_alone_stays_numbers(tmp_path):
+    path = written(
+        tmp_path / "ahrs.csv", ["t_ns", *IMU_NAMES, *(f"q{a}" for a in "wxyz")], [T_NS, *GYRO.T, *ACCEL.T, *Q_WXYZ.T]
+    )
+    log = table.read_sequence(table.sequences(path)[0])
+    assert log.poses == {}
+    assert set(log.scalars) == {f"/q{a}" for a in "wxyz"}
