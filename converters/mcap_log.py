@@ -21,6 +21,7 @@ from ._source import head, name
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
 CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
+IMU = "sensor_msgs/msg/Imu", "cdr"  # defined ahead of the messages: a gyro's and an accelerometer's may be joined
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
 
@@ -45,17 +46,21 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         summary = reader.get_summary()
         metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
         counts: dict[str, int] = {}
+        topics: list[MessageTopic] = []
         if summary is not None and summary.statistics is not None:
             of_channel = summary.statistics.channel_message_counts
             for number, channel in summary.channels.items():
                 schema = summary.schemas.get(channel.schema_id)
                 if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
+                    if schema is not None and (schema.name, channel.message_encoding) == IMU:
+                        topics.append(_topic(schema, channel))
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
         own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
         unchecked = _without_crc(file, [] if summary is None else summary.chunk_indexes)
     log = MessageLog(
         sequence.name,
         sequence.path.name,
+        topics=tuple(topics),
         messages=partial(_messages, sequence.path, images),
         counts=counts,
         metadata={"imutool": own, **metadata},

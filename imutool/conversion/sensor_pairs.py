@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -12,23 +11,22 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_imu
+from imutool.mcap_io.codec.joined_imu import pairs_by_name
 from imutool.recording import Imu
 from imutool.recording.joined_imu import joined
 from imutool.recording.message_log import MessageLog, MessageTopic, Remarks
-
-SENSOR_WORDS = (r"gyro(scope)?", r"accel(erometer)?")
 
 
 class SensorPairs:
     """Samples of single sensors, gathered from a stream of messages: 56 bytes a sample.
 
     The pairs are those that the source names, else topics whose names differ by the sensor alone, as RealSense has them
-    (`/camera/gyro/sample`, `/camera/accel/sample`).
+    (`/camera/gyro/sample`, `/camera/accel/sample`; `Gyro_0`, `Accel_0`).
     """
 
     def __init__(self, source: MessageLog) -> None:
         imus = [topic.name for topic in source.topics if schemas.canonical(topic.schema_name) == schemas.IMU]
-        self.pairs = dict(source.pairs) or _by_name(imus)
+        self.pairs = dict(source.pairs) or pairs_by_name(imus)
         self._wholes = {part: whole for whole, parts in self.pairs.items() for part in parts}
         self._payloads: dict[str, list[bytes]] = defaultdict(list)
         self._columns: dict[str, list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = defaultdict(list)
@@ -74,14 +72,3 @@ class SensorPairs:
     def _samples(self, topic: str, which: int) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
         parts = self._columns[topic]
         return np.concatenate([part[0] for part in parts]), np.concatenate([part[which] for part in parts])
-
-
-def _by_name(topics: list[str]) -> Mapping[str, tuple[str, str]]:
-    """Pairs of topics whose names differ by the words for the two sensors."""
-    pairs = {}
-    gyro, accel = ({re.sub(rf"(?<=/){word}(?=/|$)", "{}", t): t for t in topics} for word in SENSOR_WORDS)
-    for pattern, topic in gyro.items():
-        whole = f"{pattern.partition('{}')[0]}imu"
-        if "{}" in pattern and pattern in accel and whole not in topics:
-            pairs[whole] = (topic, accel[pattern])
-    return pairs

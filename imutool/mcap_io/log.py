@@ -17,7 +17,7 @@ from imutool.location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, decode_image
-from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
+from imutool.mcap_io.codec.joined_imu import pairs_by_name, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.passthrough.chunk_check import KeptChunks, neighbours, unpack_together
@@ -127,7 +127,9 @@ class Log:
             raise LogError("the log has no IMU topic", where=self.path, expected=expected, fix=fix)
         if len(found) > 1:
             what = f"the log has {len(found)} IMU topics: {', '.join(found)}"
-            raise LogError(what, where=self.path, fix="Choose one with `imu`")
+            joined = [f"gyro={gyro},accel={accel}" for gyro, accel in pairs_by_name(found).values()]
+            fix = f"Choose one with `imu`{''.join(f', or join two: {names}' for names in joined)}"
+            raise LogError(what, where=self.path, fix=fix)
         return found[0]
 
     @property

@@ -258,6 +258,7 @@ def write_split_bag(path: Path, gyro_topic: str, accel_topic: str) -> Path:
     ("topics", "options", "whole"),
     [
         (("/camera/gyro/sample", "/camera/accel/sample"), (), "/camera/imu"),
+        (("/device_0/sensor_2/Gyro_0/imu/data", "/device_0/sensor_2/Accel_0/imu/data"), (), "/device_0/sensor_2/imu"),
         (("/a", "/b"), ("--imu", "gyro=/a,accel=/b"), "/imu"),
     ],
 )

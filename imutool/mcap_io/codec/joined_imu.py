@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from posixpath import commonpath
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import Messages, Rows, columns
 
+SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
 Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
 
 
@@ -65,3 +66,10 @@ def parse_parts(text: str) -> tuple[str, str] | None:
 def whole_of(parts: tuple[str, str]) -> str:
     """Topic of the IMU that two topics make up: `imu` in the folder that they share."""
     return f"{commonpath(parts).rstrip('/')}/imu"
+
+
+def pairs_by_name(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Topics of a gyro and an accelerometer whose names differ by the sensor alone, by the IMU that they make up."""
+    gyro, accel = ({re.sub(rf"(?i)(?<=/){word}(?=(_\w+)?(/|$))", "{}", t): t for t in topics} for word in SENSOR_WORDS)
+    both = [(gyro[pattern], accel[pattern]) for pattern in gyro if "{}" in pattern and pattern in accel]
+    return {whole: parts for parts in both if (whole := whole_of(parts)) not in topics}

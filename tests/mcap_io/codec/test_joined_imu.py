@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from imutool import info
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
-from imutool.mcap_io.codec.joined_imu import parse_parts
+from imutool.mcap_io.codec.joined_imu import pairs_by_name, parse_parts
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import Series, chunks
@@ -41,11 +42,11 @@ def as_vector(t_ns, values):
     return encode_vector3(t_ns, values, "optical")
 
 
-def write_log(path: Path, schema: str) -> Path:
+def write_log(path: Path, schema: str, topics: tuple[str, str] = ("/cam/motion_g", "/cam/motion_a")) -> Path:
     with LogWriter(path) as log:
         series = [
             Series(log.channel(topic, schema, {}), t, (t, v), as_imu(sensor) if schema == schemas.IMU else as_vector)
-            for topic, sensor, t, v in (("/cam/motion_g", "gyro", GYRO_NS, GYRO), ("/cam/motion_a", "accel", ACCEL_NS, ACCEL))
+            for topic, sensor, t, v in zip(topics, ("gyro", "accel"), (GYRO_NS, ACCEL_NS), (GYRO, ACCEL), strict=True)
         ]
         for chunk in chunks(series):
             log.chunk(chunk)
@@ -77,6 +78,16 @@ def test_debias_writes_one_message_a_gyro_message(tmp_path):
     assert {topic.topic for topic in info(tmp_path / "out.mcap").imu} >= {"/cam/motion_g", "/cam/motion_a"}
 
 
+def test_a_pair_by_name_is_offered_and_joined_on_conversion(tmp_path):
+    source = write_log(tmp_path / "two.mcap", schemas.IMU, ("/cam/gyro/sample", "/cam/accel/sample"))
+    with pytest.raises(LogError, match="or join two: gyro=/cam/gyro/sample,accel=/cam/accel/sample"):
+        read(source)
+    convert(source, tmp_path / "one.mcap")
+    recording = read(tmp_path / "one.mcap")
+    assert recording.imu_topic == "/cam/imu"
+    assert np.array_equal(recording.imu.gyro, read(source, imu="gyro=/cam/gyro/sample,accel=/cam/accel/sample").imu.gyro)
+
+
 def test_what_is_no_such_pair_is_refused(tmp_path):
     source = write_log(tmp_path / "two.mcap", schemas.IMU)
     assert parse_parts("/imu0") is None
@@ -85,3 +96,19 @@ def test_what_is_no_such_pair_is_refused(tmp_path):
         parse_parts("gyro=/a")
     with Log(source) as log, pytest.raises(LogError, match="there is no topic /nowhere"):
         log.topic("gyro=/nowhere,accel=/cam/motion_a", (schemas.IMU,))
+
+
+@pytest.mark.parametrize(
+    ("topics", "pairs"),
+    [
+        (["/camera/gyro/sample", "/camera/accel/sample"], {"/camera/imu": ("/camera/gyro/sample", "/camera/accel/sample")}),
+        (["/d/Gyro_0/imu/data", "/d/Accel_0/imu/data"], {"/d/imu": ("/d/Gyro_0/imu/data", "/d/Accel_0/imu/data")}),
+        (["/phone/accelerometer", "/phone/gyroscope"], {"/phone/imu": ("/phone/gyroscope", "/phone/accelerometer")}),
+        (["/a/gyro/sample", "/b/accel/sample"], {}),
+        (["/gyro_0", "/accel_1"], {}),
+        (["/imu0", "/imu1"], {}),
+        (["/camera/gyro", "/camera/accel", "/camera/imu"], {}),
+    ],
+)
+def test_topics_that_differ_by_the_sensor_alone_are_a_pair(topics: list[str], pairs: dict[str, tuple[str, str]]) -> None:
+    assert pairs_by_name(topics) == pairs
