@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import hashlib
 import json
+import lzma
 import os
 import re
 import resource
@@ -20,6 +22,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+import zstandard
 from mcap_ros2.writer import Writer
 
 from fuzz import bounded
@@ -280,6 +283,15 @@ def test_a_clock_that_jumps_from_1970_costs_nothing_and_is_told(tmp_path: Path, 
     assert re.search(
         "clock jumps by|the clock was set", done.stdout + done.stderr + (page.read_text() if page.exists() else "")
     )
+
+
+@pytest.mark.parametrize(("pack", "program"), [(gzip.compress, "gzip"), (zstandard.compress, "zstd"), (lzma.compress, "xz")])
+def test_a_compressed_log_is_named(tmp_path: Path, refuse: Refuse, pack: Callable[[bytes], bytes], program: str) -> None:
+    imu_log(tmp_path / "a.mcap", STAMPS)
+    (tmp_path / "a.mcap.packed").write_bytes(pack((tmp_path / "a.mcap").read_bytes()))
+    for words in (("info", "a.mcap.packed"), ("debias", "a.mcap.packed", "b.mcap"), ("repair", "a.mcap.packed", "b.mcap")):
+        assert f"is compressed with {program}" in refuse(LOG, *words)
+    assert f"Unpack it first, for instance with {program} -d" in refuse(DATA, "convert", "a.mcap.packed", "b.mcap")
 
 
 def test_time_going_back_in_a_log_stops_debias(tmp_path: Path, refuse: Refuse) -> None:

@@ -16,7 +16,7 @@ from imutool import registry
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
-from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
+from imutool.errors import ConfigError, DataError, ImutoolError, compression, did_you_mean
 from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -146,11 +146,13 @@ def _find(source: Path, format: str) -> _Sequences:
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
     if not claims:
+        program = "" if source.is_dir() else compression(_start(source))
+        fix = f"Unpack it first, for instance with {program} -d" if program else ""
         raise DataError(
-            "no sequence found",
+            f"no sequence found: it is compressed with {program}" if program else "no sequence found",
             where=source,
             expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
-            fix="Name the file itself: single logs and tables in a folder are not looked for" if source.is_dir() else "",
+            fix="Name the file itself: single logs and tables in a folder are not looked for" if source.is_dir() else fix,
         )
     for place, jobs in claims.items():
         if len(jobs) > 1:
@@ -160,6 +162,15 @@ def _find(source: Path, format: str) -> _Sequences:
         [job for jobs in claims.values() for job in jobs],
         [error for place, error in errors.items() if not claims[place]],
     )
+
+
+def _start(path: Path) -> bytes:
+    """First bytes of a file; none of one that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(8)
+    except OSError:
+        return b""
 
 
 def _converters(format: str) -> list[tuple[str, ModuleType]]:

@@ -6,7 +6,7 @@ import hashlib
 import threading
 from types import TracebackType
 
-from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.errors import ConfigError, ImutoolError, LogError, compression
 from imutool.location import Location, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
 
@@ -29,6 +29,10 @@ class Source:
         self.path = path
         self._ahead, self._ahead_at = b"", 0  # bytes read ahead of short reads, and where they lie
         self._is_local = descriptor(self.file) is not None
+        if self._is_local and (program := compression(self._read(0, 8))):
+            self.file.close()
+            what, fix = f"is compressed with {program}", f"Unpack it first, for instance with {program} -d"
+            raise LogError(what, where=path, expected=expected, fix=fix)
 
     def at(self, offset: int, length: int) -> bytes:
         """Exactly these bytes.
