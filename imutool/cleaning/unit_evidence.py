@@ -35,6 +35,7 @@ MIN_TURN_RAD_S, FEWEST_TURNS = 0.1, 10  # of the true rate, and times at which i
 POSES_APART_NS = 300_000_000
 CALM_STEPS, CALM_SHARE = 10, 0.1  # windows of a second, and the calmest of them
 CALM_SCATTER = 0.03  # of the reading
+GRAVITY_SHARE = 0.5  # of the median reading, that the calmest seconds read at least where gravity is in it
 
 
 class AccelReading(NamedTuple):
@@ -63,7 +64,8 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     """Gravity as the accel reads it, and whether at rest; None without samples.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
-    Without any it is the median of all, means of a second, in which vibration is gone.
+    Without any it is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is
+    less than half of it: then it is motion that the others read, and gravity was taken out.
     """
     step, mean = motion.table()
     if not len(step):
@@ -73,11 +75,16 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     whole = np.diff(step[: count * CALM_STEPS].reshape(count, CALM_STEPS)[:, [0, -1]], axis=1)[:, 0] == CALM_STEPS - 1
     level = np.linalg.norm(cut.mean(axis=1), axis=1)
     scatter = np.sqrt(cut.var(axis=1).sum(axis=1)) / np.maximum(level, 1e-12)
-    calm = np.flatnonzero(whole)[np.argsort(scatter[whole])][: max(1, round(CALM_SHARE * count))]
+    few = max(1, round(CALM_SHARE * count))
+    calm = np.flatnonzero(whole)[np.argsort(scatter[whole])][:few]
     calm = calm[scatter[calm] < CALM_SCATTER]
     if len(calm):
         return float(quantile(level[calm], 0.5)), True
-    return float(quantile(level[whole] if whole.any() else np.linalg.norm(mean[:, 3:], axis=1), 0.5)), False
+    if not whole.any():
+        return float(quantile(np.linalg.norm(mean[:, 3:], axis=1), 0.5)), False
+    median = float(quantile(level[whole], 0.5))
+    calmest = float(quantile(level[np.flatnonzero(whole)[np.argsort((scatter * level)[whole])][:few]], 0.5))
+    return (calmest if calmest < GRAVITY_SHARE * median else median), False
 
 
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:

@@ -321,6 +321,15 @@ def test_acceleration_without_gravity_is_not_trusted(made):
     assert "accel has no gravity in it" in survey.reasons
 
 
+def test_motion_of_one_metre_per_second_squared_without_gravity_is_not_taken_for_g(made):
+    """At rest it reads noise; the median of the rest is 1, as that of a log in g is."""
+    phase = 1.5 * np.linspace(0.0, 2 * np.pi * 10, len(made.accel))
+    turning = np.stack([np.sin(phase), np.cos(phase), 0 * phase], axis=1) * (np.arange(len(phase)) > 0.2 * len(phase))[:, None]
+    survey = look(made._replace(accel=turning + 0.02 * np.random.default_rng(1).normal(size=made.accel.shape)))
+    assert "accel has no gravity in it" in survey.reasons
+    assert (survey.scale[3:] == 1.0).all()
+
+
 @pytest.mark.parametrize(
     ("sensor", "columns", "signs", "named"),
     [

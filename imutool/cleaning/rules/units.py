@@ -50,7 +50,7 @@ class Units(Rule):
             values |= {"fix": f"accel from {unit}"} if at_rest else {}
             yield Finding("units", "error", what, 3, values=values, confidence=0.7, distrust=f"accel may be in {unit}")
         elif level < FREE_OF_GRAVITY_M_S2:
-            what = f"accel reads {level:.4g} in the median: gravity was taken out, or it measures nothing"
+            what = f"accel reads {level:.4g}: gravity was taken out, or it measures nothing"
             yield Finding("units", "error", what, 3, values=values, confidence=0.9, distrust="accel has no gravity in it")
         else:
             off = abs(level / GRAVITY_M_S2 - 1.0)
