@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError, dataclass, replace
 from fractions import Fraction
 from multiprocessing import get_context
 from typing import Any
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars, nanoseconds, seconds, unit_quaternions
-from imutool.recording.columns import quantile
+from imutool.recording.columns import Columns, quantile
 
 EPOCH_NS = 1_403_638_128_245_096_960  # in EuRoC's MH_04
 SECONDS = 2.0**-52  # relative: one rounding of the difference, one of the product
@@ -426,3 +426,19 @@ def test_a_quantile_is_that_of_numpy(count: int) -> None:
     values = np.random.default_rng(count).normal(size=(count, 3))
     for share in (0.0, 0.25, 0.5, 0.9, 1.0):
         np.testing.assert_allclose(quantile(values, share), np.quantile(values, share, axis=0), rtol=1e-14)
+
+
+@dataclass
+class Rows(Columns):
+    """Columns whose annotations are not checked, as all are outside of pytest."""
+
+    t_ns: Any
+    values: Any
+
+
+def test_what_is_no_array_is_refused_by_its_name() -> None:
+    with pytest.raises(DataError, match=r"Rows\.t_ns is a list; expected a numpy array of int64\. Convert it with np\.asarray"):
+        Rows([0, 1], np.zeros((2, 3))).check(values=(3,))
+    with pytest.raises(DataError, match=r"Rows\.values is a list; expected a numpy array of float64"):
+        Rows(np.array([0, 1]), [[0.0, 0.0, 0.0]] * 2).check(values=(3,))
+    Rows(np.array([0, 1]), None).check(values=(3,))

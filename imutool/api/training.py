@@ -78,7 +78,7 @@ def train(
 def evaluate(
     log: str | Path,
     *,
-    models: Sequence[str | Path] = (),
+    models: Sequence[str | Path] | str | Path = (),
     init: str = "auto",
     smooth: bool = False,
     aid: str | None = None,
@@ -91,7 +91,7 @@ def evaluate(
 
     Args:
         log: MCAP log with true poses.
-        models: Model files, names of models that ship, or `static`.
+        models: Model files, names of models that ship, or `static`; one, or several.
         init: Initial bias, as in `debias`.
         smooth: Smoothing, as in `debias`.
         aid: Also score the smoothed path with these aids: `auto` (all that the log has), or some of `stops`, `barometer`,
@@ -117,10 +117,11 @@ def evaluate(
         True
     """
     tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True, of_each="{}_*.tum")
-    check_outputs([tum], [log, list(models)], overwrite=overwrite)
+    several = [models] if isinstance(models, str | Path) else models
+    check_outputs([tum], [log, list(several)], overwrite=overwrite)
     return evaluation.evaluate(
         local(log, "log"),
-        models=models,
+        models=several,
         init=init,
         smooth=smooth,
         aid=aid,

@@ -42,6 +42,10 @@ class Columns:
             DataError: a check fails; the message names the row.
         """
         kind = type(self).__name__
+        for name, wanted in {"t_ns": "int64", **dict.fromkeys(shapes, "float64")}.items():
+            if not isinstance(value := getattr(self, name), np.ndarray | None):
+                fix = f"Convert it with np.asarray(..., np.{wanted})"
+                raise DataError(f"{kind}.{name} is a {type(value).__name__}", expected=f"a numpy array of {wanted}", fix=fix)
         if self.t_ns.dtype != np.int64 or self.t_ns.ndim != 1:
             raise DataError(f"{kind}.t_ns is {self.t_ns.dtype}{list(self.t_ns.shape)}", expected="int64[n]")
         for name, tail in shapes.items():
