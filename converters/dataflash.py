@@ -1,7 +1,8 @@
-"""ArduPilot DataFlash (.bin): IMUs in FLU, EKF poses as an estimate, every message.
+"""ArduPilot DataFlash (.bin, .log): IMUs in FLU, EKF poses as an estimate, every message.
 
-The log describes its own messages (FMT); no library is needed. ArduPilot measures in FRD and its world is NED: the IMU and
-pose topics are written in FLU and ENU, the other topics keep its own frames. Stamps are the time since boot.
+The log describes its own messages (FMT), in binary or as text with a message a line; no library is needed. ArduPilot measures
+in FRD and its world is NED: the IMU and pose topics are written in FLU and ENU, the other topics keep its own frames. Stamps
+are the time since boot.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ TYPES = {
     **{"d": "<f8", "L": "<i4", "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "n": "S4", "N": "S16", "Z": "S64"},
     "a": "(32,)<i2",
 }
+TEXT_START = b"FMT, 128, 89, FMT"
+TEXT_TYPES = {**TYPES, "M": "S16"}  # a mode is written by its name
+TEXT_SCALES = {**dict.fromkeys("cCeE", 100.0), "L": 1e7}  # of binary integers that text shows as decimals
 
 
 class _Format(NamedTuple):
@@ -52,7 +56,8 @@ class _Format(NamedTuple):
 
 def sequences(source: Path) -> list[Sequence]:
     """DataFlash logs in the source, by their first bytes: the format of the formats."""
-    return find_files(source, (".bin",), lambda start: start.startswith(HEAD + bytes([FMT, FMT, FMT_SIZE])))
+    starts = HEAD + bytes([FMT, FMT, FMT_SIZE]), TEXT_START
+    return find_files(source, (".bin", ".log"), lambda start: start.startswith(starts))
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -69,7 +74,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     remarks = Remarks()
     with refusing(sequence.path):
         raw = sequence.path.read_bytes()
-    columns = _columns(raw, remarks)
+    columns = (_text_columns if raw.startswith(TEXT_START) else _columns)(raw, remarks)
     metadata = {"imutool": {"format": "dataflash", "sequence": sequence.name, "frames": "IMU and poses: FLU body in ENU"}}
     if "PARM" in columns and {"Name", "Value"} <= set(columns["PARM"].dtype.names or ()):
         metadata["ardupilot/parameters"] = {_text(r["Name"]): str(float(r["Value"])) for r in columns["PARM"]}
@@ -124,6 +129,52 @@ def _columns(raw: bytes, remarks: Remarks) -> dict[str, np.ndarray]:
         rows = data[np.array(places)[:, None] + np.arange(3, size)[None, :]]
         columns[formats[number].name] = np.ascontiguousarray(rows).view(formats[number].dtype)[:, 0]
     return columns
+
+
+def _text_columns(raw: bytes, remarks: Remarks) -> dict[str, np.ndarray]:
+    """Messages of a log in text, as those of the binary one; lines that are no message are counted."""
+    formats: dict[str, _Format] = {}
+    lines: dict[str, list[list[str]]] = defaultdict(list)
+    lost = 0
+    for line in raw.decode("latin-1").splitlines():
+        name, _, content = line.partition(",")
+        if name == "FMT" and content.count(",") >= 4:
+            number, size, label, letters, labels = (part.strip() for part in content.split(",", 4))
+            fields = [field.strip() for field in labels.split(",") if field.strip()]
+            known = len(fields) == len(letters) == len(set(fields)) and set(letters) <= TYPES.keys() - {"a"}
+            if known and int(number) != FMT:
+                formats[label] = _Format(label, int(size), letters, fields)
+        elif (form := formats.get(name)) is not None:
+            values = [value.strip() for value in content.split(",", len(form.labels) - 1)]
+            if len(values) == len(form.labels) and all(values):
+                lines[name].append(values)
+            else:
+                lost += 1
+        elif line.strip() and name != "FMT":
+            lost += 1
+    if lost:
+        remarks.losses.append(f"{lost} lines of the log are no message that it describes")
+    columns = {}
+    for name, rows in lines.items():
+        try:
+            columns[name] = _from_text(formats[name], rows)
+        except (ValueError, OverflowError) as error:
+            remarks.losses.append(f"{len(rows)} messages {name} are left out: {error}")
+    return columns
+
+
+def _from_text(form: _Format, rows: list[list[str]]) -> np.ndarray:
+    """Messages of a type as a structured array, in the units of the binary log."""
+    found = np.zeros(len(rows), [(label, TEXT_TYPES[letter]) for label, letter in zip(form.labels, form.letters, strict=True)])
+    for label, letter, texts in zip(form.labels, form.letters, zip(*rows, strict=True), strict=True):
+        kind = found.dtype[label]
+        if letter in TEXT_SCALES:
+            found[label] = np.rint(np.array(texts, float) * TEXT_SCALES[letter]).astype(kind)
+        elif kind.kind == "S":
+            found[label] = [text.encode() for text in texts]
+        else:
+            found[label] = np.array([int(text) for text in texts] if kind.kind in "iu" else texts, kind)
+    return found
 
 
 def _define(formats: dict[int, _Format], content: bytes) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from imutool.converters import dataflash
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
@@ -19,21 +21,31 @@ class Writer:
     """A DataFlash log: formats and messages as they come."""
 
     def __init__(self) -> None:
-        self.raw, self.numbers = b"", {}
+        self.raw, self.numbers, self.letters, self.lines = b"", {}, {}, []
         self.form(128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89)
 
     def form(self, number: int, name: str, letters: str, labels: str, size: int | None = None) -> None:
         code = "<" + "".join(CODES.get(letter, "") for letter in letters)
-        self.numbers[name] = number, code
+        self.numbers[name], self.letters[name] = (number, code), letters
         size = struct.calcsize(code) + 3 if size is None else size
+        self.lines.append(f"FMT, {number}, {size}, {name}, {letters}, {labels}")
         self.raw += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, size, name.encode(), letters.encode(), labels.encode())
 
     def add(self, name: str, *values: object) -> None:
         number, code = self.numbers[name]
         self.raw += b"\xa3\x95" + bytes([number]) + struct.pack(code, *values)
+        texts = [as_text(value, letter) for value, letter in zip(values, self.letters[name], strict=True)]
+        self.lines.append(", ".join([name, *texts]))
 
 
-def write_log(path: Path) -> Path:
+def as_text(value: Any, letter: str) -> str:
+    """Field as Mission Planner writes it into a .log."""
+    if isinstance(value, bytes):
+        return value.decode()
+    return f"{value / 1e7:.7f}" if letter == "L" else f"{value / 100:.2f}" if letter in "cC" else repr(value)
+
+
+def write_log(path: Path, text: bool = False) -> Path:
     log = Writer()
     log.form(1, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
     log.form(2, "XKF1", "QBccCffffff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD")
@@ -48,8 +60,33 @@ def write_log(path: Path) -> Path:
             log.add("IMU", t_us + instance, instance, 0.1, 0.2, 0.3, 1.0, 2.0, -9.75)
         log.add("XKF1", t_us, 0, 0, 0, 4500, 0.5, 0.25, -0.125, 1.0, 2.0, -3.0)
     log.add("GPS", 8_000_000, 3, 473_977_418)
-    path.write_bytes(log.raw)
+    if text:
+        path.write_text("\n".join([*log.lines, ""]))
+    else:
+        path.write_bytes(log.raw)
     return path
+
+
+def test_a_log_in_text_gives_the_same_messages(tmp_path):
+    paths = write_log(tmp_path / "1.BIN"), write_log(tmp_path / "1.log", text=True)
+    binary, text = (dataflash.read_sequence(dataflash.sequences(path)[0]) for path in paths)
+    assert text.imus.keys() == binary.imus.keys()
+    for topic, imu in binary.imus.items():
+        assert np.array_equal(text.imus[topic].t_ns, imu.t_ns)
+        np.testing.assert_allclose(text.imus[topic].gyro, imu.gyro, rtol=0, atol=0)
+        np.testing.assert_allclose(text.imus[topic].accel, imu.accel, rtol=0, atol=0)
+    assert np.array_equal(text.poses["/ekf/pose"].q_wb_wxyz, binary.poses["/ekf/pose"].q_wb_wxyz)
+    assert {t: c.columns.tolist() for t, c in text.tables.items()} == {t: c.columns.tolist() for t, c in binary.tables.items()}
+    assert (text.metadata["ardupilot/parameters"], text.remarks) == (binary.metadata["ardupilot/parameters"], binary.remarks)
+
+
+def test_lines_of_a_text_log_that_are_no_message_are_counted(tmp_path):
+    path = write_log(tmp_path / "1.log", text=True)
+    path.write_text(path.read_text() + "IMU, 12, 0, 0.1\nnoise\nGPS, 9000000, three, 47.3\n")
+    log = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert log.remarks.losses[0] == "2 lines of the log are no message that it describes"
+    assert log.remarks.losses[1].startswith("2 messages GPS are left out: invalid literal")
+    assert len(log.imus["/imu0"]) == 500
 
 
 def test_imus_poses_and_every_message_arrive(convert, imutool, tmp_path):
