@@ -99,8 +99,7 @@ def read_recordings(
     used = {name: of for name, of in velocities.items() if of in truths}
     columns = _Columns(log, imu_topic, truths, used, scalars, refused)
     with log.named():
-        topics = columns.topics if samples is None else columns.topics[1:]
-        for topic, rows in log.rows(topics, start_ns, end_ns):
+        for topic, rows in log.rows(columns.topics[0 if samples is None else 1 :], start_ns, end_ns):
             columns.take(topic, rows)
     found = []
     for run in columns.runs(samples):
@@ -274,22 +273,23 @@ class _Columns:
 
 
 def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Frames]:
-    """Image topics, opened again when somebody reads them."""
-    found = {}
-    for topic in log.with_schema((schemas.IMAGE,)):
-        if topic.message_encoding in ENCODINGS:
-            first, last = start_ns or 0, 2**63 - 1 if end_ns is None else end_ns
-            count = sum(int(((t >= first) & (t <= last)).sum()) for t in log.stamps(topic.name))
-            found[topic.name] = Frames(_format(log, topic.name), count, _opener(log.path, topic.name, start_ns, end_ns))
+    """Image topics, opened again when somebody reads them; none whose first message is no image."""
+    found, first, last = {}, start_ns or 0, 2**63 - 1 if end_ns is None else end_ns
+    for topic in (t.name for t in log.with_schema((schemas.IMAGE,)) if t.message_encoding in ENCODINGS):
+        if (form := _format(log, topic)) is not None:
+            count = sum(int(((t >= first) & (t <= last)).sum()) for t in log.stamps(topic))
+            found[topic] = Frames(form, count, _opener(log.path, topic, start_ns, end_ns))
     return found
 
 
-def _format(log: Log, topic: str) -> str:
-    """Image format, from the first image."""
-    for _, rows in log.rows([topic]):
-        with log.named(topic):
-            return decode_image(rows.payload[0].tobytes(), log.topics[topic].message_encoding)[1]
-    return ""
+def _format(log: Log, topic: str) -> str | None:
+    """Image format, from the first image; None where it is no image."""
+    payload = next((rows.payload[0].tobytes() for _, rows in log.rows([topic])), None)
+    try:
+        return "" if payload is None else decode_image(payload, log.topics[topic].message_encoding)[1]
+    except LogError as error:
+        logger.warning("%s %s is left out: %s", log.path, topic, error.what)
+        return None
 
 
 def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:

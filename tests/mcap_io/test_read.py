@@ -177,6 +177,15 @@ def test_frames_that_change_within_a_topic_come_as_batches_of_their_own(foreign:
     assert [(b.frame_id, len(b.stamp_ns)) for b in batches] == [("a", 5), ("c", 2), ("a", 13)]
 
 
+def test_images_that_are_none_are_left_out_and_named(foreign: Foreign, make: Make, caplog: pytest.LogCaptureFixture) -> None:
+    bad = [("/cam", schemas.IMAGE, START_NS + i, START_NS + i, i, bytes(range(40, 80))) for i in range(3)]
+    with caplog.at_level(logging.WARNING):
+        recording = read(foreign(imu_messages(make) + bad))
+    assert len(recording.imu) == 20
+    assert recording.frames == {}
+    assert "/cam is left out: payload starts with 28 29 2a 2b" in caplog.text
+
+
 def test_scalars_a_recording_cannot_hold_are_left_out_and_named(
     foreign: Foreign, make: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
