@@ -71,7 +71,7 @@ def known_layout(columns: Columns) -> Proposal | None:
 
 
 def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
-    """Entries for sensors with a time of their own, the accelerometer and poses, and for poses on the IMU's time.
+    """Entries for an accelerometer with a time of its own, and for poses on any time.
 
     Of several groups with poses true ones come first. None are taken whose quaternions have no certain order, and none of
     the IMU's own group without positions: an orientation alone is one that the sensor itself estimates.

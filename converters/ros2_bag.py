@@ -147,4 +147,5 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
             yield readers
     except (ReaderError, apsw.Error, OSError, EOFError, zlib.error, ValueError, KeyError, AssertionError) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
-        raise DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path) from error
+        fix = "Save what is intact of each .mcap with imutool repair, and convert that" if any(path.glob("*.mcap")) else ""
+        raise DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path, fix=fix) from error

@@ -111,13 +111,15 @@ def test_a_bag_without_metadata_and_a_lone_database_convert(convert, tmp_path):
     assert messages_of(tmp_path / "a.mcap") == messages_of(tmp_path / "b.mcap")
 
 
-def test_a_cut_database_is_refused_in_one_sentence(convert, tmp_path):
-    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
-    (database,) = bag.glob("*.db3")
+@pytest.mark.parametrize(("storage", "suffix"), [(StoragePlugin.SQLITE3, "db3"), (StoragePlugin.MCAP, "mcap")])
+def test_a_cut_bag_is_refused_in_one_sentence(convert, tmp_path, storage, suffix):
+    bag = write_bag(tmp_path / "bag", storage)
+    (database,) = bag.glob(f"*.{suffix}")
     database.write_bytes(database.read_bytes()[: database.stat().st_size // 2])
     done = convert(bag, tmp_path / "a.mcap")
     assert done.returncode == 4
     assert "cannot be read as a ROS 2 bag" in done.stderr
+    assert ("each .mcap with imutool repair" in done.stderr) == (suffix == "mcap")
     assert not (tmp_path / "a.mcap").exists()
 
 

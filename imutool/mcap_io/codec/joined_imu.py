@@ -69,7 +69,7 @@ def whole_of(parts: tuple[str, str]) -> str:
 
 
 def pairs_by_name(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Topics of a gyro and an accelerometer whose names differ by the sensor alone, by the IMU that they make up."""
+    """Gyro and accelerometer topics whose names differ by the sensor alone, by their IMU."""
     gyro, accel = ({re.sub(rf"(?i)(?<=/){word}(?=(_\w+)?(/|$))", "{}", t): t for t in topics} for word in SENSOR_WORDS)
     both = [(gyro[pattern], accel[pattern]) for pattern in gyro if "{}" in pattern and pattern in accel]
     return {whole: parts for parts in both if (whole := whole_of(parts)) not in topics}
