@@ -37,6 +37,7 @@ from imutool.diagnosis.reference_coverage import (
     is_another_motion,
     own_poses_sentence,
     with_unique_names,
+    without_unseen_offset,
     without_unusable,
 )
 from imutool.diagnosis.reference_errors import SMOOTHED, reference_caveat, reference_errors, turned_reference
@@ -135,8 +136,9 @@ def _beside_reference(
     report(2, 4, "searching")
     wrong, wrong_at = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
-    first = start_values(begin, named)
-    selection = select_effects(logs, named, unnamed_groups, lambda word: report(2, 4, f"trying {word}"), begin=first)
+    named, always = without_unseen_offset(named, pairs)
+    first, trying = start_values(begin, named), lambda word: report(2, 4, f"trying {word}")
+    selection = select_effects(logs, named, unnamed_groups, trying, always=always, begin=first)
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}

@@ -11,7 +11,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
@@ -20,6 +20,7 @@ from imutool.errors import DataError, ImutoolError, NumericsError
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
 from imutool.sensor import catalogue
+from imutool.sensor.effect import Effect
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.simulate import MOTION_TOPIC
 from imutool.sensor.trajectory import Stretch, smooth_motion
@@ -60,6 +61,16 @@ def align_all(
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]
     return pairs, remarks + [f"left out, {error}" if pairs else str(error) for error in refused]
+
+
+def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -> tuple[tuple[Effect, ...], Chosen]:
+    """Candidates, and effects of every fit: a clock offset if the clocks share no epoch.
+
+    What alignment by the motion leaves of it is no finding, but a filter or a delay cannot be fitted without it.
+    """
+    offset = tuple(one for one in candidates if one.name == "clock_offset" and any(pair.aligned_s for pair in pairs))
+    kept = tuple(one for one in candidates if one not in offset)
+    return kept, tuple((one, one.null_value.astype(float)) for one in offset)
 
 
 def with_unique_names(recordings: Sequence[Recording]) -> list[Recording]:

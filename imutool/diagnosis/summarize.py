@@ -77,6 +77,7 @@ def summarize(
     both = zip(selection.selected, named, strict=True)
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
     chosen = selection.fitted.chosen
+    expected_too |= {effect.key for effect, _ in chosen[: selection.always]}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {
         signal: min((f.p_value for f in findings if f.effect != JITTER and f.signal in (signal, "both")), default=1.0)

@@ -199,6 +199,17 @@ def test_a_lever_arm_is_named_sized_placed_and_removed(arm: tuple[Path, Path, Di
     assert (trace.real - trace.after)[:, 3:].std() < 1.1 * planted.NOISE[3] < (trace.real - trace.before)[:, 3:].std()
 
 
+def test_an_offset_of_clocks_that_share_no_epoch_is_no_finding(made: Made, tmp_path: Path) -> None:
+    real, sim = made({"lever_arm": ARM})
+    simulated, away_ns = read(sim), 86_400_003_700_000
+    imu, poses = simulated.imu, replace(simulated.truth, t_ns=simulated.truth.t_ns + away_ns)
+    moved = replace(simulated, imu=replace(imu, t_ns=imu.t_ns + away_ns), truths=dict.fromkeys(simulated.truths, poses))
+    write(moved, tmp_path / "sim.mcap")
+    found = diagnose([real], tmp_path / "sim.mcap")
+    assert effects(found) == ["lever_arm"]
+    assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+
+
 def test_a_pair_is_named_whole_strongest_first(made: Made) -> None:
     real, sim = made({"clock_offset": [0.004], "lever_arm": ARM})
     found = diagnose([real], sim)

@@ -12,17 +12,20 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import label, maximum, uniform_filter1d
 from scipy.signal import csd, welch
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
-from imutool.diagnosis.settings import BandSettings
+from imutool.diagnosis.settings import AlignmentSettings, BandSettings
+from imutool.inertial.stationary import nothing_but_noise
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect
 
 RIDGE = 1e-8
+MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and power that chance does not reach in any band
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
@@ -185,3 +188,25 @@ def known_band_hz(
             if (known & is_diluted(fast / slow, np.hypot(slow_std, fast_std), coherence)).any():
                 return low  # a lively axis must not hide a quiet one
     return most_hz
+
+
+def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DEFAULT.alignment) -> Float64[np.ndarray, " n"]:
+    """Wiener filter: multiply each frequency by 1 - noise / power.
+
+    The top of the spectrum shows the white noise. Bands in which nothing stands clearly above it are chance, and go.
+    """
+    n = len(x)
+    if nothing_but_noise(x):  # its ends would be taken for a ramp
+        return np.full(n, x.mean())
+    line = np.linspace(x[0], x[-1], n)  # its ends meet, so that the spectrum of a ramp is not in the noise's band
+    mirrored = np.concatenate([x - line, -(x - line)[-2:0:-1]])
+    spectrum = np.fft.rfft(mirrored)
+    power = uniform_filter1d(np.abs(spectrum) ** 2, settings.smoothed_bins, mode="nearest")
+    floor = float(np.median(power[int(settings.noise_band * len(power)) :]))
+    gain = np.clip(1.0 - floor / np.maximum(power, 1e-300), 0.0, 1.0)
+    gain[power < MOSTLY * floor] = 0.0  # what is noise for the most part goes altogether
+    bands, count = label(gain > 0.0)
+    if count:
+        highest = maximum(power, bands, np.arange(count + 1))
+        gain[highest[bands] < CLEARLY * floor] = 0.0
+    return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]

@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.ndimage import label, maximum, uniform_filter1d
 from scipy.signal import correlate, correlation_lags, periodogram
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
+from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
@@ -27,8 +27,8 @@ from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
 
+REFINEMENTS = 3  # of a lag
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
-MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and power that chance does not reach in any band
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 
 
@@ -240,28 +240,6 @@ def rotation_matrices(poses: Poses | Motion) -> Float64[np.ndarray, "n 3 3"]:
     return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
 
 
-def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DEFAULT.alignment) -> Float64[np.ndarray, " n"]:
-    """Wiener filter: multiply each frequency by 1 - noise / power.
-
-    The top of the spectrum shows the white noise. Bands in which nothing stands clearly above it are chance, and go.
-    """
-    n = len(x)
-    if nothing_but_noise(x):  # its ends would be taken for a ramp
-        return np.full(n, x.mean())
-    line = np.linspace(x[0], x[-1], n)  # its ends meet, so that the spectrum of a ramp is not in the noise's band
-    mirrored = np.concatenate([x - line, -(x - line)[-2:0:-1]])
-    spectrum = np.fft.rfft(mirrored)
-    power = uniform_filter1d(np.abs(spectrum) ** 2, settings.smoothed_bins, mode="nearest")
-    floor = float(np.median(power[int(settings.noise_band * len(power)) :]))
-    gain = np.clip(1.0 - floor / np.maximum(power, 1e-300), 0.0, 1.0)
-    gain[power < MOSTLY * floor] = 0.0  # what is noise for the most part goes altogether
-    bands, count = label(gain > 0.0)
-    if count:
-        highest = maximum(power, bands, np.arange(count + 1))
-        gain[highest[bands] < CLEARLY * floor] = 0.0
-    return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
-
-
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
     """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None for two motions."""
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
@@ -271,12 +249,30 @@ def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
     lag_s, alike = _lag(real, sim, settings)
     if shared and abs(lag_s) < settings.farthest_s:
         return 0.0
-    return lag_s if alike >= settings.least_correlation else None
+    return _refined(real, sim, lag_s, settings) if alike >= settings.least_correlation else None
 
 
 def _rests(imu: Imu) -> bool:
     """Whether a gyro shows noise only, so that nothing can be aligned, and nothing has to be."""
     return all(nothing_but_noise(column, least) for column, least in zip(imu.gyro.T, LEAST_NOISE, strict=False))
+
+
+def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> float:
+    """Lag (s) refined by Gauss-Newton, beside any linear map of the simulated rates."""
+    t_s = seconds(real.t_ns, int(real.t_ns[0]))
+    t_sim, off_s = seconds(sim.t_ns, int(real.t_ns[0])) - lag_s, 0.0
+    rate = make_interp_spline(t_sim, sim.gyro, k=3)
+    for _ in range(REFINEMENTS):
+        inside = (t_s + off_s >= t_sim[0]) & (t_s + off_s <= t_sim[-1])
+        at_s, recorded = t_s[inside] + off_s, real.gyro[inside]
+        A = np.column_stack([rate(at_s), np.ones(len(at_s))])
+        M = np.linalg.lstsq(A, recorded, rcond=None)[0]
+        slope = rate(at_s, 1) @ M[:3]
+        slope -= A @ np.linalg.lstsq(A, slope, rcond=None)[0]
+        off_s += float((slope * (recorded - A @ M)).sum() / max(float((slope**2).sum()), 1e-300))
+        if abs(off_s) > 1.0 / settings.align_hz:
+            return lag_s  # what separates the two is no delay
+    return lag_s + off_s
 
 
 def _lag(real: Imu, sim: Imu, settings: AlignmentSettings) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import firwin, welch
 
 from imutool.array_types import Float64, Int64
-from imutool.diagnosis.estimation.time_alignment import wiener_filter
+from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.errors import DataError

@@ -12,7 +12,8 @@ from support import planted
 
 from imutool.diagnosis.estimation.aligned_log import Pair, split
 from imutool.diagnosis.estimation.jacobians import expected
-from imutool.diagnosis.estimation.time_alignment import wiener_filter, with_simulation, with_truth
+from imutool.diagnosis.estimation.noise_estimate import wiener_filter
+from imutool.diagnosis.estimation.time_alignment import with_simulation, with_truth
 from imutool.errors import DataError
 from imutool.recording import Recording, Scalars
 
@@ -20,6 +21,7 @@ KEPT = 0.01  # of a signal below a tenth of Nyquist that the filter may change
 NOISE_LEFT = 0.05  # of the noise's size above the signal's band: a band that stands out by chance goes as well
 MARGIN_S = 0.25  # a little less than what lies around a border
 GRID_S = 0.011  # the step of the correlation that aligns two clocks
+REFINED_S = 2e-4  # a fiftieth of that step; noise of both gyros scatters the lag by less
 SLACK = 1.05  # over the noise: what reading a spline between samples may add
 YEAR_NS = 365 * 86_400 * 1_000_000_000
 
@@ -168,6 +170,12 @@ def test_clocks_without_a_common_epoch_are_aligned_by_the_motion(away_ns: int) -
     (same,) = with_simulation(*logs())
     ratio = left(pair)[:, :3].std(axis=0) / same.real[:, :3].std(axis=0)
     assert (ratio < 0.05).all()  # ten milliseconds of a motion at a hertz
+
+
+@pytest.mark.parametrize("off_ns", [3_700_000, -4_900_000])
+def test_clocks_without_a_common_epoch_are_aligned_below_the_step_of_the_correlation(off_ns: int) -> None:
+    (pair,) = with_simulation(*logs(sim_start_ns=planted.START_NS + YEAR_NS + off_ns))
+    assert pair.aligned_s - (YEAR_NS + off_ns) * 1e-9 == pytest.approx(0.0, abs=REFINED_S)
 
 
 def test_clocks_aligned_by_the_motion_leave_the_same_misfit_but_for_the_step_of_the_search() -> None:
