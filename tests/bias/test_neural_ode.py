@@ -22,7 +22,7 @@ from imutool.geometry import so3
 from imutool.inertial.windows import attitudes
 from imutool.recording import seconds
 from imutool.sensor.made_up_flight import flight
-from imutool.units import Sensor
+from imutool.units import SENSORS, Sensor
 
 RATE_HZ = 200.0
 SECONDS = 20.0
@@ -189,6 +189,23 @@ def test_the_curves_at_work_are_the_curves(bent: bool) -> None:
     for k in range(130):
         one = at_work.one(u[k].numpy(), slow[k].numpy(), 0.5 * k)
         np.testing.assert_allclose(one, expected[k] + rest + 0.5 * k * slope, rtol=0, atol=SAME_CURVE)
+
+
+COARSE = 1e-6  # of the curve's size: some roundings of float32
+
+
+def test_a_training_computes_the_curve_in_float32(build: MakeModel, seen: Segment) -> None:
+    model = build("neural_ode", 3)
+    assert isinstance(model, Network)
+    exact = {sensor: model.motion_bias(sensor, seen) for sensor in SENSORS}
+    model.see(seen.gyro[0], seen.accel[0])
+    for sensor in SENSORS:
+        coarse, size = model.motion_bias(sensor, seen), largest(exact[sensor])
+        assert coarse.dtype == torch.float64
+        assert 0.0 < largest(coarse - exact[sensor]) <= COARSE * size
+        weights = [*model.curve[sensor].requires_grad_().parameters()]
+        by_weights = torch.autograd.grad(model.motion_bias(sensor, seen).square().sum(), weights)
+        assert all(gradient.dtype == torch.float64 for gradient in by_weights)
 
 
 def test_an_untrained_model_adds_nothing(seen: Segment) -> None:

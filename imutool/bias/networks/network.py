@@ -40,7 +40,8 @@ class Segment:
 class BiasNetwork(nn.Module, ABC):
     """Bias network with the statistics of its sensor's training runs, for training.
 
-    It computes in float64 (`imutool.training.fit`). Names and shapes of its state are those of the model.
+    It computes in float64 (`imutool.training.fit`), unless `see` says otherwise. Names and shapes of its state are those of
+    the model.
     """
 
     method: ClassVar[str]
@@ -72,7 +73,7 @@ class BiasNetwork(nn.Module, ABC):
             self.temperature.register_buffer(name, value.to(self.prior_mean))
 
     def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
-        """Set the scales of the inputs from all training samples, before the first step."""
+        """Get ready for a training: the scales of the inputs from all its samples, the precision of what may be coarse."""
 
     def rest_at_work(self, sensor: Sensor, rest: Float[Tensor, "*logs 3"]) -> Float[Tensor, "*logs 3"]:
         """Rest biases for inference from those of training mode; equal for most models."""

@@ -36,7 +36,7 @@ class Curve(nn.Module):
 
     def __init__(self, width: int, scale: float, curve: float) -> None:
         super().__init__()
-        self.scale, self.curve = scale, curve
+        self.scale, self.curve, self.precision = scale, curve, torch.float64  # of N, whatever that of its weights
         self.W = nn.Parameter(torch.zeros(3, 3))
         layers = nn.Linear(9, width), nn.Linear(width, width), nn.Linear(width, 3, bias=False)
         for layer in layers:
@@ -46,10 +46,10 @@ class Curve(nn.Module):
 
     def forward(self, u: Float[Tensor, "*batch 3"], slow: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Motion-dependent bias: `u` the samples, `slow` the filtered ones."""
-        x, s = u / self.scale, slow / self.scale
+        x, s = u.to(self.precision) / self.scale, slow.to(self.precision) / self.scale
         inputs = torch.cat([x, asinh(NEAR_ZERO * torch.cat([x, s], dim=-1))], dim=-1)
-        bend = by_rows(self.net, inputs) - by_rows(self.net, u.new_zeros(9))
-        return u @ self.W.mT + self.curve * bend
+        bend = by_rows(self.net, inputs) - by_rows(self.net, inputs.new_zeros(9))
+        return u @ self.W.mT + self.curve * bend.to(u)
 
 
 class Network(BiasNetwork):
@@ -78,6 +78,11 @@ class Network(BiasNetwork):
                 nn.init.zeros_(layer.bias)
         self.curve = nn.ModuleDict(curves)
         self.drift = nn.ModuleDict({sensor: drift for sensor, drift in drifts.items() if sensor in chosen.drifting})
+
+    def see(self, gyro: Float[Tensor, "n 3"], accel: Float[Tensor, "n 3"]) -> None:
+        """Compute N in float32 from now on, in two fifths of the time; weights, and all else, stay float64."""
+        for sensor in self.curve:
+            _part(self.curve, sensor, Curve).precision = torch.float32
 
     def take_loads(self, names: Sequence[str], theta: Float[Tensor, " p"]) -> None:
         """Take over a drift behind the load, fitted before; the samples of the training are corrected for it."""

@@ -31,14 +31,14 @@ ROWS = 1_000  # samples at a time, so that what they need stays in a core's cach
 
 
 def by_rows(net: nn.Sequential, x: Float[Tensor, "*batch i"]) -> Float[Tensor, "*batch o"]:
-    """Perceptron linear, GELU, linear, tanh, linear without bias; `ROWS` rows at a time.
+    """Perceptron linear, GELU, linear, tanh, linear without bias, in the precision of `x`; `ROWS` rows at a time.
 
-    Where `x` are no samples, and need a gradient of their own, it is left to PyTorch.
+    Where `x` are no samples, and need a gradient of their own, it is left to PyTorch, in the precision of the weights.
     """
-    if x.requires_grad:
-        whole: Tensor = net(x)
-        return whole
     first, second, last = (layer for layer in net if isinstance(layer, nn.Linear))
+    if x.requires_grad:
+        whole: Tensor = net(x.to(first.weight))
+        return whole
     weights = first.weight, first.bias, second.weight, second.bias, last.weight
     y: Tensor = _ByRows.apply(x.reshape(-1, x.shape[-1]), torch.is_grad_enabled(), *weights)  # type: ignore[no-untyped-call]
     return y.reshape(*x.shape[:-1], y.shape[-1])
@@ -49,8 +49,9 @@ class _ByRows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, keep: bool, *weights: Tensor) -> Tensor:
-        W1, b1, W2, b2, W3 = weights
-        y, ctx.kept, ctx.weights = x.new_empty(len(x), len(W3)), [], weights
+        ctx.kept, ctx.weights, ctx.exact = [], [weight.to(x) for weight in weights], weights[0].dtype
+        W1, b1, W2, b2, W3 = ctx.weights
+        y = x.new_empty(len(x), len(W3))
         for some, out in zip(torch.split(x, ROWS), torch.split(y, ROWS), strict=True):
             a = torch.addmm(b1, some, W1.T)
             h = nn.functional.gelu(a)
@@ -73,7 +74,7 @@ class _ByRows(torch.autograd.Function):
             by_first = gelu_backward(by_second @ W2, a)
             W1_.addmm_(by_first.T, some)
             b1_ += by_first.sum(0)
-        return None, None, *by_weights
+        return None, None, *(by_weight.to(ctx.exact) for by_weight in by_weights)
 
 
 def perceptron(hidden: Sequence[int]) -> nn.Sequential:
