@@ -31,9 +31,10 @@ ROWS = 1_000  # samples at a time, so that what they need stays in a core's cach
 
 
 def by_rows(net: nn.Sequential, x: Float[Tensor, "*batch i"]) -> Float[Tensor, "*batch o"]:
-    """Perceptron linear, GELU, linear, tanh, linear without bias, in the precision of `x`; `ROWS` rows at a time.
+    """Perceptron linear, GELU, linear, tanh, linear without bias; `ROWS` rows at a time.
 
-    Where `x` are no samples, and need a gradient of their own, it is left to PyTorch, in the precision of the weights.
+    It is computed in the precision of `x`. Where `x` are no samples, and need a gradient of their own, it is left to
+    PyTorch, in the precision of the weights.
     """
     first, second, last = (layer for layer in net if isinstance(layer, nn.Linear))
     if x.requires_grad:
