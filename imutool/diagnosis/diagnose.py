@@ -16,6 +16,7 @@ from imutool.array_types import Float64
 from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
+from imutool.diagnosis.audit.simulation import read_simulation
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
@@ -120,7 +121,7 @@ def _beside_reference(
     begin: Sequence[Finding],
 ) -> Diagnosis:
     """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read."""
-    simulated = None if sim is None else read_log(sim, imu=imu)
+    simulated = None if sim is None else read_simulation(sim, imu=imu)[0]
     sim_findings, another = tuple[Finding, ...](), list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
@@ -174,7 +175,7 @@ def _with_other_imus(
 
 
 def read_log(log: Location, *, imu: str | None = None, truth: str | None = None) -> Recording:
-    """A recording or a simulation, which may fall freely, without samples that no sensor gives."""
+    """A recording, which may fall freely, without samples that no sensor gives."""
     return measured_recording(longest_stretch(read(log, imu=imu, truth=truth)), free_fall=True)
 
 
@@ -280,7 +281,7 @@ def effect_sizes(
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
-    simulated, settings = None if sim is None else read_log(sim, imu=imu), DiagnoseSettings()
+    simulated, settings = None if sim is None else read_simulation(sim, imu=imu)[0], DiagnoseSettings()
     aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)

@@ -10,16 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import Expected, noise_faults
-from imutool.diagnosis.audit.simulation import read_simulation
+from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
 from imutool.location import Location
-from imutool.mcap_io.read import read
 from imutool.noise import datasheet
 from imutool.recording import Recording
 from imutool.report import Report
@@ -63,18 +61,20 @@ def audit(
         DataError: the simulation has no poses that can be differentiated.
     """
     simulated, mount = read_simulation(sim, imu=imu, truth=truth)
-    recording = None if real is None else measured_recording(longest_stretch(read(real, imu=imu)))
+    recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
-    faults = simulator_faults(simulated, recording, sheet)
-    if mount.arm_m > LEAST_ARM_M:  # the sensor is not at the body's centre
-        faults = [fault for fault in faults if fault.fault != "body_centre"]
+    faults = simulator_faults(simulated, recording, sheet, (mount, real_mount))
     not_tested = dict(_not_tested(recording, sheet))
     tested = tuple(name for name in FAULTS if name not in not_tested)
     return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested)
 
 
-def simulator_faults(sim: Recording, real: Recording | None, sheet: datasheet.Noise) -> list[FaultFound]:
+def simulator_faults(
+    sim: Recording, real: Recording | None, sheet: datasheet.Noise, mounts: tuple[Mount, Mount] = (AT_BODY, AT_BODY)
+) -> list[FaultFound]:
     """Faults of a simulation by its own poses, and beside a recording and a data sheet.
+
+    `mounts` have moved the poses of the one and the other.
 
     Raises:
         DataError: it has no poses that can be differentiated.
@@ -91,7 +91,7 @@ def simulator_faults(sim: Recording, real: Recording | None, sheet: datasheet.No
         by_motion = [fault for fault in by_motion if fault.fault not in ("backward_difference", "step_delay")]
     faults = by_motion + faults
     if real is not None and real.truths:
-        faults += _body_centre(fit, real)
+        faults += _body_centre(fit, real, mounts)
     return faults
 
 
@@ -145,15 +145,18 @@ def _not_tested(real: Recording | None, sheet: datasheet.Noise) -> Iterator[tupl
         yield from ((name, "they need a data sheet (`noise`) or a recording (`real`)") for name in BY_NOISE)
 
 
-def _body_centre(fit: KinematicFit, real: Recording) -> list[FaultFound]:
+def _body_centre(fit: KinematicFit, real: Recording, mounts: tuple[Mount, Mount]) -> list[FaultFound]:
     """A sensor at the body's centre, where the recording's sits off it."""
     try:
         moved: Kinematics = kinematics(real)
     except ImutoolError:
         return []
-    ours, theirs = fit.estimates, kinematic_fit(moved).estimates
+    ours, theirs = (
+        {a: Estimate(estimates[a].value + stated, estimates[a].std, "m") for a, stated in zip(AXES, mount.arm, strict=True)}
+        for estimates, mount in zip((fit.estimates, kinematic_fit(moved).estimates), mounts, strict=True)
+    )
     clear = [abs(theirs[a].value - ours[a].value) > CERTAIN * np.hypot(theirs[a].std, ours[a].std) for a in AXES]
     sizes = [float(np.linalg.norm([arm[a].value for a in AXES])) for arm in (ours, theirs)]
     if not any(clear) or sizes[0] > 0.2 * sizes[1] or sizes[1] < LEAST_ARM_M:
         return []
-    return [found("body_centre", "accel", **{a: Estimate(theirs[a].value, theirs[a].std, "m") for a in AXES})]
+    return [found("body_centre", "accel", **theirs)]

@@ -31,25 +31,29 @@ class Mount(NamedTuple):
     R: Rotation
 
     @property
-    def arm_m(self) -> float:
-        """Length of the lever arm."""
-        return float(np.linalg.norm(self.p))
+    def arm(self) -> Float64[np.ndarray, "3"]:
+        """Lever arm (m) in the sensor's axes."""
+        return np.asarray(self.R.inv().apply(self.p))
 
 
 AT_BODY = Mount(np.zeros(3), Rotation.identity())
 
 
-def read_simulation(sim: Location, *, imu: str | None = None, truth: str | None = None) -> tuple[Recording, Mount]:
+def read_simulation(
+    sim: Location, *, imu: str | None = None, truth: str | None = None, simulated: bool = True
+) -> tuple[Recording, Mount]:
     """A simulation with the poses of its sensor, and the mount that moved them.
+
+    A recording is read likewise, if not `simulated`: its only poses need not be true then, and it does not fall freely.
 
     Raises:
         ConfigError, LogError: the log cannot be read, or has several poses and no `truth`.
     """
     with Log(sim) as log:
         others = log.pose_topics
-        if truth is None and not log.truth_topics and len(others) == 1:
+        if simulated and truth is None and not log.truth_topics and len(others) == 1:
             truth = others[0]
-        recording = measured_recording(longest_recording(read_recordings(log, imu=imu, truth=truth)), free_fall=True)
+        recording = measured_recording(longest_recording(read_recordings(log, imu=imu, truth=truth)), free_fall=simulated)
         recording = longest_stretch(recording)
         if not recording.truths:
             return recording, AT_BODY
@@ -57,7 +61,8 @@ def read_simulation(sim: Location, *, imu: str | None = None, truth: str | None 
         world, body = _pose_frames(log, topic)
         mount = _stated_mount(_static_transforms(log), _imu_frame(log, recording.imu_topic), world, body)
     down = "ned" in re.split(r"[^a-z0-9]+", world.lower())
-    return replace(recording, truths={topic: _of_sensor(recording.truth, mount, down=down)}), mount
+    moved = _of_sensor(recording.truths[topic], mount, down=down)
+    return replace(recording, truths={**recording.truths, topic: moved}), mount
 
 
 def _of_sensor(poses: Poses, mount: Mount, *, down: bool) -> Poses:

@@ -26,6 +26,7 @@ from imutool.diagnosis.signals import common_effects as common
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
 from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.joints import current_remark
 from imutool.diagnosis.signals.noise import lsb_of, rich_residual, whitened
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
@@ -192,6 +193,7 @@ def _summarized(
     unexplained = unexplained_residuals(logs, [after], floor, settings.held_out)
     most = settings.held_out.most_white_ratio
     beyond = any(not left.white and left.rms > most * left.noise_floor for left in unexplained.values())
+    gains = {f.signal: f.parameters["gain"].value for f in findings if f.effect == "actuator_gain"}
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
     unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
     return SignalDiagnosis(
@@ -203,7 +205,7 @@ def _summarized(
             name: msgspec.structs.replace(unexplained[name], noise_floor=float(level[k])) for k, name in enumerate(names)
         },
         closer={name: held_out_rms(logs, [before], [after], name) for name in names},
-        remarks=() if pair.shares_epoch else (NO_EPOCH.format(pair.name, pair.aligned_s),),
+        remarks=(*current_remark(gains), *(() if pair.shares_epoch else (NO_EPOCH.format(pair.name, pair.aligned_s),))),
         traces={
             name: SignalTraces(pair.stamp_s, pair.real[:, k], before[:, k], after[:, k], pair.held_out, pair.units[k])
             for k, name in enumerate(names)

@@ -103,15 +103,15 @@ def test_gravity_left_out_is_found_in_the_plane_too() -> None:
     assert motion_faults(right, kinematic_fit(right)) == []
 
 
-def written(path: Path, sim: Recording, world: str, body: Poses, mount: Poses) -> None:
+def written(path: Path, sim: Recording, world: str, body: Poses, mount: Poses, topic: str = "/tf") -> None:
     """A simulator's log in ROS 2: its IMU, /tf of the body, /tf_static of the sensor."""
     with LogWriter(path) as log:
         imu = (sim.imu.t_ns, sim.imu.gyro, sim.imu.accel)
         series = [Series(log.channel("/imu", schemas.IMU), imu[0], imu, partial(encode_imu, frame_id="imu_link"))]
-        for topic, poses, frames in (("/tf", body, (world, "base")), ("/tf_static", mount, ("base", "imu_link"))):
+        for name, poses, frames in ((topic, body, (world, "base")), ("/tf_static", mount, ("base", "imu_link"))):
             encode = partial(encode_transform, frame_id=frames[0], child_frame_id=frames[1])
             columns = (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
-            series.append(Series(log.channel(topic, schemas.TF), poses.t_ns, columns, encode))
+            series.append(Series(log.channel(name, schemas.TF), poses.t_ns, columns, encode))
         for chunk in chunks(series):
             log.chunk(chunk)
 
@@ -130,3 +130,17 @@ def test_poses_on_tf_a_stated_mount_and_a_world_named_ned_are_right(tmp_path: Pa
     report = audit(tmp_path / "sim.mcap")
     assert {fault.fault for fault in report.faults} == accused
     assert ("odom_ned" in "\n".join(lines(report))) == bool(accused)
+
+
+def test_a_recordings_stated_mount_moves_its_poses_and_is_what_the_simulation_lacks(tmp_path: Path) -> None:
+    sim, _, _ = bench.made("null", 3, DURATION_S)
+    R_bs, arm = Rotation.from_euler("xyz", [40.0, 5.0, 70.0], degrees=True), np.array([0.1, -0.2, 0.05])
+    R_wb = Rotation.from_quat(sim.truth.q_wb_wxyz, scalar_first=True) * R_bs.inv()
+    body = Poses(sim.truth.t_ns, sim.truth.p_wb - R_wb.apply(arm), R_wb.as_quat(scalar_first=True))
+    mount = Poses(sim.imu.t_ns[:1], arm[None], R_bs.as_quat(scalar_first=True)[None])
+    write(sim, tmp_path / "sim.mcap")
+    written(tmp_path / "real.mcap", sim, "world", body, mount, "/ground_truth/tf")
+    (fault,) = audit(tmp_path / "sim.mcap", tmp_path / "real.mcap").faults
+    assert fault.fault == "body_centre"
+    found = np.array([fault.parameters[axis].value for axis in "xyz"])
+    assert np.allclose(found, R_bs.inv().apply(arm), atol=0.01)

@@ -14,6 +14,7 @@ from support.robot_cases.log import write
 
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.joints import current_remark
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.quantities import in_one_unit
@@ -185,3 +186,11 @@ def test_two_motions_are_not_taken_for_one(seed: int) -> None:
     real, sim = (np.sin(2.0 * np.pi * np.outer(T * 3.0, f[k]) + p[k]).sum(axis=1)[:, None] for k in (0, 1))
     with pytest.raises(DataError, match="not alike"):
         lag_at_first_sight(T * 3.0, real, T * 3.0, sim, ("/x.y",), DiagnoseSettings())
+
+
+def test_efforts_that_are_motor_currents_are_told() -> None:
+    (remark,) = current_remark({"/j.effort[0]": 9.0, "/j.effort[1]": 0.95})
+    assert "motor currents" in remark
+    assert "/j.effort[0]: 9" in remark
+    assert "/j.effort[1]" not in remark
+    assert current_remark({"/j.effort[0]": 0.8}) == []
