@@ -141,11 +141,3 @@ def was_interrupted(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
-
-
-COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"\x04\x22\x4d\x18": "lz4"}
-
-
-def compression(start: bytes) -> str:
-    """Name of the program that compressed a file that begins like this; empty for any other."""
-    return next((name for magic, name in COMPRESSED.items() if start.startswith(magic)), "")

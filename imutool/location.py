@@ -38,6 +38,7 @@ STORES = {
 }
 ACCOUNTS = ("az", "abfs")  # their URLs say CONTAINER@ACCOUNT, which is not secret
 BLOCK_BYTES = 4 << 20
+COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"\x04\x22\x4d\x18": "lz4"}
 # A scan, the message indexes behind its chunk and the summary each have their block: 7 requests where 6 are the fewest, and
 # the library's own reading ahead made 13 (tests/bench/store.py)
 CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}
@@ -161,6 +162,11 @@ def open_location(where: Location) -> OpenFile:
         raise OSError("the server does not say how long it is, so no part of it can be asked for")
     details = getattr(remote, "details", None)  # as opening it has learnt them, without another request
     return OpenFile(remote, remote.size, size_and_etag(details if isinstance(details, dict) else where.fs.info(where.path)))
+
+
+def compression(start: bytes) -> str:
+    """Name of the program that compressed a file that begins like this; empty for any other."""
+    return next((name for magic, name in COMPRESSED.items() if start.startswith(magic)), "")
 
 
 def same_location(a: Location, b: Location) -> bool:

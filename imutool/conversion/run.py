@@ -16,7 +16,8 @@ from imutool import registry
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
-from imutool.errors import ConfigError, DataError, ImutoolError, compression, did_you_mean
+from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
+from imutool.location import compression
 from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog

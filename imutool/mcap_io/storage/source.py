@@ -6,8 +6,8 @@ import hashlib
 import threading
 from types import TracebackType
 
-from imutool.errors import ConfigError, ImutoolError, LogError, compression
-from imutool.location import Location, io_errors, open_location, reason
+from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.location import Location, compression, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
 
 BLOCK_BYTES = 1 << 20
