@@ -35,6 +35,8 @@ TYPES = {
     **{"d": "<f8", "L": "<i4", "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "n": "S4", "N": "S16", "Z": "S64"},
     "a": "(32,)<i2",
 }
+IMU_FIELDS = "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"
+POSE_FIELDS = "PE", "PN", "PD", "VE", "VN", "VD", "Roll", "Pitch", "Yaw"
 TEXT_START = b"FMT, 128, 89, FMT"
 TEXT_TYPES = {**TYPES, "M": "S16"}  # a mode is written by its name
 TEXT_SCALES = {**dict.fromkeys("cCeE", 100.0), "L": 1e7}  # of binary integers that text shows as decimals
@@ -139,11 +141,11 @@ def _text_columns(raw: bytes, remarks: Remarks) -> dict[str, np.ndarray]:
     for line in raw.decode("latin-1").splitlines():
         name, _, content = line.partition(",")
         if name == "FMT" and content.count(",") >= 4:
-            number, size, label, letters, labels = (part.strip() for part in content.split(",", 4))
+            number, _, label, letters, labels = (part.strip() for part in content.split(",", 4))
             fields = [field.strip() for field in labels.split(",") if field.strip()]
             known = len(fields) == len(letters) == len(set(fields)) and set(letters) <= TYPES.keys() - {"a"}
-            if known and int(number) != FMT:
-                formats[label] = _Format(label, int(size), letters, fields)
+            if known and number != str(FMT):
+                formats[label] = _Format(label, 0, letters, fields)
         elif (form := formats.get(name)) is not None:
             values = [value.strip() for value in content.split(",", len(form.labels) - 1)]
             if len(values) == len(form.labels) and all(values):
@@ -169,9 +171,12 @@ def _from_text(form: _Format, rows: list[list[str]]) -> np.ndarray:
     for label, letter, texts in zip(form.labels, form.letters, zip(*rows, strict=True), strict=True):
         kind = found.dtype[label]
         if letter in TEXT_SCALES:
-            found[label] = np.rint(np.array(texts, float) * TEXT_SCALES[letter]).astype(kind)
+            scaled, held = np.rint(np.array(texts, float) * TEXT_SCALES[letter]), np.iinfo(kind)
+            if not ((scaled >= held.min) & (scaled <= held.max)).all():
+                raise ValueError(f"a {label} is beyond what the binary log holds")
+            found[label] = scaled.astype(kind)
         elif kind.kind == "S":
-            found[label] = [text.encode() for text in texts]
+            found[label] = [text.encode("latin-1") for text in texts]
         else:
             found[label] = np.array([int(text) for text in texts] if kind.kind in "iu" else texts, kind)
     return found
@@ -203,15 +208,22 @@ def _instances(columns: dict[str, np.ndarray], name: str) -> dict[int, np.ndarra
     return found
 
 
+def _are_numbers(rows: np.ndarray, fields: tuple[str, ...]) -> bool:
+    return all(field in (rows.dtype.names or ()) and rows.dtype[field].kind != "S" for field in fields)
+
+
 def _imus(columns: dict[str, np.ndarray], remarks: Remarks) -> dict[str, Imu]:
     imus = {}
     for number, rows in sorted(_instances(columns, "IMU").items()):
-        values = np.stack([rows[f] for f in ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")], axis=1).astype(float)
+        if not _are_numbers(rows, IMU_FIELDS):
+            remarks.losses.append(f"/imu{number} lacks numbers of {', '.join(IMU_FIELDS)}")
+            continue
+        values = np.stack([rows[f] for f in IMU_FIELDS], axis=1).astype(float)
         kept = in_order(rows["TimeUS"].astype(np.int64) * 1000, values, f"/imu{number}")
         remarks.notes.extend(kept.notes)
         imus[f"/imu{number}"] = Imu(kept.t_ns, kept.values[:, :3] * FLU_FROM_FRD, kept.values[:, 3:] * FLU_FROM_FRD)
     if not imus:
-        remarks.losses.append("the log has no message IMU")
+        remarks.losses.append("the log has no samples of an IMU")
     return imus
 
 
@@ -220,10 +232,13 @@ def _poses(columns: dict[str, np.ndarray], remarks: Remarks) -> dict[str, Poses]
     rows = next((columns[name] for name in ("XKF1", "NKF1") if name in columns), None)
     if rows is None:
         return {}
+    if not _are_numbers(rows, POSE_FIELDS):
+        remarks.losses.append(f"the EKF's message lacks numbers of {', '.join(POSE_FIELDS)}")
+        return {}
     if "C" in (rows.dtype.names or ()):
         rows = rows[rows["C"] == rows["C"].min()]
-    angles = [rows[f] * (0.01 if rows.dtype[f].kind in "iu" else 1.0) for f in ("Roll", "Pitch", "Yaw")]  # as centidegrees
-    values = np.stack([*(rows[f] for f in ("PE", "PN", "PD", "VE", "VN", "VD")), *angles], axis=1).astype(float)
+    angles = [rows[f] * (0.01 if rows.dtype[f].kind in "iu" else 1.0) for f in POSE_FIELDS[6:]]  # as centidegrees
+    values = np.stack([*(rows[f] for f in POSE_FIELDS[:6]), *angles], axis=1).astype(float)
     kept = in_order(rows["TimeUS"].astype(np.int64) * 1000, values, "/ekf/pose")
     remarks.notes.extend(kept.notes)
     roll, pitch, yaw = np.radians(kept.values[:, 6:]).T

@@ -89,6 +89,27 @@ def test_lines_of_a_text_log_that_are_no_message_are_counted(tmp_path):
     assert len(log.imus["/imu0"]) == 500
 
 
+def test_a_text_log_that_contradicts_itself_loses_that_message_alone(tmp_path):
+    path = write_log(tmp_path / "1.log", text=True)
+    whole = dataflash.read_sequence(dataflash.sequences(path)[0])
+    path.write_text(
+        path.read_text() + "FMT, 1a, none, ODD, Qc, TimeUS,V\nODD, 5, 1e30\nFMT, 9, 3, NAN, QC, TimeUS,V\nNAN, 5, nan\n"
+    )
+    damaged = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert damaged.imus.keys() == whole.imus.keys()
+    assert [loss for loss in damaged.remarks.losses if "ODD" in loss or "NAN" in loss] == [
+        f"1 messages {name} are left out: a V is beyond what the binary log holds" for name in ("ODD", "NAN")
+    ]
+
+
+def test_an_imu_of_other_fields_is_named_as_lost(tmp_path):
+    path = tmp_path / "1.log"
+    path.write_text("FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nFMT, 9, 12, IMU, QB, TimeUS,I\nIMU, 100, 1\n")
+    log = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert log.imus == {}
+    assert any("/imu1 lacks numbers of GyrX" in loss for loss in log.remarks.losses)
+
+
 def test_imus_poses_and_every_message_arrive(convert, imutool, tmp_path):
     done = convert(write_log(tmp_path / "00000042.BIN"), tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr

@@ -130,7 +130,7 @@ class SpatialChain:
             known = np.sqrt(GRAVITY_M_S2 * np.maximum(squares, 0.0)) >= LEAST_MOMENT**2 * size
             kept = directions[:, known]
             out[i] = kept @ np.linalg.solve(kept.T @ N @ kept, kept.T @ g)
-            unknown += [np.eye(n)[i][:, None].dot(d[None]).ravel() for d in directions[:, ~known].T]
+            unknown += [np.kron(np.eye(n)[i], d) for d in directions[:, ~known].T]
         return out.ravel(), self._beyond_last_link(unknown)
 
     def _beyond_last_link(self, unknown: list[Float64[np.ndarray, " u"]]) -> Float64[np.ndarray, "u m"]:
