@@ -17,7 +17,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import decode_scalars
 from imutool.mcap_io.codec.messages import Rows
-from imutool.mcap_io.fields import _Reader, numeric_fields
+from imutool.mcap_io.fields import Reader, numeric_fields
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, UNIT_KEY, Topic
 from imutool.recording import Recording, Scalars
@@ -53,14 +53,14 @@ def temperatures(
         LogError: the log is damaged.
     """
     found: dict[str, list[Scalars]] = {}
-    readers: dict[str, _Reader | None] = {}
+    readers: dict[str, Reader | None] = {}
     for name, topic in log.topics.items():
         if name not in skip and DERIVED_KEY not in topic.metadata and topic.message_encoding in ENCODINGS:
             if topic.schema_name == schemas.FLOAT:
                 if is_temperature(name):
                     readers[name] = None
             elif paths := _paths(log, topic):
-                readers[name] = _Reader(log, topic, tuple(paths), strict=False)
+                readers[name] = Reader(log, topic, tuple(paths), strict=False)
     for name, rows in log.rows(list(readers), start_ns, end_ns):
         with log.named(name):
             for channel, part in (
@@ -99,7 +99,7 @@ def _floats(topic: Topic, rows: Rows) -> Iterator[tuple[str, Scalars]]:
         yield topic.name, thinned(cut.log_time, columns.values[:, 0], topic.metadata.get(UNIT_KEY, ""))
 
 
-def _fields(reader: _Reader, rows: Rows) -> Iterator[tuple[str, Scalars]]:
+def _fields(reader: Reader, rows: Rows) -> Iterator[tuple[str, Scalars]]:
     """Numbers of the fields of a message, which ROS gives in °C."""
     reader.take(rows)
     t_ns, values = reader.t_ns(), np.concatenate(reader.values)

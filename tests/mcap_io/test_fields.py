@@ -330,10 +330,13 @@ float32 v
     ]
 
 
-@pytest.mark.parametrize("language", ["jsonschema", "ros2idl", ""])
-def test_another_language_is_refused(tmp_path: Path, language: str) -> None:
+@pytest.mark.parametrize(
+    ("language", "message"),
+    [("jsonschema", "ros2msg and cdr"), ("ros2idl", "IDL as ROS 2 records it"), ("", "ros2msg and cdr")],
+)
+def test_another_language_is_refused(tmp_path: Path, language: str, message: str) -> None:
     path = raw(tmp_path / "other.mcap", b"float64 x\n", CDR + bytes(8), language=language)
-    with pytest.raises(LogError, match="ros2msg and cdr"):
+    with pytest.raises(LogError, match=message):
         read_field(path, "/a.x")
 
 

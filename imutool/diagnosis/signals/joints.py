@@ -11,8 +11,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.quantities import unwrapped
 from imutool.errors import LogError
-from imutool.mcap_io.codec.ros2_definition import Definition, Walk
-from imutool.mcap_io.fields import Fields, definition_of
+from imutool.mcap_io.fields import Fields, decoder_of
 from imutool.mcap_io.log import Log
 from imutool.recording import seconds
 
@@ -29,26 +28,15 @@ def joint_names(log: Log, topic: str) -> list[list[str]]:
     """Names of a topic's joints: one list, or two of several publishers; none if unreadable."""
     found = dict[tuple[str, ...], None]()
     try:
-        definition = definition_of(log, log.topics[topic])
+        decoder = decoder_of(log, log.topics[topic])
         for _, rows in log.rows([topic]):
-            left = rows.payload
-            while len(left) and len(found) < 2:
-                names = _names(left[0].tobytes(), definition)
-                found[tuple(raw.removesuffix(b"\0").decode(errors="replace") for _, raw in names)] = None
-                same = np.ones(len(left), bool)
-                for at, raw in names:
-                    same &= (left[:, at : at + len(raw)] == np.frombuffer(raw, np.uint8)).all(axis=1)
-                left = left[~same]
+            for names in decoder.texts(rows.payload, "name"):
+                found[names] = None
+            if len(found) > 1:
+                break
     except LogError:  # its numbers are not read either
         return []
     return [list(names) for names in found]
-
-
-def _names(payload: bytes, definition: Definition) -> list[tuple[int, bytes]]:
-    walk = Walk(payload, definition)
-    for _ in walk.leaves():
-        pass
-    return [(at, raw) for path, at, raw in walk.texts if path == "name"]
 
 
 def by_joint(fields: Mapping[str, Fields], wanted: Sequence[str], given: Sequence[str]) -> dict[str, Fields]:

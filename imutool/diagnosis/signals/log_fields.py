@@ -7,14 +7,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imutool.diagnosis.signals.joints import JOINTS, joint_names
+from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, joint_names
+from imutool.errors import LogError
 from imutool.location import Location
-from imutool.mcap_io.codec.schemas import IMU, POSE, TF, TWIST
-from imutool.mcap_io.fields import Fields, others
+from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, PRESSURE, TF, TWIST
+from imutool.mcap_io.fields import Fields, PlainLog, numeric_fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording.columns import longest_run
 
 MOST_READ = 400  # fields of a log to compare, and as many that may drive them
+MAGNETIC, GNSS = "sensor_msgs/msg/MagneticField", "sensor_msgs/msg/NavSatFix"
+RANGE, TEMPERATURE = "sensor_msgs/msg/Range", "sensor_msgs/msg/Temperature"
+FIELDS_OF: Mapping[str, frozenset[str]] = {
+    JOINTS: frozenset({"position[0]"}),
+    ODOMETRY: frozenset(SPEEDS),
+    MAGNETIC: frozenset(f"magnetic_field.{axis}" for axis in "xyz"),
+    GNSS: frozenset({"latitude", "longitude", "altitude"}),
+    PRESSURE: frozenset({"fluid_pressure"}),
+    RANGE: frozenset({"min_range", "max_range", "range"}),
+    TEMPERATURE: frozenset({"temperature", "variance"}),
+}
+"""Fields by which a message in another type, as of protobuf, is known for one of ROS 2."""
 ELSEWHERE = frozenset(
     {IMU, POSE, TF, TWIST, "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"}
 )
@@ -39,7 +52,7 @@ class LogFields:
         Raises:
             ConfigError, LogError: the log cannot be opened, or is damaged.
         """
-        with Log(path) as log:
+        with PlainLog(path) as log:
             named = {name: joint_names(log, name) for name, schema in schemas.items() if schema == JOINTS}
         mixed = {name for name, lists in named.items() if len(lists) > 1}
         joints = {name: lists[0] if len(lists) == 1 else [] for name, lists in named.items()}
@@ -57,13 +70,28 @@ def read_both(real: Location, sim: Location) -> tuple[LogFields, LogFields, dict
     Raises:
         ConfigError, LogError: a log cannot be opened, or is damaged.
     """
-    schemas = []
-    for path in (real, sim):
-        with Log(path) as log:
-            schemas.append({name: topic.schema_name for name, topic in log.topics.items()})
+    schemas = [_schemas(path) for path in (real, sim)]
     topics = dict(_corresponding(*schemas))
     own, other = LogFields.of(real, schemas[0], topics), LogFields.of(sim, schemas[1], set(topics.values()))
     return own, other, {topic: theirs for topic, theirs in topics.items() if topic in own.fields and theirs in other.fields}
+
+
+def _schemas(path: Location) -> dict[str, str]:
+    """Message of every topic; that of ROS 2 with its fields, where a type of its own has them."""
+    with Log(path) as log, PlainLog(path) as plain:
+        return {name: _schema(plain, name, topic.schema_name) for name, topic in log.topics.items() if name in plain.topics}
+
+
+def _schema(log: Log, name: str, schema: str) -> str:
+    recorded = log.topics[name].schema_name
+    if recorded in FIELDS_OF or recorded in ELSEWHERE or schema == IMU:
+        return recorded if recorded in FIELDS_OF else schema
+    try:
+        paths = set(numeric_fields(log, name, long=False))
+    except LogError:
+        return schema
+    known = (kind for kind, wanted in FIELDS_OF.items() if wanted <= paths and (kind != JOINTS or any(joint_names(log, name))))
+    return next(known, schema)
 
 
 def _corresponding(real: Mapping[str, str], sim: Mapping[str, str]) -> Iterator[tuple[str, str]]:

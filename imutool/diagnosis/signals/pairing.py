@@ -14,7 +14,7 @@ import numpy as np
 
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
-from imutool.diagnosis.signals.log_fields import ELSEWHERE, LogFields, read_both
+from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
 from imutool.diagnosis.signals.quantities import in_one_unit, metres, unwrapped
 from imutool.geometry import quaternion
 from imutool.location import Location
@@ -26,14 +26,12 @@ MOST_COMPARED, MOST_DRIVERS = 24, 6
 SAME = 1e-12  # relative difference of two copies
 LEAST_COPIED = 0.9  # of the longer log, that two copies share
 LISTED = 12
-MAGNETIC, GNSS = "sensor_msgs/msg/MagneticField", "sensor_msgs/msg/NavSatFix"
-RANGE, TEMPERATURE = "sensor_msgs/msg/Range", "sensor_msgs/msg/Temperature"
 VALUES: Mapping[str, tuple[str, str, str]] = {
     PRESSURE: ("fluid_pressure", "pressure", "Pa"),
     RANGE: ("range", "range", "m"),
     TEMPERATURE: ("temperature", "number", "K"),
 }
-"""Field, kind and unit of messages that hold one value; their other fields are settings."""
+"""Field, kind and unit of messages of one sensor; their other fields, if they vary, are plain numbers."""
 TRIPLES: Mapping[str, tuple[tuple[str, str, str], str, str]] = {
     MAGNETIC: (("magnetic_field.x", "magnetic_field.y", "magnetic_field.z"), "magnetic", "T"),
     GNSS: (("longitude", "latitude", "altitude"), "gnss", "m"),
@@ -111,27 +109,23 @@ def _of_topic(
     if schema == JOINTS:  # the wheels are given, as the motion of an arm is
         used = {k for _, indices in wheels.values() for k in indices}
         yield from joint_pairs(topic, *_joints(real, sim, topic, theirs), used)
-    elif schema in TRIPLES:
-        paths, kind, unit = TRIPLES[schema]
-        if all(path in side for path in paths for side in (mine, other)):
-            state = _attitude(real)
-            if kind == "gnss":
-                origin = other
-                mine, other = metres(mine, origin), metres(other, origin)
-            yield SignalPair.of_columns(topic, paths, kind, (unit,) * 3, mine, other, state)
-    else:
-        values = VALUES.get(schema)
-        if topic in wheels:
-            yield wheels[topic][0]
-        for path in mine:
-            if path in other and (values is None or path == values[0]) and not (topic in wheels and path in SPEEDS):
-                if schema == ODOMETRY and path.startswith("pose."):
-                    continue
-                kind, unit = ("number", _unit(path)) if values is None else values[1:]
-                state = _speed(real) if kind == "pressure" else {}
-                pair = replace(SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}"), kind=kind, state=state)
-                if is_quantity(mine[path]):
-                    yield replace(unwrapped(pair), units=(pair.units[0] or unit,))
+        return
+    done: tuple[str, ...] = SPEEDS if topic in wheels else ()
+    if topic in wheels:
+        yield wheels[topic][0]
+    if schema in TRIPLES:
+        done, kind, unit = TRIPLES[schema]
+        if all(path in side for path in done for side in (mine, other)):
+            sides = (metres(mine, other), metres(other, other)) if kind == "gnss" else (mine, other)
+            yield SignalPair.of_columns(topic, done, kind, (unit,) * 3, *sides, _attitude(real))
+    for path in mine:
+        if path in other and path not in done and not (schema == ODOMETRY and path.startswith("pose.")):
+            value, kind, unit = VALUES.get(schema, ("", "", ""))
+            kind, unit = (kind, unit) if path == value else ("number", _unit(path))
+            state = _speed(real) if kind == "pressure" else {}
+            pair = replace(SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}"), kind=kind, state=state)
+            if is_quantity(mine[path]):
+                yield replace(unwrapped(pair), units=(pair.units[0] or unit,))
 
 
 def _unit(path: str) -> str:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
+
+from imutool.mcap_io.codec.formats import DEPTH, LACKS, MAX_ROW, MOST_FIELDS, Path, fields_of, nested
 
 # Base types of reflection.fbs with a fixed size, and the kinds that refer to others.
 SCALARS = dict(zip(range(3, 13), "bBhHiIqQfd", strict=True))
 BOOL, STRING, VECTOR, OBJECT, ARRAY = 2, 13, 14, 15, 17
-MOST_FIELDS = 5000  # of a schema that are searched: one can nest without end
 LARGEST_STRUCT = 1 << 16  # bytes
 
 
@@ -130,6 +130,18 @@ class FlatBuffer:
             raise KeyError(field.name)
         return inside
 
+    def numbers(self, message: Any) -> Iterator[Path]:
+        """Paths of all numbers in a message, those of vectors up to its last."""
+        for path, _, node in fields_of(self.tree(DEPTH)):
+            if node == "number":
+                yield path
+            for number in range(MAX_ROW + 1) if node in ("vector", "matrix") else ():
+                try:
+                    self.at(message, (*path, number))
+                except LACKS:
+                    break
+                yield *path, number
+
     def new(self, values: Sequence[tuple[Sequence[str | int], Any]]) -> bytes:
         """Bytes of a message with these fields; required ones are there, all others keep their default."""
         out = bytearray(4)
@@ -196,20 +208,6 @@ class FlatBuffer:
         if field.base == OBJECT and self._objects[field.index].is_struct:
             return self._objects[field.index].size
         return struct.calcsize(SCALARS.get(field.base, "I"))
-
-
-def nested(values: Sequence[tuple[Sequence[str | int], Any]]) -> dict[str, Any]:
-    """Fields by their paths as nested objects and lists."""
-    tree: dict[str, Any] = {}
-    for path, value in values:
-        inner: Any = tree
-        for key, following in pairwise(path):
-            inner = inner.setdefault(key, [] if isinstance(following, int) else {})
-        if isinstance(path[-1], int):
-            inner.append(value)
-        else:
-            inner[path[-1]] = value
-    return tree
 
 
 def _object(table: _Table) -> Object:

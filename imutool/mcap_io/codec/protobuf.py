@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 
-from imutool.mcap_io.codec.flatbuffer import MOST_FIELDS
+from imutool.mcap_io.codec.formats import DEEPEST, MAX_ROW, MOST_FIELDS, Path
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,18 @@ class Protobuf:
             KeyError: a message on the way is not set.
         """
         for key in path[:-1]:
+            if isinstance(key, int):
+                message = message[key]
+                continue
             field = message.DESCRIPTOR.fields_by_name[key]
-            if field.message_type is not None and not message.HasField(key):
+            if field.message_type is not None and not field.is_repeated and not message.HasField(key):
                 raise KeyError(key)
-            message = getattr(message, str(key))
+            message = getattr(message, key)
         return message[path[-1]] if isinstance(path[-1], int) else getattr(message, path[-1])
+
+    def numbers(self, message: Any) -> Iterator[Path]:
+        """Paths of all numbers in a message, without those of messages that are not set."""
+        yield from islice(_numbers(message, ()), MOST_FIELDS)
 
     def new(self, values: Sequence[tuple[Sequence[str | int], Any]]) -> bytes:
         """Bytes of a message with these fields; all others keep their default."""
@@ -80,7 +88,7 @@ def _tree(descriptor: Any, depth: int, left: list[int]) -> dict[str, Any]:
         left[0] -= 1
         if left[0] < 0:
             break
-        numeric = field.cpp_type not in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE, field.CPPTYPE_BOOL, field.CPPTYPE_ENUM)
+        numeric = _is_number(field)
         if field.is_repeated:
             fields[field.name] = ("matrix" if "covariance" in field.name.lower() else "vector") if numeric else ""
         elif field.message_type is not None:
@@ -88,3 +96,24 @@ def _tree(descriptor: Any, depth: int, left: list[int]) -> dict[str, Any]:
         else:
             fields[field.name] = "number" if numeric else "text" if field.cpp_type == field.CPPTYPE_STRING else ""
     return fields
+
+
+def _is_number(field: Any) -> bool:
+    return field.cpp_type not in (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE, field.CPPTYPE_BOOL, field.CPPTYPE_ENUM)
+
+
+def _numbers(message: Any, path: Path) -> Iterator[Path]:
+    for field in message.DESCRIPTOR.fields if len(path) < DEEPEST else ():
+        own = (*path, field.name)
+        value = getattr(message, field.name)
+        is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
+        if field.is_repeated and not is_map:
+            for number, part in enumerate(value[: MAX_ROW + 1]):
+                if field.message_type is not None:
+                    yield from _numbers(part, (*own, number))
+                elif _is_number(field):
+                    yield *own, number
+        elif field.message_type is not None and not is_map and message.HasField(field.name):
+            yield from _numbers(value, own)
+        elif _is_number(field):
+            yield own

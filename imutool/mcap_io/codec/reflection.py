@@ -8,12 +8,11 @@ A message that lacks them has NaN, so that `clean` can leave it out.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +21,10 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.flatbuffer import FlatBuffer, nested
+from imutool.mcap_io.codec.flatbuffer import FlatBuffer
+from imutool.mcap_io.codec.formats import DEPTH, MATRIX, NUMBER, TEXT, VECTOR, Format, Json, Path, Tree, fields_of, stamps_of
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
-from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, NS_PER_S, POSE, runs
+from imutool.mcap_io.codec.schemas import GYRO_COVARIANCE, IMU, POSE, runs
 
 UNIT = r"(_?(rad(_?p?_?s)?|rads|m_?s_?2|mps2|si))?"
 GYRO = rf"(angular_?velocity|gyro(scope)?|ang_?vel|rotation_?rate|angular_?rate|omega){UNIT}"
@@ -32,30 +32,7 @@ ACCEL = rf"(linear_?acceleration|accel(eration|erometer)?|acc|specific_?force){U
 POSITION = r"position|pos|translation|p"
 ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
 POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
-STAMP = r"timestamp|stamp|time|sensor_?time"
-CLOCK = r"((hw|hardware|device|sensor|sample|imu|host|header|capture|ts)_?)?(time|timestamp|stamp|t|ts)"
-COUNTED = {rf"{CLOCK}_?ns(ec)?": 1, rf"{CLOCK}_?us(ec)?|utime": 1000}  # stamps of one number
 FRAME = r"frame_?id|frame"
-SECONDS, NANOSECONDS = ("sec", "seconds", "secs"), ("nsec", "nanos", "nanosec", "nsecs", "nanoseconds")
-DEPTH = 4  # messages within messages that are searched
-NUMBER, VECTOR, MATRIX, TEXT = "number", "vector", "matrix", "text"
-
-Path = tuple[str | int, ...]  # of a field; a number of a list has its place at the end
-Tree = Mapping[str, Any]  # of fields: NUMBER, VECTOR, MATRIX, TEXT or a tree
-
-
-@runtime_checkable
-class Format(Protocol):
-    """Encoding of messages, with access to their fields by path."""
-
-    def parse(self, raw: bytes) -> Any:
-        """Message from its bytes; ValueError where they are none."""
-
-    def at(self, message: Any, path: Path) -> Any:
-        """Value of a field; KeyError, IndexError or ValueError where the message lacks it."""
-
-    def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
-        """Bytes of a message with these fields; of numbers in a list the path ends with their place."""
 
 
 class Sample(NamedTuple):
@@ -156,8 +133,8 @@ def reflect(encoding: str, topic: str, schema_name: str, schema: bytes, first: b
     """
     form = format_of(encoding, schema_name, schema)
     try:
-        tree = form if form is None else form.tree(DEPTH) if encoding != "json" else _tree_of(json.loads(first or b""), DEPTH)
-    except (ValueError, RecursionError):
+        tree = form and tree_of(form, first or b"")
+    except ValueError:
         return None
     if form is None or not isinstance(tree, Mapping):
         return None
@@ -173,7 +150,7 @@ def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
         ImportError: the schema is of protobuf, which is not installed.
     """
     if encoding == "json":
-        return _Json()
+        return Json()
     if encoding == "flatbuffer":
         return FlatBuffer.of(schema_name, schema)
     if encoding != "protobuf":
@@ -181,6 +158,15 @@ def format_of(encoding: str, schema_name: str, schema: bytes) -> Any:
     from imutool.mcap_io.codec.protobuf import Protobuf
 
     return Protobuf.of(schema_name, schema)
+
+
+def tree_of(form: Any, first: bytes) -> Any:
+    """Tree of the fields, by the schema or, of JSON, by the first message.
+
+    Raises:
+        ValueError: that is no message.
+    """
+    return form.tree(form.parse(first)) if isinstance(form, Json) else form.tree(DEPTH)
 
 
 def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
@@ -194,7 +180,7 @@ def reflect_cdr(schema_name: str, schema: bytes) -> Reflected | None:
 
 def _found(tree: Tree, form: Format) -> Reflected | None:
     """Fields of an IMU in the tree of a message's fields."""
-    fields = [(path, _spelled(path[-1]), node) for path, node in _walk(tree, ())]
+    fields = [*fields_of(tree)]
     gyro, accel = (_vector(fields, pattern) for pattern in (GYRO, ACCEL))
     if gyro is None or accel is None:
         return None
@@ -203,14 +189,14 @@ def _found(tree: Tree, form: Format) -> Reflected | None:
         next((path for path, name, node in fields if node == MATRIX and re.fullmatch(rf"{pattern}_?covariance", name)), None)
         for pattern in (GYRO, ACCEL)
     ]
-    stamp, *others = [*_stamps(fields)] or [()]
+    stamp, *others = [*stamps_of(fields)] or [()]
     unused = tuple(other[0][0] for other in others)
     return Reflected(IMU, form, (*gyro, *accel), stamp, frame, tuple(covariances), unused)
 
 
 def _pose(tree: Tree, form: Format) -> Reflected | None:
     """First position with a quaternion beside it in the tree of a message's fields."""
-    fields = [(path, _spelled(path[-1]), node) for path, node in _walk(tree, ())]
+    fields = [*fields_of(tree)]
     for path, name, node in fields:
         if not (isinstance(node, Mapping) and re.fullmatch(ORIENTATION, name)):
             continue
@@ -219,20 +205,8 @@ def _pose(tree: Tree, form: Format) -> Reflected | None:
         parts = next(([f"{q}{axis}" for axis in "wxyz"] for q in ("", "q") if {f"{q}{a}" for a in "wxyz"} <= node.keys()), None)
         if position is not None and parts is not None:
             frame = next((p for p, text, kind in fields if kind == TEXT and re.fullmatch(FRAME, text)), None)
-            return Reflected(POSE, form, (*position, *((*path, part) for part in parts)), next(_stamps(fields), ()), frame)
+            return Reflected(POSE, form, (*position, *((*path, part) for part in parts)), next(stamps_of(fields), ()), frame)
     return None
-
-
-def _walk(tree: Tree, above: Path) -> Iterator[tuple[Path, Any]]:
-    for name, node in tree.items():
-        yield (*above, name), node
-        if isinstance(node, Mapping):
-            yield from _walk(node, (*above, name))
-
-
-def _spelled(name: str | int) -> str:
-    """Name of a field in lower case with underscores."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", str(name)).lower()
 
 
 def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path, Path, Path] | None:
@@ -249,49 +223,3 @@ def _vector(fields: Sequence[tuple[Path, str, Any]], pattern: str) -> tuple[Path
         for axis in "xyz"
     )
     return None if x is None or y is None or z is None else (x, y, z)
-
-
-def _stamps(fields: Sequence[tuple[Path, str, Any]]) -> Iterator[tuple[tuple[Path, int], ...]]:
-    """Fields that make up each stamp of a known unit; the first counts."""
-    for path, name, node in fields:
-        if isinstance(node, Mapping) and re.fullmatch(STAMP, name):
-            parts = [next((key for key in keys if node.get(key) == NUMBER), None) for keys in (SECONDS, NANOSECONDS)]
-            if parts[0] is not None and parts[1] is not None:
-                yield ((*path, parts[0]), NS_PER_S), ((*path, parts[1]), 1)
-        for pattern, size in COUNTED.items():
-            if node == NUMBER and re.fullmatch(pattern, name):
-                yield ((path, size),)
-
-
-def _tree_of(value: Any, depth: int) -> Any:
-    """Tree of the fields of a JSON value."""
-    if isinstance(value, bool) or value is None:
-        return ""
-    if isinstance(value, int | float):
-        return NUMBER
-    if isinstance(value, str):
-        return TEXT
-    if isinstance(value, list):
-        numbers = all(isinstance(part, int | float) and not isinstance(part, bool) for part in value)
-        return {3: VECTOR, 9: MATRIX}.get(len(value), "") if numbers else ""
-    return {name: _tree_of(part, depth - 1) for name, part in value.items()} if depth else ""
-
-
-class _Json:
-    """Messages in JSON."""
-
-    def parse(self, raw: bytes) -> Any:
-        try:
-            return json.loads(raw)
-        except RecursionError as error:
-            raise ValueError("nests too deep") from error
-
-    def at(self, message: Any, path: Path) -> Any:
-        for key in path:
-            message = message[key]
-        if isinstance(message, bool):
-            raise ValueError("a truth value is no number")
-        return message
-
-    def new(self, values: Sequence[tuple[Path, Any]]) -> bytes:
-        return json.dumps(nested(values)).encode()

@@ -1,8 +1,9 @@
-"""Find every number in a message from its `ros2msg` definition, in one walk over its bytes.
+"""Find every number in a ROS message from its definition, in one walk over its bytes.
 
 Grammar and alignment are those of ROS 2 (docs.ros.org, "About internal ROS 2 interfaces"; classic CDR: each primitive is
-aligned to its own size, counted from behind the 4-byte encapsulation). A log's definitions are taken for hostile: how deep they
-nest is bounded, and every count is checked against the bytes left, so that a walk costs no more than the message is long.
+aligned to its own size, counted from behind the 4-byte encapsulation). ROS 1 has neither encapsulation nor alignment.
+A log's definitions are taken for hostile: how deep they nest is bounded, and every count is checked against the bytes left, so
+that a walk costs no more than the message is long.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from imutool.errors import LogError
-from imutool.mcap_io.codec.flatbuffer import MOST_FIELDS
+from imutool.mcap_io.codec.formats import DEEPEST, MOST_FIELDS
 
 NUMBERS = {
     **dict.fromkeys(("bool", "byte", "char", "uint8"), "u1"),
@@ -23,8 +24,12 @@ NUMBERS = {
 }
 FORMATS = {"u1": "B", "i1": "b", "u2": "H", "i2": "h", "u4": "I", "i4": "i", "u8": "Q", "i8": "q", "f4": "f", "f8": "d"}
 TEXT = "string"
-TIMES = ("builtin_interfaces/Time", "builtin_interfaces/Duration")
-DEEPEST = 24  # messages within messages; those of ROS are at most six deep
+TIMES = {  # the types of the seconds; ROS 1 has no package for them
+    "builtin_interfaces/Time": "int32",
+    "builtin_interfaces/Duration": "int32",
+    "time": "uint32",
+    "duration": "int32",
+}
 PADDING = 4  # bytes to which some writers fill up a payload
 MOST_TEXT = 1 << 20  # bytes of a definition
 MOST_COUNTED = 4096  # counts and texts before a number in one message
@@ -32,8 +37,7 @@ MOST_COUNTED = 4096  # counts and texts before a number in one message
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>|\s.*|=.*)"
 )
-_SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
-
+SEPARATOR = re.compile(r"^=+\s*$", re.MULTILINE)
 
 Message = tuple[bytes, Mapping[str, tuple[int, str]]]  # bytes; first byte and format of each number by its path
 
@@ -68,10 +72,9 @@ def parse(schema_name: str, text: bytes) -> Definition:
         raise LogError(f"the definition of {schema_name} has {len(text)} bytes", expected=f"at most {MOST_TEXT}")
     root = _short(schema_name)
     known: dict[str, tuple[Field, ...]] = {
-        TIMES[0]: (Field("sec", "int32", None), Field("nanosec", "uint32", None)),
-        TIMES[1]: (Field("sec", "int32", None), Field("nanosec", "uint32", None)),
+        name: (Field("sec", kind, None), Field("nanosec", "uint32", None)) for name, kind in TIMES.items()
     }
-    for position, part in enumerate(_SEPARATOR.split(text.decode(errors="replace"))):
+    for position, part in enumerate(SEPARATOR.split(text.decode(errors="replace"))):
         name, body = root, part
         if position:
             first, _, body = part.strip().partition("\n")
@@ -97,7 +100,7 @@ def _fields(of: str, body: str) -> Iterator[Field]:
         if found["rest"].lstrip().startswith("="):
             continue  # a constant is in no message
         kind = found["type"]
-        if kind not in NUMBERS and kind not in (TEXT, "wstring"):
+        if kind not in NUMBERS and kind not in (TEXT, "wstring", *TIMES):
             kind = _short(kind) if "/" in kind else "std_msgs/Header" if kind == "Header" else f"{of.partition('/')[0]}/{kind}"
         count = None if found["array"] is None else 0 if found["bound"] else int((found["count"] or "0")[:12])
         yield Field(found["name"], kind, count)
@@ -142,13 +145,17 @@ class Walk:
         LogError: not plain CDR, or the message ends before its fields do.
     """
 
-    def __init__(self, payload: bytes, definition: Definition) -> None:
+    def __init__(self, payload: bytes, definition: Definition, encoding: str = "cdr") -> None:
+        self.payload, self.definition, self.position, self.order = payload, definition, 0, "<"
+        self.constants: list[tuple[int, bytes]] = []
+        self.texts: list[tuple[str, int, bytes]] = []
+        self._is_cdr = encoding == "cdr"
+        if not self._is_cdr:
+            return
         if payload[:2] not in (b"\0\0", b"\0\1") or len(payload) < 4:
             raise LogError(f"payload starts with {payload[:4].hex(' ')}", expected="plain CDR: 00 00 or 00 01")
-        self.payload, self.definition, self.position = payload, definition, 4
-        self.order = "<" if payload[1] else ">"
-        self.constants = [(0, payload[:2])]
-        self.texts: list[tuple[str, int, bytes]] = []
+        self.position, self.order = 4, "<" if payload[1] else ">"
+        self.constants.append((0, payload[:2]))
 
     def leaves(self) -> Iterator[Leaf]:
         """Every number of the message, rows of numbers as one."""
@@ -156,7 +163,7 @@ class Walk:
 
     def _message(self, kind: str, path: str) -> Iterator[Leaf]:
         fields = self.definition[kind]
-        if not fields:
+        if not fields and self._is_cdr:
             self._skip(1)  # what is empty is written as one byte
         for field in fields:
             yield from self._field(field, f"{path}.{field.name}" if path else field.name)
@@ -187,7 +194,7 @@ class Walk:
         return count
 
     def _align(self, size: int) -> None:
-        self.position += -(self.position - 4) % size
+        self.position += -(self.position - 4) % size if self._is_cdr else 0
 
     def _skip(self, size: int) -> int:
         at, self.position = self.position, self.position + size

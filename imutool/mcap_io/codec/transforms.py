@@ -12,9 +12,9 @@ import numpy as np
 
 from imutool.array_types import Bool
 from imutool.mcap_io.codec.encode import encode_transforms
+from imutool.mcap_io.codec.formats import LACKS, Format
 from imutool.mcap_io.codec.joined_imu import Cut
 from imutool.mcap_io.codec.messages import FIXED, MESSAGE, Messages
-from imutool.mcap_io.codec.reflection import Format
 from imutool.mcap_io.codec.schemas import NS_PER_S, TF
 
 TYPE = re.compile(r"(?:.*[./])?FrameTransform(s?)")
@@ -59,7 +59,7 @@ class Transforms:
         try:
             message = self.format.parse(raw)
             each = self.format.at(message, ("transforms",)) if self.several else [message]
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except LACKS:
             return []
         return [transform for part in each if (transform := self._transform(part, log_time)) is not None]
 
@@ -68,7 +68,7 @@ class Transforms:
         try:
             parent, child = (str(at(message, (name,))) for name in FRAMES)
             values = [float(at(message, path)) for path in NUMBERS]
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except LACKS:
             return None
         return Transform((parent, child), next(self._stamps(message), log_time), values)
 
@@ -76,6 +76,6 @@ class Transforms:
         for seconds, nanoseconds in STAMPS:
             try:
                 parts = [int(self.format.at(message, ("timestamp", name))) for name in (seconds, nanoseconds)]
-            except (ValueError, KeyError, TypeError, AttributeError):
+            except LACKS:
                 continue
             yield parts[0] * NS_PER_S + parts[1]

@@ -1,0 +1,121 @@
+"""Read any number of any message by topic and path: `/joint_states.position[2]`.
+
+Messages are those of ROS 2, of ROS 1, or in protobuf, JSON or FlatBuffers. One chunk is in memory at a time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from itertools import islice
+
+import numpy as np
+
+from imutool.array_types import Float64, Int64
+from imutool.errors import LogError
+from imutool.location import Location
+from imutool.mcap_io.fields.decoders import decoder_of
+from imutool.mcap_io.fields.reader import Fields, PlainLog, Reader, listed
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import DERIVED_KEY
+
+__all__ = ["Fields", "PlainLog", "Reader", "decoder_of", "listed", "numbers", "numeric_fields", "others", "read_field", "split"]
+
+MAX_OTHERS, READ_FACTOR = 48, 4  # channels, and how many times as many fields are read to find varying ones
+_PATH = re.compile(r"[^.\[\]]+(\[\d{1,9}\])*(\.[^.\[\]]+(\[\d{1,9}\])*)*")
+_NO_CHANNEL = re.compile(r"(^|\.)(\w*stamp|covariance|\w+_covariance|variance)\b")
+
+
+def read_field(path: Location, signal: str) -> Fields:
+    """One signal of a log, named TOPIC.field.
+
+    Raises:
+        ConfigError: the file cannot be opened.
+        LogError: no such topic or field (the message lists what there is), another encoding, an array that is shorter in some
+            message, NaN or infinity, stamps that do not increase, damage.
+    """
+    with PlainLog(path) as log:
+        topic, inside = split(log, signal)
+        reader = _read(log, topic, (inside,))
+        with log.named(topic):
+            return reader.whole(inside)
+
+
+def numbers(log: Log, topic: str, paths: tuple[str, ...]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
+    """Stamps and numbers of some fields of a topic, unchecked."""
+    reader = _read(log, topic, paths)
+    return reader.t_ns(), np.concatenate([np.zeros((0, len(paths))), *reader.values])
+
+
+def _read(log: Log, topic: str, paths: tuple[str, ...]) -> Reader:
+    """Reader of some fields of a topic, after its messages."""
+    reader = Reader(log, log.topics[topic], paths)
+    for _, rows in log.rows([topic]):
+        with log.named(topic):
+            reader.take(rows)
+    return reader
+
+
+def split(log: Log, signal: str) -> tuple[str, str]:
+    """Topic and path of TOPIC.field; of topics that both fit, the longer.
+
+    Raises:
+        LogError: no such topic, or no path behind it.
+    """
+    topics = [topic for topic in log.topics if signal.startswith(f"{topic}.")]
+    if not topics:
+        expected = "TOPIC.field" if signal in log.topics else log.listing()
+        fields = f" It has {listed(numeric_fields(log, signal))}" if signal in log.topics else ""
+        what = f"{signal} names no field" if signal in log.topics else f"there is no topic that {signal} begins with"
+        raise LogError(what, where=log.path, expected=expected, fix=fields.strip())
+    topic = max(topics, key=len)
+    inside = signal[len(topic) + 1 :]
+    if not _PATH.fullmatch(inside):
+        raise LogError(f"field {inside!r}", where=f"{log.path} {topic}", expected="names and dots: twist.linear.x")
+    return topic, inside
+
+
+def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
+    """Paths of the numbers in a topic's first message, without stamps; `long` arrays if asked.
+
+    Raises:
+        LogError: no schema, or another encoding.
+    """
+    decoder = decoder_of(log, log.topics[topic])
+    for _, rows in log.rows([topic]):
+        with log.named(topic):
+            return decoder.paths(rows.payload[0].tobytes(), long)
+    return []
+
+
+def others(
+    path: Location, signal: str, most: int = MAX_OTHERS, skip: Collection[str] = (), *, gaps: bool = False
+) -> dict[str, Fields]:
+    """Every other varying number of a log by TOPIC.field: candidates to drive a signal.
+
+    Left out are stamps, covariances, constants, long arrays (images), unreadable or computed topics, those in `skip`, all that
+    vary behind the first `most`, and fields with NaN or stamps that do not increase; with `gaps`, only such rows of theirs.
+
+    Raises:
+        ConfigError, LogError: the log cannot be opened, or is damaged.
+    """
+    with PlainLog(path) as log:
+        readers, left = dict[str, Reader](), READ_FACTOR * most
+        for name, topic in log.topics.items():
+            paths = [] if name in skip or DERIVED_KEY in topic.metadata else _offered(log, name)
+            paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
+            if paths:
+                readers[name], left = Reader(log, topic, tuple(paths), strict=False), left - len(paths)
+        for name, rows in log.rows(list(readers)):
+            with log.named(name):
+                readers[name].take(rows)
+    offered = ((f"{name}.{inside}", reader.usable(inside, gaps)) for name, reader in readers.items() for inside in reader.paths)
+    return dict(islice(((name, values) for name, values in offered if values is not None), most))
+
+
+def _offered(log: Log, topic: str) -> list[str]:
+    """Numeric fields of a topic, none where it has no readable definition."""
+    try:
+        return numeric_fields(log, topic, long=False)
+    except LogError:
+        return []
