@@ -74,9 +74,9 @@ def _in_file(path: Path) -> list[Sequence]:
     roots = {"/".join(parts[: parts.index(ROOT)]) for parts in folders if ROOT in parts and "__MACOSX" not in parts}
     if not roots and (inner := sorted(m for m in members if m.lower().endswith((*SUFFIXES, BAG)))):
         raise DataError(
-            f"holds archives, not recordings ({', '.join(inner[:3])}{', ...' if len(inner) > 3 else ''})",
+            f"holds archives or bags, not the files of a sequence ({', '.join(inner[:3])}{', ...' if len(inner) > 3 else ''})",
             where=path,
-            fix="Unpack the outer archive and convert the folder",
+            fix="Unpack it and convert the folder",
         )
     return [Sequence(PurePosixPath(root).name or stem(path), path, root) for root in sorted(roots)]
 

@@ -47,6 +47,7 @@ def load(path: Path, kind: str) -> Columns:
     columns = Columns()
     with refusing(path):
         LOADERS[kind](path, columns)
+    columns.join_stamps()
     if not columns.values:
         raise DataError("holds no columns of numbers", where=path, expected="a time, three rates and three accelerations")
     return columns

@@ -19,12 +19,14 @@ from imutool.recording.message_log import Remarks
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
+LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 LEAST_NUMBERS = 4  # in a row: a time and a vector
 COMMENTS = "#", "%", "//"
 DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123
     r"(?:(\d{4})-(\d\d)-(\d\d)|(\d\d?)\.(\d\d?)\.(\d{4}))[T ]+(\d\d?:\d\d:\d\d)(?:[.,](\d{1,9})\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)?"
 )
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
+SECONDS, NANOSECONDS = re.compile(r"(.*?)(secs?|seconds?)", re.I), ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds")
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 
@@ -56,6 +58,19 @@ class Columns:
                 self.values[f"{name}[{number}]"], self.units[f"{name}[{number}]"] = array[:, number], unit
         elif array.size > 1:
             self.values[name], self.units[name] = array.reshape(-1), unit
+
+    def join_stamps(self) -> None:
+        """Make one column of a stamp that has its seconds and its nanoseconds in two, as ROS' header.stamp has."""
+        for seconds in [column for column in self.values if SECONDS.fullmatch(column)]:
+            stem = SECONDS.fullmatch(seconds)[1]  # type: ignore[index]  # it matched
+            nanoseconds = next((c for c in self.values if c.startswith(stem) and c[len(stem) :].lower() in NANOSECONDS), "")
+            name, pair = f"{stem.rstrip('._/ ') or 'stamp'} [ns]", [self.values.get(c) for c in (seconds, nanoseconds)]
+            if name in self.values or not all(part is not None and part.dtype.kind in "iu" for part in pair):
+                continue
+            sec, nsec = (np.asarray(part).astype(np.int64) for part in pair)
+            if len(sec) == len(nsec) and 0 <= sec.min() <= sec.max() < LAST_S and 0 <= nsec.min() <= nsec.max() < 10**9:
+                del self.values[seconds], self.values[nanoseconds]
+                self.values[name], self.units[name] = sec * 10**9 + nsec, "ns"
 
 
 def text_of(raw: bytes) -> str:

@@ -56,8 +56,12 @@ def to_location(text: str) -> Location:
     """File or object that a user names.
 
     Raises:
-        ConfigError: an unknown kind of store, one whose package is not installed, or a URL with a password or signature in it.
+        ConfigError: an unknown kind of store, one whose package is not installed, a URL with a password or signature in it, or
+            `-`, which is elsewhere a stream.
     """
+    if text == "-":
+        what = "is a stream: a log is read by its indexes, and checked after it is written"
+        raise ConfigError(what, where="-", expected="a file or a URL", fix="Name a file; one called - is ./-")
     scheme, colon, rest = text.partition("://")
     if not colon:
         return Path(text)

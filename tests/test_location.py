@@ -41,6 +41,12 @@ def test_a_name_without_a_store_is_a_file(text: str) -> None:
     assert to_location(f"file://{text}") == Path(text)
 
 
+def test_a_stream_is_no_location() -> None:
+    with pytest.raises(ConfigError, match=r"-: is a stream.*\./-"):
+        to_location("-")
+    assert to_location("./-") == Path("-")
+
+
 def test_a_url_is_an_object_in_a_store(store: Any) -> None:
     found = to_location("s3://fleet/robot 7/log#1.mcap")
     assert not isinstance(found, Path)

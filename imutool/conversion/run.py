@@ -17,7 +17,7 @@ from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
-from imutool.location import compression
+from imutool.location import compression, local
 from imutool.mcap_io.storage.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -211,9 +211,9 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
     """Target of each log; missing folders are made. A text that ends with a slash names a folder.
 
     Raises:
-        ConfigError: several logs but `out` names a file, or a folder cannot be made.
+        ConfigError: several logs but `out` names a file, it is a URL or a stream, or a folder cannot be made.
     """
-    slash, out = str(out).endswith(("/", os.sep)), Path(out)
+    slash, out = str(out).endswith(("/", os.sep)), local(str(out), "out")
     if many and (out.suffix == SUFFIX or out.is_file()):
         raise ConfigError("several sequences do not fit into one file", where=out, expected="a folder")
     into_folder = many or slash or out.is_dir()

@@ -63,6 +63,15 @@ def test_one_sequence_goes_to_the_file_named(source, tmp_path):
     assert read(report.written[0]) == next(iter(registry.load("imutool.converters", "euroc").read(source / "a")))
 
 
+@pytest.mark.parametrize("out", ["s3://bucket/log.mcap", "-"])
+def test_a_log_is_not_written_to_a_folder_named_as_a_store(source, tmp_path, monkeypatch, out):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(ConfigError, match="in an object store|is a stream"):
+        convert(source, out)
+    assert sorted(tmp_path.iterdir()) == before
+
+
 def test_one_sequence_into_a_folder_that_exists_takes_its_name(source, tmp_path):
     (tmp_path / "out").mkdir()
     assert convert(source / "a", tmp_path / "out").written == [tmp_path / "out" / "a.mcap"]

@@ -243,7 +243,7 @@ def test_a_text_file_named_zip_is_refused(make):
 
 
 def test_an_archive_of_archives_says_to_unpack_it(make):
-    refused(make.zip("machine_hall.zip", {"machine_hall/MH_01_easy/MH_01_easy.zip": b"PK"}), "holds archives.*Unpack")
+    refused(make.zip("machine_hall.zip", {"machine_hall/MH_01_easy/MH_01_easy.zip": b"PK"}), "holds archives or bags.*Unpack")
 
 
 def test_what_a_mac_leaves_in_an_archive_is_no_sequence(make):
@@ -277,7 +277,7 @@ def test_a_source_that_does_not_exist_is_named(tmp_path):
 def test_an_archive_of_archives_in_a_folder_fails_with_the_same_advice(make):
     make.zip("machine_hall.zip", {"machine_hall/MH_01_easy/MH_01_easy.zip": b"PK"})
     (sequence,) = euroc.sequences(make.tmp)
-    with pytest.raises(DataError, match=r"holds archives.*Unpack"):
+    with pytest.raises(DataError, match=r"holds archives or bags.*Unpack"):
         euroc.recognises(sequence)
 
 

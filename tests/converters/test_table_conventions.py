@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
+from imutool.errors import ConfigError
 
 COUNT = 400
 START_NS = 1_600_000_000_000_000_000
@@ -51,6 +52,26 @@ def test_the_stamp_of_a_message_counts_before_the_time_of_its_arrival(tmp_path, 
     columns = [late_ns, np.arange(COUNT), T_NS if stamp == "set" else 0 * T_NS, *GYRO.T, *ACCEL.T]
     imu = table.read_sequence(table.sequences(written(tmp_path / "echo.csv", names, columns))[0]).imus["/imu0"]
     assert np.array_equal(imu.t_ns, T_NS if stamp == "set" else late_ns)
+
+
+TWO_COLUMNS = [("sec", "nanosec"), ("header.stamp.secs", "header.stamp.nsecs"), ("stamp_Seconds", "stamp_Nanoseconds")]
+
+
+@pytest.mark.parametrize("names", TWO_COLUMNS)
+def test_a_stamp_in_two_columns_is_one_time(tmp_path, names):
+    columns = [T_NS + 900_000_000, T_NS // 10**9, T_NS % 10**9, *GYRO.T, *ACCEL.T]
+    path = written(tmp_path / "two.csv", ["time", *names, *IMU_NAMES], columns)
+    log = table.read_sequence(table.sequences(path)[0], mapping=None)
+    expected = T_NS if names[0].startswith("header") else T_NS + 900_000_000  # else the first time counts
+    assert np.array_equal(log.imus["/imu0"].t_ns, expected)
+    bare = table.read_sequence(table.sequences(written(path, [*names, *IMU_NAMES], columns[1:]))[0])
+    assert np.array_equal(bare.imus["/imu0"].t_ns, T_NS)
+
+
+def test_nanoseconds_without_their_second_are_no_time(tmp_path):
+    path = written(tmp_path / "half.csv", ["nanosec", *IMU_NAMES], [T_NS % 10**9, *GYRO.T, *ACCEL.T])
+    with pytest.raises(ConfigError, match="no column that rises looks like a time"):
+        table.read_sequence(table.sequences(path)[0])
 
 
 POSES = {
