@@ -26,7 +26,10 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
     r"(?:(\d{4})-(\d\d)-(\d\d)|(\d\d?)\.(\d\d?)\.(\d{4}))[T ]+(\d\d?:\d\d:\d\d)(?:[.,](\d{1,9})\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)?"
 )
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
-SECONDS, NANOSECONDS = re.compile(r"(.*?)(secs?|seconds?)", re.I), ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds")
+SECONDS, NANOSECONDS = (
+    re.compile(r"(.*?)(secs?|seconds?)", re.I),
+    ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
+)
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 

@@ -208,6 +208,19 @@ def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: 
         call(str(logs / "flight_1.mcap"))
 
 
+@pytest.mark.parametrize("unit_ns", [1_000, 1_000_000])
+def test_times_of_another_unit_are_refused(unit_ns: int, logs: Path, tmp_path: Path) -> None:
+    imu = imutool.read(logs / "flight_1.mcap").imu
+    other = imutool.Recording("other", imutool.Imu(imu.t_ns // unit_ns, imu.gyro, imu.accel))
+    for call in (
+        lambda: imutool.write(tmp_path / "log.mcap", other),
+        lambda: imutool.debias(other, imutool.load_model("static")),
+    ):
+        with pytest.raises(imutool.DataError, match="not in nanoseconds"):
+            call()
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_url_is_a_path(store: Any, logs: Path) -> None:
     recording = imutool.read(logs / "flight_1.mcap")
     imutool.write("s3://fleet/flight_1.mcap", recording)

@@ -72,7 +72,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
 
     Raises:
         ConfigError: The log exists without `overwrite`, cannot be written, or the compression is unknown.
-        DataError: Two topics of one name, or times before 1970.
+        DataError: Two topics of one name, times before 1970, or an IMU whose times are not in nanoseconds.
 
     Examples:
         >>> import imutool
@@ -85,6 +85,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
         True
     """
     check_outputs([OutputFile("path", path, output_conflicts.LOG)], overwrite=overwrite)
+    recording.imu.check_rate(recording.name)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
 

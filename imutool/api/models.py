@@ -182,6 +182,7 @@ def debias(
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
         LogError: No such IMU, a log that is debiased already, or damage that cannot be repaired.
+        DataError: A recording whose times are not in nanoseconds.
         ModelError: No model and no time at rest, a model for another rate or that does not fit the log, a damaged model file.
 
     Examples:
@@ -209,6 +210,7 @@ def debias(
 def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
     if not isinstance(model, Model | None):
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
+    recording.imu.check_rate(recording.name)
     name, chosen, start = _model_and_start(recording, model, init, smooth)
     about = recording.metadata.get("imutool", {})
     fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).report(name, recording.name, force=force)

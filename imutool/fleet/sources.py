@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import glob as globs
+import logging
 import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +15,11 @@ from imutool.errors import ConfigError, redact
 from imutool.fleet.task import Source
 from imutool.location import Location, identity, io_errors, reason, size_and_etag, to_location
 
+logger = logging.getLogger(__name__)
+
 LOG, BAG = ".mcap", ".bag"
+RAW = BAG, ".db3", ".ulg", ".csv", ".tsv", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".zip", ".tar", ".tgz", ".tar.gz"
+CONVERT = "imutool convert makes logs of other recordings"
 PATTERN = re.compile(r"[*?\[]")
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
 PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8,24}\.partial", re.DOTALL)
@@ -37,7 +43,7 @@ class _File(NamedTuple):
 def find(text: str, out: Location, *, bags: bool = False) -> Found:
     """Find the logs of a path, a glob, a folder or a URL; logs below `out` are left out.
 
-    With `bags` ROS 1 bags are logs too.
+    With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
     keeps its own name. Links are followed. A log without a usable name below OUT is refused, and the others go on.
@@ -46,10 +52,13 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         ConfigError: nothing there, or no log in it.
     """
     endings = (LOG, BAG) if bags else (LOG,)
-    root, files = _files(text, endings)
-    logs, refused, taken = [], [], dict[str, str]()
+    root, files = _files(text, (*endings, *RAW))
+    logs, refused, taken, passed_over = [], [], dict[str, str](), Counter[str]()
     for where, about in files:
         if f"{where}/".startswith(f"{str(out).rstrip('/')}/"):
+            continue
+        if not where.endswith(endings) and (ending := next((raw for raw in RAW if where.endswith(raw)), "")):
+            passed_over[ending] += 1
             continue
         try:
             name = relative(where, root)
@@ -62,9 +71,11 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         except ConfigError as error:
             refused.append((_shown(where), str(error)))
     if not logs and not refused:
-        raise ConfigError(
-            f"no {' or '.join(endings)} log", where=text, expected="a log, a folder with logs, or a pattern that fits some"
-        )
+        expected = "a log, a folder with logs, or a pattern that fits some"
+        raise ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=CONVERT if passed_over else "")
+    if passed_over:
+        kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
+        logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)
     logs.sort(key=lambda source: source.name)
     return Found(logs, sorted(refused))
 

@@ -35,7 +35,7 @@ from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
-from imutool.recording import Imu
+from imutool.recording import LEAST_PERIOD_S, Imu
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.report import UNSET
 from imutool.units import SENSORS
@@ -268,6 +268,8 @@ def _imu_warnings(
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
     warnings += jump_warnings(jumps)
+    if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S:
+        warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")
     return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 

@@ -23,6 +23,7 @@ GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
 GAP_FACTOR = 4.0  # length of a gap in the truth, in median periods
 MIN_GAP_S = 0.08  # least length of a gap: a 20 Hz truth, and the 70 ms jitter of FETCH, have no gap
+LEAST_PERIOD_S = 20e-6  # an IMU has at most 32 kHz; stamps in microseconds taken for nanoseconds are closer from 50 Hz on
 
 Times = Int64[np.ndarray, " n"]
 
@@ -51,6 +52,16 @@ class Imu(Columns):
     def __post_init__(self) -> None:
         self.freeze()
         self.check(gyro=(3,), accel=(3,))
+
+    def check_rate(self, where: str) -> None:
+        """Refuse stamps too close for an IMU, as of microseconds where nanoseconds are expected.
+
+        Raises:
+            DataError: more than half of the samples follow within 20 µs.
+        """
+        if len(self) > 1 and self.period_s < LEAST_PERIOD_S:
+            what = f"the IMU has {1.0 / self.period_s:.3g} samples a second: its t_ns is not in nanoseconds"
+            raise DataError(what, where=where, expected=f"steps of at least {LEAST_PERIOD_S * 1e9:.0f} ns")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

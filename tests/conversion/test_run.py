@@ -67,7 +67,7 @@ def test_one_sequence_goes_to_the_file_named(source, tmp_path):
 def test_a_log_is_not_written_to_a_folder_named_as_a_store(source, tmp_path, monkeypatch, out):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.iterdir())
-    with pytest.raises(ConfigError, match="in an object store|is a stream"):
+    with pytest.raises(ConfigError, match=r"in an object store|is a stream"):
         convert(source, out)
     assert sorted(tmp_path.iterdir()) == before
 

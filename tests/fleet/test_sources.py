@@ -47,6 +47,15 @@ def test_bags_are_taken_where_asked_for_and_keep_their_names(tmp_path: Path) -> 
         find(str(tree(tmp_path / "none", "x.txt")), NOWHERE, bags=True)
 
 
+def test_other_recordings_are_passed_over_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tree(tmp_path, "a/log.mcap", "a/log.bag", "b.bag", "t.csv", "u.tar.gz", "readme.txt")
+    assert names(tmp_path) == ["a/log.mcap"]
+    assert "passed over (2 .bag, 1 .csv, 1 .tar.gz); imutool convert" in caplog.text
+    (tmp_path / "a" / "log.mcap").unlink()
+    with pytest.raises(ConfigError, match=r"no \.mcap log.*imutool convert makes logs"):
+        find(str(tmp_path), NOWHERE)
+
+
 def test_what_lies_in_out_is_no_source(tmp_path: Path) -> None:
     tree(tmp_path, "a.mcap", "out/a.mcap", "outer/a.mcap")
     assert names(tmp_path, tmp_path / "out") == ["a.mcap", "outer/a.mcap"]

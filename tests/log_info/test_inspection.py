@@ -82,6 +82,11 @@ def test_clocks_of_every_topic_are_measured(tmp_path):
     assert report["duration_s"] == pytest.approx(999 * 0.005)
 
 
+def test_stamps_that_are_no_nanoseconds_are_told(tmp_path):
+    report = logged(tmp_path, replace(resting(400), t_ns=(START_NS + PERIOD_NS * np.arange(400)) // 1000))
+    assert any("2e+05 samples a second: the stamps are not in nanoseconds" in warning for warning in report["warnings"])
+
+
 def test_jitter_and_gaps_are_those_of_the_periods(tmp_path):
     imu = resting(1001)
     shift = np.where(np.arange(1001) % 2, 500_000, 0)  # periods alternate between 5.5 and 4.5 ms
