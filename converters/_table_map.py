@@ -277,9 +277,9 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
 
 
 def rises(values: np.ndarray) -> bool:
-    """Whether nearly every value is above the one before it, and of the second half above its like in the first.
+    """Whether nearly every value exceeds the one before it, and the one half a table before.
 
-    The second tells a time from the nanoseconds of its second, which begin again.
+    The second tells a time from the nanoseconds of a stamp, which begin again each second.
     """
     later = values[len(values) // 2 :].astype(float) - values[: len(values) - len(values) // 2].astype(float)
     return len(values) > 1 and float(min(np.mean(np.diff(values.astype(float)) > 0), np.mean(later > 0))) > 0.9

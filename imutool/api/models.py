@@ -181,8 +181,7 @@ def debias(
 
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.
-        LogError: No such IMU, a log that is debiased already, or damage that cannot be repaired.
-        DataError: A recording whose times are not in nanoseconds.
+        LogError, DataError: No such IMU, a log that is debiased already, damage, or times that are not in nanoseconds.
         ModelError: No model and no time at rest, a model for another rate or that does not fit the log, a damaged model file.
 
     Examples:
