@@ -12,8 +12,9 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import label, maximum, uniform_filter1d
-from scipy.signal import csd, welch
+from scipy.ndimage import uniform_filter, uniform_filter1d
+from scipy.signal import ShortTimeFFT, csd, welch
+from scipy.signal.windows import hann
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
@@ -190,23 +191,36 @@ def known_band_hz(
     return most_hz
 
 
-def wiener_filter(x: Float64[np.ndarray, " n"], settings: AlignmentSettings = DEFAULT.alignment) -> Float64[np.ndarray, " n"]:
-    """Wiener filter: multiply each frequency by 1 - noise / power.
+def wiener_filter(
+    x: Float64[np.ndarray, "n k"], rate_hz: float, settings: AlignmentSettings = DEFAULT.alignment
+) -> Float64[np.ndarray, "n k"]:
+    """Wiener filter of a simulation's signals, by frequency, across signals and in short times.
 
-    The top of the spectrum shows the white noise. Bands in which nothing stands clearly above it are chance, and go.
+    The top of the spectrum shows the white noise. In units of it, the eigenvectors of the cross-spectrum with hardly more than
+    noise go: what a gyro shows of a motion helps an accelerometer that hardly shows it. What stays is multiplied by
+    1 - noise / power of its own time: one gain for all of it would leave noise at rest, and take from the motion.
     """
     n = len(x)
-    if nothing_but_noise(x):  # its ends would be taken for a ramp
-        return np.full(n, x.mean())
-    line = np.linspace(x[0], x[-1], n)  # its ends meet, so that the spectrum of a ramp is not in the noise's band
-    mirrored = np.concatenate([x - line, -(x - line)[-2:0:-1]])
-    spectrum = np.fft.rfft(mirrored)
-    power = uniform_filter1d(np.abs(spectrum) ** 2, settings.smoothed_bins, mode="nearest")
-    floor = float(np.median(power[int(settings.noise_band * len(power)) :]))
-    gain = np.clip(1.0 - floor / np.maximum(power, 1e-300), 0.0, 1.0)
-    gain[power < MOSTLY * floor] = 0.0  # what is noise for the most part goes altogether
-    bands, count = label(gain > 0.0)
-    if count:
-        highest = maximum(power, bands, np.arange(count + 1))
-        gain[highest[bands] < CLEARLY * floor] = 0.0
-    return line + np.fft.irfft(gain * spectrum, n=len(mirrored))[:n]
+    line = np.linspace(x[0], x[-1], n)  # without which the ends meet their own mirror, so that no step shows there
+    noisy = np.array([nothing_but_noise(column) for column in x.T])  # the ends would be taken for a ramp
+    line[:, noisy] = x[:, noisy].mean(axis=0)
+    size = 4 * max(1, min(round(settings.short_time_s * rate_hz), n - 1) // 4)
+    stft = ShortTimeFFT(hann(size, sym=False), size // 4, fs=rate_hz)
+    y = x - line
+    mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
+    parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
+    top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
+    std = np.sqrt(np.maximum(np.median(top.mean(axis=1), axis=0), 1e-300))
+    parts /= std
+    power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
+    power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")
+    value, vector = np.linalg.eigh(power)
+    vector = vector * (value > MOSTLY)[:, None, :]
+    kept = vector @ vector.conj().swapaxes(1, 2)
+    parts = parts @ kept.swapaxes(1, 2)
+    noise = np.abs(np.diagonal(kept, axis1=1, axis2=2))[:, None, :]
+    around_each = (settings.short_time_parts, settings.short_time_parts, 1)
+    here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
+    gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
+    clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
+    return np.asarray(line + clean[size : size + n])

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.signal import welch
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.aligned_log import AlignedLog
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.significance import bic
@@ -270,17 +270,18 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
 
 
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
-    """Whether a fitted frequency lies beyond the poses' band, is too slow, or rings too loud.
-
-    Smoothed poses lose and delay motion there by themselves, which looks alike.
-    """
+    """Whether a fit is no answer: beyond the poses' band, too slow, too loud, or noise."""
     if any(n.least is not None and value < n.least for n, value in zip(effect.parameters, theta, strict=True)):
         return True
+    # smoothed poses lose and delay motion beyond their band by themselves, which looks alike
     factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
     reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
     outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
-    return outside or (effect.name == "mount_resonance" and any(_rings_too_loud(effect, theta, log.pair) for log in logs))
+    if effect.name == "mount_resonance":  # no spring takes back what it passes on
+        return outside or bool(theta[2:].sum() < 0.0) or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
+    noise = max(float(log.pair.sim_noise[:3].max()) if isinstance(log.pair, Pair) else 0.0 for log in logs)
+    return outside or (effect.jumps and bool(theta[0] < settings.beyond_sim_noise * noise))  # takes what a filter left of it
 
 
 def _rings_too_loud(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

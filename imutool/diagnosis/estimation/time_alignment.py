@@ -165,7 +165,7 @@ def _simulated(
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    clean = np.stack([wiener_filter(column, settings.alignment) for column in even.T], axis=1)
+    clean = wiener_filter(even, 1.0 / period_s, settings.alignment)
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))

@@ -200,7 +200,7 @@ def from_simulation(
         even, jumps = _resampled(t_sim, column, t_even), _jumps(column)
         f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(settings.noise.segment_samples, len(even)), average="median")
         top = (f_hz >= settings.signal.noise_band / period_sim) & (f_hz <= settings.signal.noise_band_end / period_sim)
-        clean = wiener_filter(even, settings.alignment)
+        clean = wiener_filter(even[:, None], 1.0 / period_sim, settings.alignment)[:, 0]
         fine.append(np.interp(t_fine, t_even, clean) if jumps else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine)))
         density.append(float(np.median(power[top])))
     return IdealSignal(float(t_fine[0]), rate_hz, np.stack(fine, axis=1), {}), np.array(density)

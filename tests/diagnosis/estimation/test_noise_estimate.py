@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 from scipy.signal import butter, sosfiltfilt
 from support import planted
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std, whitened
+from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std, whitened, wiener_filter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.reference_errors import SMOOTHED
 from imutool.diagnosis.settings import BandSettings
@@ -24,6 +25,10 @@ BAND_HZ = 6.0
 NEAR = 1.35  # of the noise: three axes of a few hundred rows, and what a rich model spends
 NEAR_A_JUMP = 2.0  # until a fit finds its time, the part of a second around it is misfit: left out altogether it is twenty
 WITHOUT = planted.catalogue()
+
+
+def rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
 
 
 def beside_poses(effects: dict[str, list[float]] | None = None, added: np.ndarray | None = None) -> Pair:
@@ -146,3 +151,29 @@ def test_a_scale_beside_a_noisy_sensor_leaves_the_band_as_it_is() -> None:
 def test_a_sensor_that_is_too_slow_leaves_the_band_as_it_is() -> None:
     pair = beside_poses({"low_pass": [6.0]})
     assert known_band_hz(pair.real, planted.ideal(FELT), planted.RATE_HZ, BAND_HZ, BAND) == BAND_HZ
+
+
+def shaken_at_times(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A body that rests for ten seconds and shakes for ten, in two signals a quarter of a period apart; when it moves."""
+    t, rng = planted.clock(120.0), np.random.default_rng(seed)
+    moves = t // 10.0 % 2 == 1
+    wave = 2.0 * np.pi * np.outer(t, rng.uniform(2.0, 12.0, 40)) + rng.uniform(0.0, 2.0 * np.pi, 40)
+    return moves[:, None] * np.stack([np.cos(wave).sum(axis=1), np.sin(wave).sum(axis=1)], axis=1) / np.sqrt(20.0), moves
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_motion_is_not_shrunk_by_the_rests_between_and_rests_lose_their_noise(seed: int) -> None:
+    x, moves = shaken_at_times(seed)
+    noisy = x[:, :1] + np.random.default_rng([seed, 1]).normal(size=(len(x), 1))
+    clean = wiener_filter(noisy, 100.0)
+    assert (clean * x[:, :1])[moves].sum() / (clean**2)[moves].sum() == pytest.approx(1.0, abs=0.03)
+    rests = binary_erosion(~moves, iterations=150)
+    assert rms(clean[rests]) < 0.15
+
+
+def test_a_signal_near_its_noise_is_known_by_another_that_stands_clear() -> None:
+    x, moves = shaken_at_times(0)
+    size, noise = np.array([100.0, 0.7]), np.random.default_rng(1).normal(size=x.shape)
+    error = wiener_filter(x * size + noise, 100.0) - x * size
+    alone = wiener_filter((x * size + noise)[:, 1:], 100.0) - (x * size)[:, 1:]
+    assert rms(error[moves, 1]) < 0.5 * rms(alone[moves, 0])

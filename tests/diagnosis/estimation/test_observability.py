@@ -110,6 +110,21 @@ def test_an_effect_alone_is_told() -> None:
     assert not below_model_error({}, SETTINGS, denoised=False, poses=False)
 
 
+@pytest.mark.parametrize(("shares", "beyond"), [([0.5, 0.4, -0.02], False), ([-0.022, -0.035, -0.01], True)])
+def test_a_mount_has_no_negative_share(shares: list[float], beyond: bool) -> None:
+    log = planted.weighed(planted.pair(planted.shaken(2)))
+    ((effect, theta),) = planted.acting({"mount_resonance": [30.0, 0.05, *shares]})
+    assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
+
+
+@pytest.mark.parametrize(("sim_noise", "beyond"), [(0.0, False), (1e-3, False), (1e-2, True)])
+def test_a_dead_band_within_the_noise_of_a_simulation_is_that_noise(sim_noise: float, beyond: bool) -> None:
+    """In rad/s of a sample: what the filter leaves of it at rest, no gyro reads."""
+    pair = replace(planted.pair(planted.shaken(2)), sim_noise=np.full(6, sim_noise))
+    ((effect, theta),) = planted.acting({"gyro_dead_band": [0.015]})
+    assert beyond_the_band(effect, theta, [planted.weighed(pair)], SETTINGS) == beyond
+
+
 RINGS = [4.0, 0.02, 0.0, 0.0, 0.5]  # above the band of these poses, lightly damped, along z alone
 POSES_HZ, NEAR_HZ = 2.0, 6.0
 
