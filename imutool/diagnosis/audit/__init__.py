@@ -14,6 +14,7 @@ from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
 from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
+from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
@@ -63,8 +64,13 @@ def audit(
     simulated, mount = read_simulation(sim, imu=imu, truth=truth)
     recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
-    faults = simulator_faults(simulated, recording, sheet, (mount, real_mount))
+    faults, untold = _faults(simulated, recording, sheet, (mount, real_mount))
     not_tested = dict(_not_tested(recording, sheet))
+    if untold and not any(fault.fault == "step_lines" for fault in faults):
+        at = " and ".join(f"{line.f_hz:.4g} Hz ({line.sensor})" for line in untold)
+        not_tested["step_lines"] = (
+            f"there are lines, at {at}, and the poses are too slow or too noisy to show whether the body moves so"
+        )
     tested = tuple(name for name in FAULTS if name not in not_tested)
     return AuditReport(str(sim), None if real is None else str(real), tuple(faults), tested, not_tested)
 
@@ -79,6 +85,13 @@ def simulator_faults(
     Raises:
         DataError: it has no poses that can be differentiated.
     """
+    return _faults(sim, real, sheet, mounts)[0]
+
+
+def _faults(
+    sim: Recording, real: Recording | None, sheet: datasheet.Noise, mounts: tuple[Mount, Mount]
+) -> tuple[list[FaultFound], list[SpectralLine]]:
+    """Faults, and spectral lines whose cause the poses do not show."""
     if not sim.truths:
         raise sim.no_truth("a simulation without poses", "a simulation with the poses of its body")
     moved = kinematics(sim)
@@ -86,13 +99,16 @@ def simulator_faults(
     by_motion = motion_faults(moved, fit)
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
-    faults = noise_faults(sim.imu, fit.residual, expected)
+    arm = np.array([fit.estimates[axis].value for axis in AXES])
+    samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
+    lines_found = spectral_lines(samples, fit.residual, rate_hz, *by_differences(sim.truth, arm))
+    faults, untold = noise_faults(sim.imu, fit.residual, expected, lines_found)
     if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step
         by_motion = [fault for fault in by_motion if fault.fault not in ("backward_difference", "step_delay")]
     faults = by_motion + faults
     if real is not None and real.truths:
         faults += _body_centre(fit, real, mounts)
-    return faults
+    return faults, untold
 
 
 def simulator_remarks(sim: Recording) -> list[str]:

@@ -98,7 +98,7 @@ FAULTS: Mapping[str, Fault] = {
         "has white noise where the sensor's falls with frequency", "x = low-pass(x)", f"{GITHUB}/gazebosim/gz-sensors/issues/7"
     ),
     "step_lines": Fault(
-        "shows the physics step as lines in its spectrum",
+        "has lines in its spectrum with which the body does not move, as the physics step makes them",
         "x += A sin(2 pi f t), f the physics rate or its alias",
         f"{GITHUB}/gazebosim/gazebo-classic/issues/666",
     ),

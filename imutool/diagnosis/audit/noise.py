@@ -1,17 +1,17 @@
-"""Faults of a simulated IMU's noise, digits and clock, beside a data sheet or a recording."""
+"""Faults of a simulated IMU's noise, digits and lines, beside a data sheet or a recording."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
-from scipy.signal import spectrogram, welch
+from scipy.signal import welch
 from scipy.stats import chi2
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.audit.spectral_lines import SpectralLine
 from imutool.diagnosis.estimation.timestamps import grid, limits
 from imutool.diagnosis.result import Estimate
 from imutool.noise.datasheet import Noise
@@ -20,7 +20,6 @@ from imutool.recording.columns import true_ranges
 from imutool.units import SENSORS, UNITS, Sensor
 
 Six = Float64[np.ndarray, "n 6"]
-Line = Float64[np.ndarray, " f"]
 ABSENT = 0.02  # of the expected noise: less is none
 ALIKE = 1.35  # factor between two densities that are one: a data sheet is typical
 SAME_SAMPLE = 1.12  # factor between the noise of two samples that was meant to be one
@@ -34,12 +33,6 @@ CONSEQUENCES = {
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
 LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
-LINES_P_VALUE = 1e-9
-AROUND = (31, 13)  # bins whose medians a line exceeds: a hump is wider
-LEAST_LINE: dict[Sensor, float] = {"gyro": 1e-5, "accel": 1e-4}  # amplitude, rad/s and m/s²: less is rounding
-STEADY = 0.45  # of its mean, the scatter of a line from segment to segment; of noise on three axes 0.58
-HANN = 1.5  # bins of noise in one of a Hann window
-LINES_FROM = 0.15  # of the rate: below, motion is left
 SEGMENT = 1024
 REPEATED = 0.08  # of the samples
 REST = 20  # equal samples in a row
@@ -78,10 +71,18 @@ def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndar
     return np.asarray(np.sqrt(np.median(power[(f_hz > 0.25 * rate_hz) & (f_hz < 0.48 * rate_hz)], axis=0) * rate_hz / 2.0))
 
 
-def noise_faults(imu: Imu, residual: Six, expected: list[Expected]) -> list[FaultFound]:
-    """Faults of the noise; `residual` is what the motion leaves of the samples."""
+def noise_faults(
+    imu: Imu, residual: Six, expected: list[Expected], lines: Sequence[SpectralLine] = ()
+) -> tuple[list[FaultFound], list[SpectralLine]]:
+    """Faults of the noise, and lines of unknown cause.
+
+    `residual` is what the motion leaves of the samples.
+    """
     rate_hz, samples = 1.0 / imu.period_s, np.concatenate([imu.gyro, imu.accel], axis=1)
-    out = [*_lines(samples, residual, rate_hz), *_repeated(samples)]
+    out = [
+        found("step_lines", line.sensor, f=Estimate(line.f_hz, line.width_hz, "Hz")) for line in lines if line.cause == "sensor"
+    ]
+    out += _repeated(samples)
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
         own = float(np.median(fast_noise(residual[:, part], rate_hz)))
@@ -92,13 +93,13 @@ def noise_faults(imu: Imu, residual: Six, expected: list[Expected]) -> list[Faul
                 out += _clipping(sensor, samples[:, part], reference.samples[:, part])
                 out += _digits(sensor, samples[:, part], reference.samples[:, part])
                 out += _bandwidth(sensor, residual[:, part], rate_hz, reference.samples[:, part], reference.rate_hz)
-    return [fault for fault in out if not _follows(fault, out)]
+    untold = [line for line in lines if line.cause == "unknown" and not _follows("step_lines", line.sensor, out)]
+    return [fault for fault in out if not _follows(fault.fault, fault.signal, out)], untold
 
 
-def _follows(fault: FaultFound, others: list[FaultFound]) -> bool:
+def _follows(fault: str, signal: str, others: list[FaultFound]) -> bool:
     """Whether a fault is only another side of one that was found."""
-    causes = {name for other in others if other.signal in (fault.signal, "both") for name in (other.fault,)}
-    return any(fault.fault in CONSEQUENCES.get(name, ()) for name in causes)
+    return any(fault in CONSEQUENCES.get(other.fault, ()) for other in others if other.signal in (signal, "both"))
 
 
 def _density(sensor: Sensor, own: float, rate_hz: float, density: float, real_hz: float | None) -> Iterator[FaultFound]:
@@ -172,35 +173,6 @@ def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> t
 
 
 BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
-
-
-def _lines(samples: Six, residual: Float64[np.ndarray, "m 6"], rate_hz: float) -> Iterator[FaultFound]:
-    """Lines in the spectrum of what the motion leaves, above the frequencies of a body's motion.
-
-    They are lines of the samples, too: a curve through slow poses has some of its own.
-    """
-    size = min(SEGMENT, len(residual) // 4)
-    for k, sensor in enumerate(SENSORS):
-        part = slice(3 * k, 3 * k + 3)
-        (f_hz, power, ratio, steady), (_, _, ratio_all, _) = (_peaks(x[:, part], rate_hz, size) for x in (residual, samples))
-        above = (f_hz > LINES_FROM * rate_hz) & (f_hz < 0.99 * rate_hz / 2.0)
-        above &= np.sqrt(2.0 * HANN * power * rate_hz / size) > LEAST_LINE[sensor]
-        lines = np.flatnonzero(above & steady & (np.minimum(ratio, ratio_all) > 3.0))
-        if len(lines):
-            f = float(f_hz[lines[np.argmax(ratio[lines])]])
-            yield found("step_lines", sensor, f=Estimate(f, rate_hz / size, "Hz"))
-
-
-def _peaks(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> tuple[Line, Line, Line, Bool[np.ndarray, " f"]]:
-    """Frequencies, power, power beside the medians around each, and whether it is no chance and lasts as a motion does not."""
-    f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=size, noverlap=size // 2, axis=0)
-    by_segment = parts.sum(axis=1)
-    total = by_segment.mean(axis=1)
-    freedom = 3.0 * 2.0 * by_segment.shape[1] * 9.0 / 11.0  # of half-overlapping Hann segments, three axes
-    around = np.maximum(*(median_filter(total, bins, mode="nearest") for bins in AROUND))
-    ratio = total / np.maximum(around, 1e-300)
-    lasts = by_segment.std(axis=1) < STEADY * total
-    return f_hz, total, ratio, np.asarray(lasts & (chi2.logsf(ratio * freedom, freedom) < np.log(LINES_P_VALUE)))
 
 
 def _repeated(samples: Six) -> Iterator[FaultFound]:

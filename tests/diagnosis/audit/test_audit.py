@@ -22,10 +22,12 @@ from imutool.diagnosis.audit import audit, lines, simulator_faults, simulator_re
 from imutool.diagnosis.audit.faults import FAULTS
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import noise_faults
+from imutool.diagnosis.audit.spectral_lines import spectral_lines
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_transform
 from imutool.mcap_io.write import Series, chunks, write
 from imutool.mcap_io.writer import LogWriter
+from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses, Recording
 
 PATH = Path(__file__).parents[2] / "bench" / "audit.py"
@@ -80,12 +82,40 @@ def test_rest_repeats_no_samples_and_a_burst_is_no_line() -> None:
     t, rng = np.arange(6000) / 100.0, np.random.default_rng(4)
     moves = np.sin(2 * np.pi * 0.7 * np.maximum(t - 30.0, 0.0))[:, None] * np.ones(6)
     imu = Imu((t * 1e9).astype(np.int64), moves[:, :3], moves[:, 3:])
-    assert noise_faults(imu, moves + 1e-3 * rng.normal(size=moves.shape), []) == []
+    assert noise_faults(imu, moves + 1e-3 * rng.normal(size=moves.shape), []) == ([], [])
     held = moves[np.arange(len(t)) // 2 * 2]
-    assert [f.fault for f in noise_faults(Imu(imu.t_ns, held[:, :3], held[:, 3:]), held, [])] == ["repeated_samples"]
+    faults, _ = noise_faults(Imu(imu.t_ns, held[:, :3], held[:, 3:]), held, [])
+    assert [fault.fault for fault in faults] == ["repeated_samples"]
     burst = 0.01 * (np.sin(2 * np.pi * 31.0 * t) * np.exp(-((t - 40.0) ** 2) / 8.0))[:, None] * np.ones(6)
     shaken = burst + 1e-4 * rng.normal(size=burst.shape)
-    assert noise_faults(Imu(imu.t_ns, shaken[:, :3], shaken[:, 3:]), shaken, []) == []
+    assert spectral_lines(shaken, shaken, 100.0, np.zeros((len(t), 6)), 100.0) == []
+    lasting = 0.01 * np.sin(2 * np.pi * 31.0 * t)[:, None] + 1e-4 * rng.normal(size=burst.shape)
+    assert {line.cause for line in spectral_lines(lasting, lasting, 100.0, np.zeros((len(t), 6)), 100.0)} == {"sensor"}
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_line_is_a_fault_where_the_body_does_not_move_with_it(moves: bool) -> None:
+    """A rotor of 37 Hz: its force shakes the body, and the poses with it."""
+    rng = np.random.default_rng(7)
+    still, t = bench.Motion.drawn(rng), np.arange(16 * 200) / 200.0
+    p = still.p.copy()
+    p[0, :, 3], p[1, :, 3] = 1.0 / (2.0 * np.pi * 37.0) ** 2, 37.0
+    shaken = bench.Motion(p, still.angles)
+    samples = np.concatenate([shaken.rate(t), shaken.force(t)], axis=1)
+    noise = np.repeat([1e-3, 1e-2], 3) * rng.normal(size=samples.shape)
+    log = bench._log(shaken if moves else bench.Motion(p * (p[1] < 30.0), still.angles), t, samples + noise)
+    assert {fault.fault for fault in simulator_faults(log, None, Noise())} == (set() if moves else {"step_lines"})
+
+
+def test_poses_too_slow_to_show_a_line_leave_its_cause_open(tmp_path: Path) -> None:
+    sim, _, _ = bench.made("step_lines", 5, DURATION_S)
+    every = round(0.02 / sim.imu.period_s)
+    slow = Poses(sim.truth.t_ns[::every], sim.truth.p_wb[::every], sim.truth.q_wb_wxyz[::every])
+    write(replace(sim, truths={"/ground_truth/pose": slow}), tmp_path / "sim.mcap")
+    report = audit(tmp_path / "sim.mcap")
+    assert report.faults == ()
+    assert "Hz (accel)" in report.not_tested["step_lines"]
+    assert "step_lines" not in report.tested
 
 
 def test_gravity_left_out_is_found_in_the_plane_too() -> None:
