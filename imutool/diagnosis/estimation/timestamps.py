@@ -67,10 +67,11 @@ def _period(since_s: Float64[np.ndarray, " n"], settings: TimestampSettings) -> 
     best = float(np.median(np.diff(since_s)))
     span = settings.period_span
     for count in (settings.period_samples, len(since_s)):
-        first_s = since_s[:count]
-        tried = best * (1.0 + np.linspace(-span, span, settings.periods))
-        agree = np.array([abs(np.exp(2j * np.pi * first_s / period_s).sum()) for period_s in tried])
-        best, span = float(tried[int(np.argmax(agree))]), 4.0 * span / settings.periods
+        first_s, slowest = since_s[:count], (1.0 - span) / best
+        step = 2.0 * span / (settings.periods - 1) / best
+        turned, by = np.exp(2j * np.pi * slowest * first_s), np.exp(2j * np.pi * step * first_s)
+        agree = [abs(turned.sum()), *(abs(np.multiply(turned, by, out=turned).sum()) for _ in range(settings.periods - 1))]
+        best, span = 1.0 / (slowest + step * int(np.argmax(agree))), 4.0 * span / settings.periods
     mean = np.exp(2j * np.pi * since_s / best).mean()
     return best, float(np.angle(mean)) / (2.0 * np.pi) * best, float(abs(mean))
 
