@@ -171,6 +171,7 @@ class SearchSettings(Settings, frozen=True):
     rivals: Annotated[int, msgspec.Meta(ge=0)] = 3  # effects that are tried in another's place for `similar`
     rival_share: Share = 0.5  # of the gain that a score has to promise for a fit
     common_arm_share: Share = 0.7  # of a size effect's squares that a lever arm alone has to remove to replace it
+    most_taken: Share = 0.7  # of an axis' motion by poses, that a term, a curve or a limit may take
     implausible_factor: Positive = 4.0  # over the plausible size: a larger linear parameter is a fit to noise
     model_error: Positive = 1e-5  # of the largest effect's squares (0.3 % of its size) may be its model's error
     model_error_denoised: Positive = 1e-3  # the same beside a simulation whose noise was filtered out (3 %)

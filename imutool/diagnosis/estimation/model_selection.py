@@ -45,7 +45,7 @@ from imutool.diagnosis.estimation.significance import (
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import SplineCurve, with_finer_curve
+from imutool.diagnosis.estimation.unnamed_effects import SplineCurve, shrinks_motion, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
@@ -289,8 +289,8 @@ class _Search:
         effect, theta = whole.chosen[k]
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
-        curve = isinstance(effect.forward, SplineCurve)
-        if beyond_the_band(effect, theta, self.logs, self.settings) or has_no_size(effect, theta, std, curve=curve):
+        no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or shrinks_motion(effect, theta, self.logs)
+        if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
         log_p = self.candidates.log_p(effect, gain)
         if scattered is not None:

@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline, PPoly
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import AddedColumns
+from imutool.diagnosis.estimation.jacobians import AddedColumns, expected
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
@@ -236,3 +236,23 @@ def with_finer_curve(logs: Sequence[WhitenedLog], now: Fit) -> Fit:
 def finer_curve(logs: Sequence[WhitenedLog], curve: Effect) -> Effect | None:
     """Curve with more knots; none where the variable has no room for them."""
     return finer(curve, like([log.pair for log in logs if isinstance(log.pair, Pair)]))
+
+
+def shrinks_motion(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) -> bool:
+    """Whether a term, a curve or a limit takes most of an axis' motion by poses.
+
+    On an axis that hardly moves, what poses say is their own noise, and whatever shrinks it removes a misfit (regression
+    dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7). No sensor loses so much.
+    """
+    if effect.kind == "catalogue" and effect.name != "saturation":
+        return False
+
+    def taken(log: WhitenedLog) -> Float64[np.ndarray, " k"]:
+        """Share of the motion that the effect takes, by axis."""
+        ideal, rows, constant = expected(log.pair, ()), log.rows("all"), log.constants[log.rows("all")]
+        added = log.whiten(expected(log.pair, ((effect, theta),)) - ideal)[rows]
+        motion = log.whiten(ideal)[rows]
+        motion = motion - constant * (constant * motion).sum(axis=0) / np.maximum((constant**2).sum(axis=0), 1e-300)
+        return np.asarray(-(motion * added).sum(axis=0) / np.maximum((motion**2).sum(axis=0), 1e-300))
+
+    return any(bool((taken(log) > log.pair.settings.search.most_taken).any()) for log in logs if log.pair.band_hz is not None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support import planted
@@ -185,3 +187,11 @@ def test_a_curve_follows_the_range_of_a_robot_that_stands_most_of_the_time() -> 
     basis = fine.forward.basis(x)
     left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
     assert left[passing].std() < 0.4 * y[passing].std()  # by samples alone: 0.58
+
+
+@pytest.mark.parametrize(("gain", "poses", "shrinks"), [(-0.09, True, True), (-0.01, True, False), (-0.09, False, False)])
+def test_a_term_that_takes_away_the_motion_of_poses_is_their_noise(gain: float, poses: bool, shrinks: bool) -> None:
+    """Beside gravity of 9.81 m/s² along z, a rate times the force is a scale of ten times the gain."""
+    pair = replace(planted.pair(planted.planar()), band_hz=6.0 if poses else None)
+    (term,) = (one for one in unnamed.terms(unnamed.like([pair])) if one.variant == "gyro.z:omega_z f_z")
+    assert unnamed.shrinks_motion(term, np.array([gain]), [planted.weighed(pair)]) == shrinks
