@@ -25,13 +25,15 @@ from imutool.diagnosis.diagnose import diagnose
 DEVIATIONS = 3.0
 
 
-def plan(count: int, seed: int) -> list[tuple[int, str, str, str]]:
-    """Cases in turn: each effect alone, then pairs, unnamed ones and none."""
+def plan(count: int, seed: int, only: str = "") -> list[tuple[int, str, str, str]]:
+    """Cases in turn: each effect alone, then pairs, unnamed ones and none; `count` of those with `only` in their words."""
     turn = [(robot, "single", name) for robot in ROBOTS for name in EFFECTS[robot]]
     turn += [("arm", "unnamed", form) for form in UNNAMED] + [
         (robot, kind, "") for kind in ("pair", "none") for robot in ROBOTS
     ]
-    return [(seed + k, *turn[k % len(turn)]) for k in range(count)]
+    wanted = [k for k, words in enumerate(turn) if only in " ".join(words)]
+    rounds = range(-(-count // len(wanted))) if wanted else ()
+    return [(seed + r * len(turn) + k, *turn[k]) for r in rounds for k in wanted][:count]
 
 
 def _is_ripple(finding: Any, effect: dict[str, Any]) -> bool:
@@ -91,9 +93,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of robot, kind or effect")
     options = parser.parse_args()
     total: Counter[str] = Counter()
-    for seed, robot, kind, effect in plan(options.count, options.seed):
-        if options.only and options.only not in f"{robot} {kind} {effect}":
-            continue
+    for seed, robot, kind, effect in plan(options.count, options.seed, options.only):
         folder = options.folder / f"{seed:04d}_{robot}_{kind}"
         if not (folder / "truth.json").exists():
             conceal_robot(folder, seed, robot, kind, effect)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, without_others
@@ -14,6 +16,8 @@ from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose
 from imutool.errors import DataError
 from imutool.location import Location
 from imutool.mcap_io.fields import others, read_field
+
+BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal
 
 
 def with_signals(
@@ -46,22 +50,47 @@ def with_signals(
         )
     if pairing.pairs:
         diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks))
+    clocks, later = list[float](), list[SignalPair]()
     for pair in pairing.pairs:
         report(3, 4, pair.name)
-        diagnosis = _compared(diagnosis, pair, pairing, settings)
+        try:
+            diagnosis = _compared(diagnosis, pair, pairing, settings, clocks)
+        except DataError as error:
+            if pair.kind in BY_OTHERS:
+                later.append(pair)
+            else:
+                diagnosis = _left_out(diagnosis, pair.name, error)
+    for pair in later:  # what differs in most of it is of one motion where other signals are
+        try:
+            known = replace(pair, clock_s=float(np.median(clocks)) if clocks else None)
+            diagnosis = _compared(diagnosis, known, pairing, settings, [])
+        except DataError as error:
+            diagnosis = _left_out(diagnosis, pair.name, error)
     return diagnosis
 
 
-def _compared(diagnosis: Diagnosis, pair: SignalPair, pairing: Pairing, settings: DiagnoseSettings) -> Diagnosis:
-    """Diagnosis with one more signal; a remark where it cannot be compared."""
+def _left_out(diagnosis: Diagnosis, name: str, error: DataError) -> Diagnosis:
+    return replace(diagnosis, remarks=(*diagnosis.remarks, f"{name} was not compared: {error.what}"))
+
+
+def _compared(
+    diagnosis: Diagnosis, pair: SignalPair, pairing: Pairing, settings: DiagnoseSettings, clocks: list[float]
+) -> Diagnosis:
+    """Diagnosis with one more signal, whose clock joins `clocks`; a remark where a part of it cannot be compared.
+
+    Raises:
+        DataError: no part can.
+    """
     drivers = {name: values for name, values in pairing.drivers.items() if not name.startswith(f"{pair.name}.")}
     try:
-        return _with_signal(diagnosis, diagnose_signal(pair, drivers, settings))
+        added = diagnose_signal(pair, drivers, settings)
     except DataError as error:
-        rest = without_others(pair, settings)
-        left_out = ", ".join(name for name in pair.names if rest is not None and name not in rest.names) or pair.name
-        told = replace(diagnosis, remarks=(*diagnosis.remarks, f"{left_out} was not compared: {error.what}"))
-        return told if rest is None else _compared(told, rest, pairing, settings)
+        if (rest := without_others(pair, settings)) is None:
+            raise
+        left_out = ", ".join(name for name in pair.names if name not in rest.names)
+        return _compared(_left_out(diagnosis, left_out, error), rest, pairing, settings, clocks)
+    clocks += [] if pair.sim_state else [added.clock_s]
+    return _with_signal(diagnosis, added)
 
 
 def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:

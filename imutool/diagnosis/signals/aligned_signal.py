@@ -139,7 +139,9 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
         band = band_hz(ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
         return _aligned(pair, ideal, rows, t_real, density, settings, band_hz=band)
     t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
-    lag_s, aligned_s = lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
+    lag_s, aligned_s = 0.0, pair.clock_s or None
+    if pair.clock_s is None:
+        lag_s, aligned_s = lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
     if aligned_s is not None:
         t_sim, lag_s = t_sim - aligned_s, 0.0
     period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))

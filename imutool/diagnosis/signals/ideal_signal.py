@@ -48,6 +48,7 @@ class SignalPair:
     kind: str = "number"
     state: Mapping[str, Fields] = field(default_factory=dict)
     sim_state: Mapping[str, Fields] = field(default_factory=dict)
+    clock_s: float | None = None  # of the simulation, which other signals of the two logs know
 
     @classmethod
     def of_fields(cls, real: Fields, sim: Fields, name: str) -> SignalPair:
@@ -111,15 +112,21 @@ def at_recorded_motion(
     return ideal, 2.0 * float(np.median(np.diff(own_s))) * left.var(axis=0)
 
 
-def without_others(pair: SignalPair, settings: DiagnoseSettings) -> SignalPair | None:
-    """Efforts of the joints that follow from the motion, without those of a gripper."""
-    if pair.kind != "efforts":
-        return None
+def simulated_motion(pair: SignalPair, settings: DiagnoseSettings) -> tuple[dict[str, Column], Float64[np.ndarray, "n k"]]:
+    """Simulated state at the stamps of the simulated efforts, and those efforts.
+
+    Raises:
+        DataError: too few samples, or gaps.
+    """
     sim_s, _, state = motion(pair.sim_state, settings)
     own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
     inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
-    at = {name: np.interp(own_s[inside], sim_s, values) for name, values in state.items()}
-    kept = following(at, pair.sim[inside])
+    return {name: np.interp(own_s[inside], sim_s, values) for name, values in state.items()}, pair.sim[inside]
+
+
+def without_others(pair: SignalPair, settings: DiagnoseSettings) -> SignalPair | None:
+    """Efforts of the joints that follow from the motion, without those of a gripper."""
+    kept = following(*simulated_motion(pair, settings)) if pair.kind == "efforts" else []
     if not 0 < len(kept) < len(pair.names):
         return None
     states = [

@@ -1,8 +1,9 @@
-"""Noise of a signal: whitening filters by column, and the step of its values."""
+"""Noise of a signal: whitening filters, the step of its values, errors of what is ideal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -10,15 +11,20 @@ from scipy.ndimage import median_filter
 from scipy.signal import welch
 
 from imutool.array_types import Bool, Float64
+from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.noise_estimate import ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
 from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
+from imutool.diagnosis.held_out import held_out_rms, with_effects
 from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, Column
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 
 RICH_KNOTS = 12
+INTERPOLATION_ERROR = 1e-5  # of a signal's size, between the stamps of two logs; the digits of a sensor are coarser
+LEARNT_ERROR = 0.003  # of the efforts themselves
+SMALL_GAIN = 3e-3  # of the largest effect's squares, which such an error may take (5 % of its size)
 
 
 def whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Sequence[float]) -> WhitenedLog:
@@ -26,7 +32,7 @@ def whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Seq
 
     Where the simulated signal has its power, the noise density is taken from just above, so that an effect that nobody has
     modelled is not taken for noise; the simulation's own noise, which is in its band, comes on top. An error of rounding is no
-    white noise where the signal is slow: the density is no less than that.
+    white noise where the signal is slow: the density is no less than that, nor than the error of interpolation.
     """
     settings, band = pair.settings, None
     if pair.band_hz is not None:
@@ -48,6 +54,7 @@ def whitened(pair: AlignedSignal, residual: Float64[np.ndarray, "n k"], lsb: Seq
             model = (pair.real - residual)[:, k]
             rounding = np.rint(model / lsb[k]) * lsb[k] - model
             power = np.maximum(power, _density(rounding[::every], usable, rate_hz, settings.noise)[1])
+        power = np.maximum(power, 2.0 * (INTERPOLATION_ERROR * float(expected_slow[:, k].std())) ** 2 / rate_hz)
         filter_, std = autoregression(power, rate_hz, settings.noise.order)
         filters.append(filter_)
         stds.append(std)
@@ -105,3 +112,37 @@ def lsb_of(pair: SignalPair, settings: DiagnoseSettings) -> list[float]:
         step, simulated = (grid(values, settings.timestamps) for values in (real, sim))
         steps.append(0.0 if simulated and abs(step / simulated - 1.0) < settings.signal.same_grid else step)
     return steps
+
+
+def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection, list[str]]:
+    """Selection without effects as small as errors of dynamics or interpolation, and those."""
+    pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    if not selection.selected:
+        return selection, []
+    size, least, of = np.array(pair.scale().size), 0.0, _changes if pair.band_hz is None else _sizes
+    sizes = np.stack([of(log, selection, selected) for selected in selection.selected])
+    enough = INTERPOLATION_ERROR * size
+    if pair.band_hz is not None:
+        least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
+        enough = np.maximum(LEARNT_ERROR * size, np.sqrt(SMALL_GAIN) * sizes.max(axis=0))
+    kept, small = list[SelectedEffect](), list[SelectedEffect]()
+    for selected, own in zip(selection.selected, sizes, strict=True):
+        (kept if selected.gain >= least and (own >= enough).any() else small).append(selected)
+    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
+    return replace(selection, selected=tuple(kept)), names
+
+
+def _changes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Float64[np.ndarray, " k"]:
+    """Deviation of what an effect adds to each column."""
+    chosen = selection.fitted.chosen
+    without = tuple(entry for entry in chosen if entry[0].key != selected.effect.key)
+    return np.asarray((with_effects(log.pair, chosen) - with_effects(log.pair, without)).std(axis=0))
+
+
+def _sizes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Float64[np.ndarray, " k"]:
+    """What an effect removes of each column, on held-out time."""
+    chosen = selection.fitted.chosen
+    without = tuple(entry for entry in chosen if entry[0].key != selected.effect.key)
+    before, after = ([with_effects(log.pair, these)] for these in (without, chosen))
+    gains = [held_out_rms([log], before, after, name) for name in log.pair.signals]
+    return np.array([np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0)) for gain in gains])

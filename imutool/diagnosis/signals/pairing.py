@@ -15,7 +15,7 @@ import numpy as np
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
 from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
-from imutool.diagnosis.signals.quantities import in_one_unit, metres, unwrapped
+from imutool.diagnosis.signals.quantities import in_one_unit, in_radians, metres, unwrapped
 from imutool.geometry import quaternion
 from imutool.location import Location
 from imutool.mcap_io.codec.schemas import ODOMETRY, PRESSURE
@@ -61,9 +61,10 @@ def paired(real: Location, sim: Location) -> Pairing:
         if _is_copy(given):
             same.extend(given.names)
         else:
-            pair, remark = in_one_unit(given)
-            remarks += [remark] if remark else []
-            pairs.append(pair)
+            for to_usual in (in_radians, in_one_unit):
+                given, remark = to_usual(given)  # noqa: PLW2901
+                remarks += [remark] if remark else []
+            pairs.append(given)
     pairs.sort(key=lambda pair: pair.kind == "number")  # a sort keeps the log's order otherwise
     untried = [name for pair in pairs[MOST_COMPARED:] for name in pair.names]
     pairs = pairs[:MOST_COMPARED]
@@ -176,13 +177,15 @@ def _speed(side: LogFields) -> dict[str, Fields]:
 
 
 def _drivers(side: LogFields, compared: set[str]) -> dict[str, Fields]:
-    """Numbers of the recording that may drive a misfit: no motion, and nothing that is compared itself."""
+    """Numbers of the recording that may drive a misfit: temperatures, no motion, nothing else that is compared itself."""
     found = {
         f"{topic}.{path}": values
         for topic, fields in side.fields.items()
         if side.schemas[topic] not in ELSEWHERE | {JOINTS, ODOMETRY, *TRIPLES}
         for path, values in fields.items()
-        if f"{topic}.{path}" not in compared and is_quantity(values) and (path == VALUES.get(side.schemas[topic], (path,))[0])
+        if (side.schemas[topic] == TEMPERATURE or f"{topic}.{path}" not in compared)
+        and is_quantity(values)
+        and (path == VALUES.get(side.schemas[topic], (path,))[0])
     }
     temperatures_first = sorted(found, key=lambda name: "temperature" not in name.lower())
     return {name: found[name] for name in temperatures_first[:MOST_DRIVERS]}

@@ -8,11 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion
+from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
+from imutool.sensor.robot_effects.joint_dynamics import identified
 
 FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
 OTHER_MOTION_ERROR = 1.5  # likewise, of the efforts of two motions
+TURNED = 4.0 * np.pi  # rad; a hinge of an arm turns less
 TURNS = (2.0 * np.pi, 360.0)
 EARTH_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
 FACTORS = {180.0 / np.pi: "degrees", 100.0: "hundreds", 1e3: "thousands", 1e4: "gauss", 1e6: "millions"}
@@ -36,6 +40,43 @@ def unwrapped(pair: SignalPair) -> SignalPair:
         return values
 
     return replace(pair, real=whole(pair.real), sim=whole(pair.sim))
+
+
+def in_radians(pair: SignalPair) -> tuple[SignalPair, str]:
+    """Efforts of an arm with its angles in radians, where a log has degrees.
+
+    A hinge of an arm turns less than twice round. Simulated degrees are known by the efforts, which follow from the angles in
+    radians alone; recorded ones by their size beside the simulated.
+    """
+    states, changed, settings = [pair.state, pair.sim_state], list[str](), DiagnoseSettings()
+    far = [pair.kind == "efforts" and max(map(_size, _angles(state)), default=0.0) > TURNED for state in states]
+    if far[1] and _is_chain(trial := replace(pair, sim_state=_radians(states[1])), settings):
+        pair, changed = trial, ["simulation"]
+    sizes = [np.median([np.std(own.values) for own in _angles(state)] or [1.0]) for state in (pair.state, pair.sim_state)]
+    if far[0] and abs(np.log(sizes[0] / sizes[1]) - np.log(180.0 / np.pi)) < OTHER_MOTION_ERROR:
+        pair, changed = replace(pair, state=_radians(states[0])), ["recording", *changed]
+    return pair, f"Angles of {pair.name} are degrees in the {' and the '.join(changed)}, and were converted" if changed else ""
+
+
+def _size(values: Fields) -> float:
+    return float(np.abs(values.values).max())
+
+
+def _angles(state: Mapping[str, Fields]) -> list[Fields]:
+    return [values for name, values in state.items() if name.startswith("q")]
+
+
+def _radians(state: Mapping[str, Fields]) -> dict[str, Fields]:
+    return {name: replace(values, values=np.radians(values.values)) for name, values in state.items()}
+
+
+def _is_chain(pair: SignalPair, settings: DiagnoseSettings) -> bool:
+    """Whether simulated efforts are those of links on hinges: sums of sines would fit angles of any unit."""
+    try:
+        dynamics = identified(*simulated_motion(pair, settings))
+    except DataError:
+        return False
+    return dynamics is not None and (bool(dynamics.signs) or dynamics.spatial is not None)
 
 
 def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
+from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
@@ -27,7 +27,14 @@ from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
 from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.joints import current_remark
-from imutool.diagnosis.signals.noise import lsb_of, rich_residual, whitened
+from imutool.diagnosis.signals.noise import (
+    LEARNT_ERROR,
+    SMALL_GAIN,
+    above_model_error,
+    lsb_of,
+    rich_residual,
+    whitened,
+)
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
@@ -35,11 +42,9 @@ from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction
 
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
-LEARNT_ERROR = 0.003  # of the efforts themselves
-SMALL_GAIN = 3e-3  # of the largest effect's squares, which such an error may take (5 % of its size)
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 CERTAIN = 6.0  # deviations from which a constant is a finding
-NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signal ({:+.3f} s), so that a delay between them cannot be seen"
+NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signals ({:+.3f} s), so that a delay between them cannot be seen"
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
     "efforts": (
@@ -75,6 +80,7 @@ class SignalDiagnosis:
     closer: Mapping[str, HeldOut]
     remarks: tuple[str, ...]
     traces: Mapping[str, SignalTraces]
+    clock_s: float  # of the simulation, over the recording's
 
 
 def diagnose_signal(
@@ -107,7 +113,7 @@ def diagnose_signal(
 
 
 def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
-    """Signal whose search is for effects of each column, but for those that `_above_model_error` would leave out."""
+    """Signal whose search is for effects of each column, but for those that `above_model_error` would leave out."""
     search = signal.settings.search
     most = max(search.most_effects, search.effects_each_column * signal.columns)
     least = max(search.negligible_share, 0.0 if signal.band_hz is None else SMALL_GAIN)
@@ -169,7 +175,7 @@ def _summarized(
 ) -> SignalDiagnosis:
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     level, logs, names = noise_floor([log]), [log], pair.names
-    selection, small = _above_model_error(log, selection)
+    selection, small = above_model_error(log, selection)
     before, after = with_effects(pair, ()), with_effects(pair, selection.whole.chosen)
     similar = selection.similar()
     findings = [_with_python(finding_of(logs, selection, selected, level, similar)) for selected in selection.selected]
@@ -210,6 +216,7 @@ def _summarized(
             name: SignalTraces(pair.stamp_s, pair.real[:, k], before[:, k], after[:, k], pair.held_out, pair.units[k])
             for k, name in enumerate(names)
         },
+        clock_s=pair.aligned_s,
     )
 
 
@@ -227,30 +234,6 @@ def _with_learnt_error(finding: Finding) -> Finding:
         for name, one in finding.parameters.items()
     }
     return msgspec.structs.replace(finding, parameters=parameters)
-
-
-def _above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection, list[str]]:
-    """Selection without effects as small as the error of learnt dynamics, and those effects."""
-    pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
-    if pair.band_hz is None or not selection.selected:
-        return selection, []
-    least, scale = SMALL_GAIN * max(selected.gain for selected in selection.selected), pair.scale()
-    sizes = np.stack([_sizes(log, selection, selected) for selected in selection.selected])
-    enough = np.maximum(LEARNT_ERROR * np.array(scale.size), np.sqrt(SMALL_GAIN) * sizes.max(axis=0))
-    kept, small = list[SelectedEffect](), list[SelectedEffect]()
-    for selected, clear in zip(selection.selected, (sizes >= enough).any(axis=1), strict=True):
-        (kept if selected.gain >= least and clear else small).append(selected)
-    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
-    return replace(selection, selected=tuple(kept)), names
-
-
-def _sizes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> Float64[np.ndarray, " k"]:
-    """What an effect removes of each column, on held-out time."""
-    chosen = selection.fitted.chosen
-    without = tuple(entry for entry in chosen if entry[0].key != selected.effect.key)
-    before, after = ([with_effects(log.pair, these)] for these in (without, chosen))
-    gains = [held_out_rms([log], before, after, name) for name in log.pair.signals]
-    return np.array([np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0)) for gain in gains])
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:

@@ -23,6 +23,7 @@ from imutool.diagnosis.audit.faults import FAULTS
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics, motion_faults
 from imutool.diagnosis.audit.noise import noise_faults
 from imutool.diagnosis.audit.spectral_lines import spectral_lines
+from imutool.diagnosis.diagnose import diagnose
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_transform
 from imutool.mcap_io.write import Series, chunks, write
@@ -160,6 +161,29 @@ def test_poses_on_tf_a_stated_mount_and_a_world_named_ned_are_right(tmp_path: Pa
     report = audit(tmp_path / "sim.mcap")
     assert {fault.fault for fault in report.faults} == accused
     assert ("odom_ned" in "\n".join(lines(report))) == bool(accused)
+
+
+def test_a_diagnosis_reads_the_simulation_as_the_audit_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its poses are those of the sensor, by the stated mount, in a world whose z is up."""
+    sim, _, _ = bench.made("null", 3, DURATION_S)
+    write(sim, tmp_path / "real.mcap")
+    mount = Poses(sim.imu.t_ns[:1], np.array([[0.1, -0.2, 0.05]]), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    body = Poses(sim.truth.t_ns, sim.truth.p_wb, sim.truth.q_wb_wxyz)
+    written(tmp_path / "sim.mcap", sim, "odom_ned", body, mount)
+    given = list[Recording]()
+
+    def aligned(recordings: object, simulated: Recording, *_: object) -> None:
+        given.append(simulated)
+        raise NotImplementedError
+
+    module = importlib.import_module("imutool.diagnosis.diagnose")
+    monkeypatch.setattr(module, "is_another_motion", lambda *_: False)
+    monkeypatch.setattr(module, "align_all", aligned)
+    with pytest.raises(NotImplementedError):
+        diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap")
+    (simulated,) = given
+    moved = Rotation.from_quat(sim.truth.q_wb_wxyz, scalar_first=True).apply([0.1, -0.2, 0.05]) + sim.truth.p_wb
+    assert np.allclose(simulated.truth.p_wb, moved[:, [1, 0, 2]] * [1.0, 1.0, -1.0])
 
 
 def test_a_recordings_stated_mount_moves_its_poses_and_is_what_the_simulation_lacks(tmp_path: Path) -> None:

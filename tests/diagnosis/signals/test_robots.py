@@ -47,6 +47,11 @@ def test_a_vehicle_lacks_what_was_planted_and_nothing_else(robot: str, kind: str
     within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
 
 
+def test_a_pressure_that_is_mostly_its_own_physics_is_aligned_as_the_other_signals_are(tmp_path: Path) -> None:
+    conceal_robot(tmp_path, 79, "flight", "single", "dynamic_pressure")
+    within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
+
+
 def test_a_ripple_up_to_the_end_of_the_band_leaves_spectrum_for_the_noise(tmp_path: Path) -> None:
     """27 waves a turn: the efforts' power reaches to where joints are compared."""
     conceal_robot(tmp_path, 12003, "arm", "single", "gear_ripple")

@@ -226,6 +226,16 @@ def test_nothing_is_found_where_only_noise_and_a_constant_differ(seed: int) -> N
     assert d.unexplained[NAME].rms == pytest.approx(NOISE, rel=0.25)
 
 
+def test_what_interpolation_leaves_between_two_logs_without_noise_is_nothing() -> None:
+    """Two simulators interpolate one motion on straight lines."""
+    fine = np.arange(0.0, 70.0, 2e-3)
+    x = Motion(5)(fine)
+    t, t_sim = 3.0 + np.arange(2000) / 40.0, np.arange(3000) / 50.0
+    real, sim = fields(t, np.interp(t, fine, x)), fields(t_sim, np.interp(t_sim, fine, x))
+    found = diagnose_signal(SignalPair.of_fields(real, sim, NAME), {})
+    assert found.findings == found.located == ()
+
+
 def test_an_offset_alone_is_no_news_but_told() -> None:
     d = diagnosed(lambda x, t, c: x(t) + 4.0)
     assert d.findings == ()
