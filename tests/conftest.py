@@ -73,6 +73,11 @@ def pytest_collection() -> Generator[None, object, object]:
     return (yield)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the tests of whole commands first: a long one that begins last is waited for alone."""
+    items.sort(key=lambda item: item.path.parent.name not in ("tests", "cli"))
+
+
 def pytest_collection_finish() -> None:
     """Leaves what is collected and imported out of every later collection of garbage."""
     gc.freeze()
