@@ -23,6 +23,7 @@ from imutool.location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import RESTAMP
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.units import SENSORS
 
@@ -275,6 +276,8 @@ def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, find
     """Reasons not to trust the log."""
     if whole.motion.samples < FEWEST:
         yield f"{whole.motion.samples} of {whole.messages} samples are left"
+        if whole.messages >= FEWEST and not whole.motion.end_ns:
+            yield f"the stamps were never set: {RESTAMP}"
         return
     share = invalid / whole.messages
     if share > settings.max_invalid_share:

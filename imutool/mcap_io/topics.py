@@ -41,7 +41,8 @@ UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
 CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
-UNSET_FIX = "A stamp of 0 is not set: imutool convert LOG OUT --restamp takes the log times"
+RESTAMP = "imutool convert LOG OUT --restamp takes the log times"
+UNSET_FIX = f"A stamp of 0 is not set: {RESTAMP}"
 
 
 @dataclass(frozen=True)
