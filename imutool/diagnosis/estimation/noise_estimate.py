@@ -26,7 +26,7 @@ from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect
 
 RIDGE = 1e-8
-MOSTLY, CLEARLY = 2.0, 4.0  # times the white noise: power of a signal, and power that chance does not reach in any band
+MOSTLY = 2.0  # times the white noise: less is noise for the most part
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
@@ -210,7 +210,7 @@ def wiener_filter(
     mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
     parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
-    std = np.sqrt(np.maximum(np.median(top.mean(axis=1), axis=0), 1e-300))
+    std = np.sqrt(np.maximum(np.median(top, axis=(0, 1)) / np.log(2.0), 1e-300))  # a shock is no noise of other times
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
     power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")

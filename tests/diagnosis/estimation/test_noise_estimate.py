@@ -177,3 +177,10 @@ def test_a_signal_near_its_noise_is_known_by_another_that_stands_clear() -> None
     error = wiener_filter(x * size + noise, 100.0) - x * size
     alone = wiener_filter((x * size + noise)[:, 1:], 100.0) - (x * size)[:, 1:]
     assert rms(error[moves, 1]) < 0.5 * rms(alone[moves, 0])
+
+
+def test_a_shock_is_no_noise_of_other_times() -> None:
+    """Of a simulation without noise, in which a mean over time would find some."""
+    x, _ = shaken_at_times(0)
+    x[6000] += 1e3
+    assert rms((wiener_filter(x, 100.0) - x)[:5000]) < 0.01 * rms(x[:5000])
