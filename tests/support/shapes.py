@@ -2,7 +2,6 @@
 
 jaxtyping and beartype check every call, at 0.1 to 0.3 ms each: two thirds of the time of the tests of `diagnose`.
 What they check depends on types, dtypes and shapes alone, so a combination that has passed passes again.
-Of a function that is called very often every tenth call is looked at: looking alone took a fifth of the time of all tests.
 """
 
 from __future__ import annotations
@@ -20,8 +19,6 @@ import numpy as np
 
 LONGEST = 16
 """Longest tuple or list whose elements are all looked at; of a longer one its length and first elements."""
-OFTEN, EACH = 1_000, 10
-"""Calls of a function in one process that are all looked at, and which of the later ones are: every tenth."""
 _CHECK_EACH_CALL: Any = jaxtyping.jaxtyped
 _passed: dict[types.CodeType, dict[Hashable, set[Hashable]]] = {}
 """By code and arguments: the results that have passed. A function made inside a function shares its code."""
@@ -49,16 +46,11 @@ def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[
     passed = _passed.setdefault(function.__code__, {})
     check = functools.cache(functools.partial(_CHECK_EACH_CALL, typechecker=typechecker))
     results: list[Any] = []
-    calls = 0
     give_result = _with_signature(lambda *_, **__: results.pop(), function)
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        nonlocal calls
-        calls += 1
-        if calls > OFTEN and calls % EACH:
-            return function(*args, **kwargs)
         called: Hashable = _combinations(args)
         if kwargs:
             called = called, *kwargs, _combinations(kwargs.values())
