@@ -187,7 +187,8 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
         drawn = figures.residual(trace, found=found)
         yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
     for k, (signal, traces) in enumerate(d.signals.items()):
-        drawn = figures.scalar_signal(traces, found=any(finding.signal == signal for finding in d.findings))
+        of_it = any(f"{signal}.".startswith(f"{finding.signal}.") for finding in d.findings)  # or of a whole topic
+        drawn = figures.scalar_signal(traces, found=of_it)
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'
