@@ -109,7 +109,12 @@ def _npy_shape(member: Any) -> tuple[int, ...]:
 
 def _load_mat(path: Path, columns: Columns) -> None:
     scipy_io = _module("scipy.io", path)
-    _check_size(path, sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in scipy_io.whosmat(path)))
+    try:
+        listed = scipy_io.whosmat(path)
+    except TypeError as error:  # scipy reads no header of an object
+        fix = "Save arrays from MATLAB (of an object struct(...), of a table table2array), or a table with writetable as CSV"
+        raise DataError("holds MATLAB objects, as tables and timetables are", where=path, expected="arrays", fix=fix) from error
+    _check_size(path, sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in listed))
     try:
         content = scipy_io.loadmat(path, simplify_cells=True)
     except Exception as error:  # scipy raises whatever damaged bytes lead to

@@ -17,6 +17,7 @@ from imutool.errors import ConfigError
 from imutool.recording.joined_imu import in_order, unit_by_gravity
 from imutool.recording.message_log import KINDS
 
+from ._table_names import triples
 from ._table_text import Columns
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
@@ -29,22 +30,16 @@ PLAUSIBLE_HZ = 5.0, 10_000.0
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
-WORDS = {
-    "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
-    r"|dreh(rate|geschwindigkeit)",
-    "accel": r"accel(eration|erometer)?|acce?|ac|a|linear_?acceleration|specific_?force|sp_?force|(linear)?beschleunigung"
-    r"|a_rs_s",
-}
 ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
 TIME_WORDS = (
     rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
-    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed)"
+    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed|(gps_?)?(tow|time_?of_?week))"
 )
 UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
     "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
     "mg": r"mg",
     "g": r"g",
     "ns": r"ns|nanoseconds?|nsec",
@@ -180,9 +175,9 @@ def _propose_sensor(
     proposal: Proposal, sensor: str, units: dict[str, float], names: dict[str, tuple[str, str]], columns: Columns
 ) -> None:
     """Columns of the three axes, and their unit."""
-    whole = _triples(sensor, {column: name for column, (name, _) in names.items()})
-    if not whole:  # UncompGyro_0: a capital begins a word
-        whole = _triples(sensor, {c: split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", c))[0] for c in names})
+    plain = {column: name for column, (name, _) in names.items()}
+    spaced = {c: split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", c))[0] for c in names}  # UncompGyro_0
+    whole = triples(sensor, plain, spaced)
     if len(whole) != 1:
         proposal.open += [sensor, f"{sensor}_unit"]
         proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}")
@@ -196,16 +191,6 @@ def _propose_sensor(
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
         _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
-
-
-def _triples(sensor: str, names: dict[str, str]) -> list[dict[str, str]]:
-    """Columns of three axes, by the words for a sensor in their names."""
-    groups: dict[str, dict[str, str]] = {}
-    for column, name in names.items():
-        axis = re.fullmatch(rf"((?:.*_)?({WORDS[sensor]}))_?(?P<axis>[xyz012])(_(raw|adc|counts?))?", name)
-        if axis:
-            groups.setdefault(axis[1], {})[axis["axis"].translate(DIGITS)] = column
-    return [group for group in groups.values() if set(group) == set("xyz")]
 
 
 def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:

@@ -1,4 +1,4 @@
-"""Columns of numbers and tables of text: delimiters, headers, units, calendar times.
+"""Columns of numbers and tables of text: delimiters, headers, units.
 
 A matrix of three columns `gyro` becomes the columns `gyro[0]`, `gyro[1]`, `gyro[2]`, whichever way it lies.
 """
@@ -16,15 +16,15 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
+from ._table_dates import calendar_times
+
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
 LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 LEAST_NUMBERS = 4  # in a row: a time and a vector
+LOOKED_AT = 200  # first lines, which show whether text is a table
 COMMENTS = "#", "%", "//"
-DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123
-    r"(?:(\d{4})-(\d\d)-(\d\d)|(\d\d?)\.(\d\d?)\.(\d{4}))[T ]+(\d\d?:\d\d:\d\d)(?:[.,](\d{1,9})\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)?"
-)
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
 SECONDS, NANOSECONDS = (
     re.compile(r"(.*?)(secs?|seconds?)", re.I),
@@ -94,14 +94,18 @@ def is_text_table(head: bytes) -> bool:
     lines = text_of(head).splitlines()
     rows = [line for line in lines[:-1] or lines if line.strip()]
     delimiter = _delimiter(rows)
-    return any(sum(map(_is_number, row.split(delimiter))) >= LEAST_NUMBERS for row in rows[:50])
+    return any(_is_row(row, delimiter, LEAST_NUMBERS) for row in rows[:LOOKED_AT])
 
 
 def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
-    """What separates the fields, of which there are `least`; None for white space."""
-    plain = [row for row in rows[:50] if not row.startswith(COMMENTS)]
-    counts = {mark: min((row.count(mark) for row in plain[1:20]), default=0) for mark in (";", "\t", ",")}
-    return next((mark for mark, count in counts.items() if count >= least - 1), None)
+    """What separates most rows into fields of which `least` are numbers; None for white space."""
+    counts = {mark: sum(_is_row(row, mark, least) for row in rows[:LOOKED_AT]) for mark in (";", "\t", ",", None)}
+    return max(counts, key=lambda mark: counts[mark])  # of equals the first
+
+
+def _is_row(line: str, delimiter: str | None, least: int) -> bool:
+    """Whether a line has `least` numbers."""
+    return not line.startswith(COMMENTS) and sum(map(_is_number, line.split(delimiter))) >= least
 
 
 def _is_number(text: str) -> bool:
@@ -124,59 +128,70 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     if any(len(line) > MAX_LINE for line in lines):
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
     delimiter = _delimiter(lines, least)
-    first = next((n for n, line in enumerate(lines) if sum(map(_is_number, line.split(delimiter))) >= least), len(lines))
+    first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, least)), len(lines))
     rows = _fields(lines[first:], delimiter)
+    if rows and all(row[-1] == "" for row in rows):  # a delimiter ends each row, in the header perhaps none
+        rows = [row[:-1] for row in rows]
     width = max(map(len, rows), default=0)
     names, units = _header(lines[:first], delimiter, width)
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
     commas: list[str] = []
+    empty: list[str] = []
     for name, fields in zip(names, zip(*whole, strict=True), strict=True):
         texts = [text.strip().strip('"') for text in fields]
+        if not any(texts):
+            empty.append(name)
+            continue
         if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
             texts[:] = [text.replace(",", ".") for text in texts]
             commas.append(name)
         if (values := _numbers(texts)) is not None:
             columns.values[name], columns.texts[name], columns.units[name] = values, texts, units.get(name, "")
-        elif (t_ns := _dates(texts)) is not None:
-            columns.values[name], columns.units[name] = t_ns, "ns"
-            if not texts[0].endswith(("Z", "UTC")) and not re.search(r":\d\d[.,\d]*[+-]", texts[0]):
-                columns.remarks.notes.append(f"{name}: its times name no zone and count as UTC")
+        elif (found := calendar_times(texts)) is not None:
+            columns.values[name], columns.units[name] = found[0], "ns"
+            columns.remarks.notes.extend(f"{name}: {note}" for note in found[1])
         elif len(set(texts)) == 1:
             columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
         else:
             columns.remarks.losses.append(f"{name} is left out: its fields, as {texts[0][:40]!r}, are no numbers")
+    if named := ", ".join(filter(None, empty)):
+        columns.remarks.notes.append(f"columns without a value are left out: {named}")
     if commas:
         columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
 
 
 def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[str], dict[str, str]]:
-    """Names of the columns, with the units of a row of their own below them; numbers where there is no header."""
+    """Names of the columns, with the units of a row of their own below them; numbers where there is no header.
+
+    In a row of units texts repeat, and in the row of names above it none does. A row of names that repeat stands below a row of
+    their groups.
+    """
     rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
-    rows = [row for row in rows if len(row) == width]
-    if len(rows) > 1 and sum(bool(UNIT_TEXT.fullmatch(text)) for text in rows[-1]) >= width - 1:
-        names = _distinct(rows[-2])
-        return names, dict(zip(names, (text.strip("[]()") for text in rows[-1]), strict=True))
-    return (_distinct(rows[-1]) if rows else [f"column {number}" for number in range(1, width + 1)]), {}
+    rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
+    units: list[str] = []
+    if len(rows) > 1 and (
+        sum(bool(UNIT_TEXT.fullmatch(text)) for text in rows[-1]) >= width - 1
+        or (_repeats(rows[-1]) and len({*rows[-2]} - {""}) >= width - 1)
+    ):
+        units = [re.sub(r"^[\[(](.*)[\])]$", r"\1", text) for text in rows.pop()]
+    if not rows:
+        return [f"column {number}" for number in range(1, width + 1)], {}
+    names = rows[-1]
+    if len(rows) > 1 and _repeats(names):
+        group, joint = "", []
+        for above, text in zip(rows[-2], names, strict=True):
+            group = above or group  # it stands above the first of its columns, or above each
+            joint.append(".".join(filter(None, (group, text))))
+        names = names if _repeats(joint) else joint
+    names = _distinct(names)
+    return names, dict(zip(names, units, strict=True)) if units else {}
 
 
-def _dates(texts: list[str]) -> np.ndarray | None:
-    """Calendar times in nanoseconds since 1970; None for other texts."""
-    found = []
-    for text in texts:
-        if (match := DATE.fullmatch(text)) is None:
-            return None
-        year, month, day, day_first, month_second, year_last, clock, fraction, zone = match.groups()
-        date = (year, month, day) if year else (year_last, month_second.zfill(2), day_first.zfill(2))
-        try:
-            seconds = int(np.datetime64(f"{'-'.join(date)}T{clock.zfill(8)}", "s").astype(np.int64))
-        except ValueError:
-            return None
-        if zone and zone[0] in "+-":
-            seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[-2:]))
-        found.append(seconds * 10**9 + int((fraction or "0").ljust(9, "0")))
-    return np.array(found, np.int64)
+def _repeats(texts: list[str]) -> bool:
+    named = list(filter(None, texts))
+    return len(set(named)) < len(named)
 
 
 def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:
@@ -191,10 +206,12 @@ def _distinct(names: list[str]) -> list[str]:
 
     `angular_velocity,x,y,z,linear_acceleration,x,y,z` has `angular_velocity.x`, `linear_acceleration.x`, ....
     """
-    above, distinct = "", []
+    above, distinct = "", list[str]()
     for text in names:
         if names.count(text) > 1:
-            distinct.append(f"{above}.{text}" if above else text)
+            name = f"{above}.{text}" if above else text
+            repeated = sum(re.fullmatch(rf"{re.escape(name)}( \(\d+\))?", other) is not None for other in distinct)
+            distinct.append(f"{name} ({repeated + 1})" if repeated else name)
         else:
             above = text
             distinct.append(text)

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
-from imutool.errors import ConfigError
+from imutool.converters._table_dates import calendar_times
+from imutool.converters._table_files import kind_of, load
+from imutool.converters._table_map import propose
+from imutool.converters._table_text import Columns
+from imutool.errors import ConfigError, DataError
 
 COUNT = 400
 START_NS = 1_600_000_000_000_000_000
@@ -116,3 +120,79 @@ def test_an_orientation_alone_stays_numbers(tmp_path):
     log = table.read_sequence(table.sequences(path)[0])
     assert log.poses == {}
     assert set(log.scalars) == {f"/q{a}" for a in "wxyz"}
+
+
+NAMES_OF_AXES = [
+    [*(f"{a} Gyro [x8005]" for a in "XYZ"), *(f"{a} Accel [x8004]" for a in "XYZ")],
+    ["gyro_roll", "gyro_pitch", "gyro_yaw", *(f"accel_{a}" for a in "xyz")],
+    ["rollrate", "pitchrate", "yawrate", *(f"acc_{a}" for a in "xyz")],
+    [*(f"S1_Gyro_{a}_CAL" for a in "XYZ"), *(f"S1_Accel_LN_{a}_CAL" for a in "XYZ")],
+    [*(f"gyro_{a}" for a in "xyz"), *(f"accel_{a}" for a in "xyz"), "roll_rate", "pitch_rate", "yaw_rate"],
+]
+
+
+@pytest.mark.parametrize("names", NAMES_OF_AXES)
+def test_axes_before_the_sensor_and_turns_about_them_are_known(names):
+    values = [T_NS, *GYRO.T, *ACCEL.T, *GYRO.T]
+    proposal = propose(Columns(dict(zip(["t", *names], values[: len(names) + 1], strict=True))))
+    assert (proposal.entries["gyro"], proposal.entries["accel"]) == (names[:3], names[3:6])
+
+
+def test_the_world_coordinates_of_a_point_are_no_rates():
+    names = ["t", *(f"{a}_w" for a in "xyz"), *(f"acc_{a}" for a in "xyz")]
+    assert "gyro" in propose(Columns(dict(zip(names, [T_NS, *P.T, *ACCEL.T], strict=True)))).open
+
+
+HEADERS = {
+    "part,left,right,left,right\naxis,acc_x,acc_x,gyr_x,gyr_x": [
+        "part.axis",
+        *(f"{s}.{n}_x" for n in ("acc", "gyr") for s in ("left", "right")),
+    ],
+    "time,left,,right,\n,acc_x,gyr_x,acc_x,gyr_x": ["time", "left.acc_x", "left.gyr_x", "right.acc_x", "right.gyr_x"],
+    "time,left,right,top,low\nms,m/(s^2),m/(s^2),no_units,no_units": ["time", "left", "right", "top", "low"],
+    "time,left,right,top,low, ": ["time", "left", "right", "top", "low"],
+    "x,x,y,x,y": ["x", "x (2)", "y", "x (3)", "y (2)"],
+    "INFO\nStart,1,2\n\nDATA\ntime,left,right,top,low": ["time", "left", "right", "top", "low"],
+}
+
+
+@pytest.mark.parametrize("end", ["", ","])
+@pytest.mark.parametrize("header", HEADERS)
+def test_no_column_is_lost_to_its_header(tmp_path, header, end):
+    path = tmp_path / "log.csv"
+    path.write_text(header + "\n" + "".join(f"{n},1,2,3,4{end}\n" for n in range(40)))
+    columns = load(path, kind_of(path.read_bytes(), path))
+    assert [values[5] for values in columns.values.values()] == [5, 1, 2, 3, 4]
+    assert [*columns.values] == HEADERS[header]
+    assert columns.units.get("left", "") == ("m/(s^2)" if "no_units" in header else "")
+
+
+CLOCKS = {
+    "2026/3/4 15:04:05.25": 15.0 * 3600,
+    "2026-03-04 15:04:05:250": 15.0 * 3600,
+    "3/4/2026 3:04:05.25 PM": 15.0 * 3600,
+    "3/4/2026 12:04:05.25 am": 0.0,
+    "23/4/2026 15:04:05.25": 50 * 86_400.0 + 15.0 * 3600,
+}
+
+
+@pytest.mark.parametrize("text", CLOCKS)
+def test_dates_of_other_countries_count(text):
+    (t_ns,), notes = calendar_times([text])
+    assert t_ns == int(np.datetime64("2026-03-04T00:04:05.25", "ns").astype(int)) + CLOCKS[text] * 10**9
+    assert ("its dates count as month/day/year" in notes) == (text.startswith("3/"))
+
+
+def test_clocks_without_a_date_go_on_after_midnight_and_excels_after_the_hour():
+    assert (calendar_times(["23:59:59.5", "00:00:00.5", "00:00:01"])[0] / 1e9).tolist() == [86399.5, 86400.5, 86401.0]
+    assert (calendar_times(["59:59.5", "00:00.5"])[0] / 1e9).tolist() == [3599.5, 3600.5]
+    assert calendar_times(["12:30:00", "start"]) is None
+    assert calendar_times(["9999-01-01 00:00:00"]) is None
+
+
+def test_objects_of_matlab_are_refused_with_what_to_save(tmp_path):
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+    array = np.array([6, 8, 17, 0], np.uint32).tobytes()  # flags of an array of the class of objects
+    (tmp_path / "log.mat").write_bytes(header + np.array([14, len(array)], np.uint32).tobytes() + array)
+    with pytest.raises(DataError, match="holds MATLAB objects"):
+        table.read_sequence(table.sequences(tmp_path / "log.mat")[0])

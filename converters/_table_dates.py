@@ -1,0 +1,64 @@
+"""Times in texts: dates of several calendars' notations, and clocks without a date."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from imutool.array_types import Int64
+
+HOUR_NS = 3600 * 10**9
+HALF_DAY_S = 43_200
+LAST_NS = 2**63 - 1  # in the year 2262
+DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123; 11/21/2026 3:04:05 PM
+    r"(?:(?P<year>\d{4})(?P<mark>[-/.])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
+    r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))[T ]+"
+    r"(?P<clock>\d\d?:\d\d:\d\d)(?:[.,:](?P<fraction>\d{1,9})\d*)? ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?",
+    re.IGNORECASE,
+)
+CLOCK = re.compile(r"(?:(\d\d?):)?(\d\d?):(\d\d)(?:[.,](\d{1,9})\d*)?")  # of one day or, as Excel shows times, of one hour
+
+
+def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
+    """Nanoseconds since 1970 of dates, with notes; None for other texts.
+
+    Clocks without a date count from the first midnight. Of 4/5/2026 the month is the first number, unless one exceeds 12 there.
+    """
+    matches = [DATE.fullmatch(text) for text in texts]
+    slashes = [match for match in matches if match and match["sign"] == "/"]
+    day_first = any(int(match["first"]) > 12 for match in slashes)
+    stamps = []
+    for match in matches:
+        if match is None:
+            return _clock_times(texts)
+        month_first = match["sign"] == "/" and not day_first
+        day, month = (match["second"], match["first"]) if month_first else (match["first"], match["second"])
+        date = f"{match['year'] or match['last']}-{(match['month'] or month).zfill(2)}-{(match['day'] or day).zfill(2)}"
+        try:
+            seconds = int(np.datetime64(f"{date}T{match['clock'].zfill(8)}", "s").astype(np.int64))
+        except ValueError:
+            return None
+        if half := match["half"]:
+            seconds += HALF_DAY_S * ((half.upper() == "PM") - (match["clock"].startswith("12:")))
+        if (zone := match["zone"]) and zone[0] in "+-":
+            seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[-2:]))
+        stamps.append(seconds * 10**9 + int((match["fraction"] or "0").ljust(9, "0")))
+    if not 0 <= min(stamps) <= max(stamps) <= LAST_NS:
+        return None
+    notes = [] if matches[0] is None or matches[0]["zone"] else ["its times name no zone and count as UTC"]
+    if slashes:
+        notes.append(f"its dates count as {'day/month' if day_first else 'month/day'}/year")
+    return np.array(stamps, np.int64), notes
+
+
+def _clock_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:
+    """Times of the day, or of the hour, in nanoseconds since the first midnight; a step back of half of it begins the next."""
+    matches = [CLOCK.fullmatch(text) for text in texts]
+    if not all(matches):
+        return None
+    parts = [match.groups(default="0") for match in matches if match]
+    t_ns = np.array([(int(h) * 3600 + int(m) * 60 + int(s)) * 10**9 + int(f.ljust(9, "0")) for h, m, s, f in parts], np.int64)
+    whole = (24 if matches[0] and matches[0][1] else 1) * HOUR_NS
+    t_ns += whole * np.concatenate([[0], np.cumsum(np.diff(t_ns) < -whole // 2)])
+    return t_ns, [f"its times name no date and count from the start of the {'day' if whole > HOUR_NS else 'hour'}"]
