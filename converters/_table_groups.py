@@ -77,10 +77,8 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     the IMU's own group without positions: an orientation alone is one that the sensor itself estimates.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
-    found: Entries = {}
-    if len(columns.values[entries["accel"][0]]) != len(columns.values[time]):
-        other = time_beside(columns, entries["accel"][0], time, unit)
-        found = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
+    other = time_beside(columns, entries["accel"][0], time, unit)
+    found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
         beside = time_beside(columns, column, time, unit)

@@ -28,12 +28,13 @@ STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
 PLAUSIBLE_HZ = 5.0, 10_000.0
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
+MOST_SHOWN = 12  # triples of columns in a message
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
 ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
 TIME_WORDS = (
     rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
-    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|millis|micros|elapsed|(gps_?)?(tow|time_?of_?week))"
+    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
 )
 UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
@@ -122,11 +123,13 @@ class Proposal(msgspec.Struct):
     def toml(self) -> str:
         """The proposal as a map file, with a question behind what is open."""
         lines = []
-        for name in ("time", "time_unit", "gyro", "gyro_unit", "accel", "accel_unit"):
+        asked_for = "time", "time_unit", "gyro", "gyro_unit", "accel", "accel_unit"
+        for name in (*asked_for, *(name for name in self.entries if name not in asked_for)):
             value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
             text = f'"{value}"' if isinstance(value, str) else "[" + ", ".join(f'"{part}"' for part in value) + "]"
-            asked = f"  # please state: {' or '.join(UNITS_OF.get(name, ['the columns']))}" if name in self.open else ""
-            lines.append(f"{name} = {text}{asked}")
+            asked = f"please state: {' or '.join(UNITS_OF.get(name, ['the columns']))}"
+            asked = "these, or other columns?" if name in self.entries else asked
+            lines.append(f"{name} = {text}" + (f"  # {asked}" if name in self.open else ""))
         lines.append(
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
         )
@@ -179,8 +182,10 @@ def _propose_sensor(
     spaced = {c: split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", c))[0] for c in names}  # UncompGyro_0
     whole = triples(sensor, plain, spaced)
     if len(whole) != 1:
-        proposal.open += [sensor, f"{sensor}_unit"]
-        proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}")
+        proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
+        shown = "".join(f"{': ' if n == 0 else ', '}{triple['x']}/y/z" for n, triple in enumerate(whole[:MOST_SHOWN]))
+        proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}{shown}")
+    if not whole:
         return
     chosen = [whole[0][axis] for axis in "xyz"]
     proposal.entries[sensor] = chosen

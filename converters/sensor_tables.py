@@ -64,8 +64,8 @@ class _Files:
 def sequences(source: Path) -> list[Sequence]:
     """The zip, or the folders, with tables of a gyroscope and an accelerometer, or with OXTS."""
     if source.is_file() and is_zip(source):
-        return [Sequence(name(source), source)] if zipfile.is_zipfile(source) and _is_mine(source) else []
-    return find_folders(source, _is_mine)
+        return [Sequence(name(source), source)] if zipfile.is_zipfile(source) and is_phone(source) else []
+    return find_folders(source, is_phone)
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -99,11 +99,15 @@ def read(source: Path) -> Iterator[MessageLog]:
     return map(read_sequence, sequences(source))
 
 
-def _is_mine(path: Path) -> bool:
+def is_phone(path: Path) -> bool:
+    """Whether a folder or zip has a phone app's tables, whose times are named, or OXTS."""
     files = _files(path)
     tables = files.tables()
+    gyro = next((tables[table] for table in GYRO if table in tables), "")
     return any(map(OXTS.fullmatch, files.names)) or (
-        any(table in tables for table in GYRO) and any(table in tables for table in (*ACCEL, "accelerometer"))
+        bool(gyro)
+        and any(table in tables for table in (*ACCEL, "accelerometer"))
+        and re.search(r"\btime\b", files.text(gyro).partition("\n")[0], re.IGNORECASE) is not None
     )
 
 

@@ -23,6 +23,7 @@ from imutool.recording.message_log import MessageLog, Remarks
 from . import Sequence
 from ._source import find_folders, head, name
 from ._table_files import kind_of, load
+from ._table_folder import is_split, load_split
 from ._table_groups import group_entries, known_layout, time_beside
 from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map
 from ._table_text import Columns
@@ -35,10 +36,11 @@ MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metada
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is a table; of folders those that hold `data.hdf5`, as RoNIN's."""
+    """The source itself, if it is a table; folders with a table a sensor, or with `data.hdf5`."""
     if source.is_dir():
         folders = find_folders(source, lambda path: kind_of(head(path / DATA_FILE), path / DATA_FILE) == "hdf5")
-        return [Sequence(folder.name, folder.path / DATA_FILE) for folder in folders]
+        split = find_folders(source, is_split)
+        return [*(Sequence(folder.name, folder.path / DATA_FILE) for folder in folders), *split]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
     return [Sequence(name(source), source)] if kind_of(head(source), source) else []
@@ -57,7 +59,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
         DataError: the file cannot be read.
     """
     path = sequence.path
-    columns = load(path, kind_of(head(path), path))
+    columns = load_split(path) if path.is_dir() else load(path, kind_of(head(path), path))
     remarks = columns.remarks
     table = _proposed(columns, path, remarks) if mapping is None else read_map(mapping)
     place = path if mapping is None else mapping
@@ -103,20 +105,19 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
         ConfigError: something is open; the message holds a map file to complete.
     """
     proposal = known_layout(columns) or propose(columns)
+    if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
+        proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
     if proposal.open:
-        shown = ", ".join(list(columns.values)[:40])
+        shown, reasons = ", ".join(list(columns.values)[:40]), "; ".join(proposal.reasons + remarks.losses)
         raise ConfigError(
-            f"the meaning of its columns is not certain: {'; '.join(proposal.reasons)}. Its columns are {shown}",
+            f"the meaning of its columns is not certain: {reasons}. Its columns are {shown}",
             where=path,
             fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml()}",
         )
-    entries = {**proposal.entries, **group_entries(columns, proposal.entries, proposal.reasons)}
-    remarks.notes.append(
-        "columns: "
-        + ", ".join(f"{key} = {value if isinstance(value, str) else '/'.join(value)}" for key, value in entries.items())
-    )
+    named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
+    remarks.notes.append("columns: " + ", ".join(f"{key} = {value}" for key, value in named.items()))
     remarks.notes.extend(proposal.reasons)
-    return msgspec.convert(entries, TableMap)
+    return msgspec.convert(proposal.entries, TableMap)
 
 
 def _described(table: TableMap) -> dict[str, str]:

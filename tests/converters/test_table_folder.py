@@ -1,0 +1,107 @@
+"""Folders with a table a sensor, and what the proposed map holds: followed to the letter, it leads to the recording."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.converters import sensor_tables, table
+from imutool.errors import ConfigError
+
+COUNT = 400
+T_S = 1_600_000_000.0 + np.arange(COUNT) / 100.0
+RNG = np.random.default_rng(12)
+GYRO = RNG.normal(0.0, 0.1, (COUNT, 3))
+TURN = np.linspace(0.0, 1.0, COUNT)
+ACCEL = 9.80665 * np.stack([np.sin(TURN), 0.0 * TURN, np.cos(TURN)], axis=1)  # changes evenly: between two samples it is known
+LATE_S = 0.002
+
+
+def rows(t_s: np.ndarray, *values: np.ndarray, mark: str = ",") -> str:
+    return "".join(
+        mark.join([f"{t:.6f}", *map(repr, row)]) + "\n" for t, row in zip(t_s, np.column_stack(values).tolist(), strict=True)
+    )
+
+
+FOLDERS = {
+    "without headers": ("Gyro.txt", rows(T_S, GYRO), "Accel.txt", rows(T_S + LATE_S, ACCEL)),
+    "of another language": (
+        "giroscopio_1.csv",
+        "timestamp,x,y,z\n" + rows(T_S, GYRO),
+        "acelerometro_1.csv",
+        "timestamp,x,y,z\n" + rows(T_S + LATE_S, ACCEL),
+    ),
+    "with names of their own": (
+        "RawGyro.csv",
+        "t;gyro_x;gyro_y;gyro_z\n" + rows(T_S, GYRO, mark=";"),
+        "raw-acc.csv",
+        "t;acc_x;acc_y;acc_z\n" + rows(T_S + LATE_S, ACCEL, mark=";"),
+    ),
+}
+
+
+def answered(error: ConfigError, path: Path, **answers: str) -> Path:
+    """The proposed map with answers to what it asks."""
+    text = str(error.fix).partition("\n\n")[2]
+    for name, answer in answers.items():
+        text = re.sub(rf'^{name} = "\?".*$', f'{name} = "{answer}"', text, flags=re.MULTILINE)
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_a_folder_with_a_table_a_sensor_is_one_recording(tmp_path, folder):
+    gyro_name, gyro, accel_name, accel = FOLDERS[folder]
+    source = tmp_path / "walk"
+    source.mkdir()
+    (source / gyro_name).write_text(gyro)
+    (source / accel_name).write_text(accel)
+    (source / "gyro_bias.csv").write_text("x,y,z,w\n1,2,3,4\n")
+    (source / "notes.txt").write_text("a walk\n")
+    assert sensor_tables.sequences(source) == []
+    (sequence,) = table.sequences(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(sequence)
+    assert 'accel_time = "accel/' in refused.value.fix
+    log = table.read_sequence(sequence, mapping=answered(refused.value, tmp_path / "map.toml", gyro_unit="rad/s"))
+    imu = log.imus["/imu0"]
+    assert np.array_equal(imu.t_ns, np.rint(T_S[1:] * 1e6).astype(np.int64) * 1000)
+    assert np.array_equal(imu.gyro, GYRO[1:])
+    late = np.stack([np.interp(T_S[1:], T_S + LATE_S, column) for column in ACCEL.T], axis=1)
+    np.testing.assert_allclose(imu.accel, late, atol=1e-6)  # float seconds at an epoch
+    assert f"the gyro is {gyro_name}" in log.remarks.notes
+
+
+def test_of_several_sensors_the_map_names_the_first_and_the_refusal_all(tmp_path):
+    names = [f"{side}_{sensor}_{a}" for side in ("left", "right") for sensor in ("acc", "gyr") for a in "xyz"]
+    (tmp_path / "log.csv").write_text(",".join(["time", *names]) + "\n" + rows(T_S, ACCEL, GYRO, 2 * ACCEL, 2 * GYRO))
+    (sequence,) = table.sequences(tmp_path / "log.csv")
+    with pytest.raises(ConfigError, match="left_gyr_x/y/z, right_gyr_x/y/z") as refused:
+        table.read_sequence(sequence)
+    log = table.read_sequence(sequence, mapping=answered(refused.value, tmp_path / "map.toml", gyro_unit="rad/s"))
+    assert np.array_equal(log.imus["/imu0"].gyro, GYRO)
+    assert np.array_equal(log.imus["/imu0"].accel, ACCEL)
+
+
+def test_the_proposed_map_keeps_the_poses_and_the_refusal_names_what_cannot_be_read(tmp_path):
+    q_wxyz = np.stack([np.cos(TURN), 0 * TURN, np.sin(TURN), 0 * TURN], axis=1)
+    names = [
+        "time",
+        *(f"gyr_{a}" for a in "xyz"),
+        *(f"acc_{a}" for a in "xyz"),
+        *(f"p_{a}" for a in "xyz"),
+        *(f"q_{a}" for a in "wxyz"),
+    ]
+    text = ",".join([*names, "state"]) + "\n" + rows(T_S, GYRO, ACCEL, ACCEL, q_wxyz)
+    text = text.replace("\n", ",boost\n").replace("state,boost", "state").replace("boost", "coast", 5)
+    (tmp_path / "log.csv").write_text(text)
+    (sequence,) = table.sequences(tmp_path / "log.csv")
+    with pytest.raises(ConfigError, match="state is left out") as refused:
+        table.read_sequence(sequence)
+    log = table.read_sequence(sequence, mapping=answered(refused.value, tmp_path / "map.toml", gyro_unit="rad/s"))
+    (poses,) = log.poses.values()
+    np.testing.assert_allclose(np.abs(poses.q_wb_wxyz), np.abs(q_wxyz), atol=1e-12)
+    assert set(log.kinds.values()) == {"estimate"}  # nothing says that they are truth
