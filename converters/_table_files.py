@@ -129,7 +129,7 @@ def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]
         if not name.startswith("__"):
             if isinstance(value, dict):
                 yield from _flat(value, f"{prefix}{name}.")
-            elif isinstance(value, np.ndarray):
+            elif isinstance(value, np.ndarray | int | float):
                 yield f"{prefix}{name}", value
 
 
@@ -143,6 +143,9 @@ def _load_hdf5(path: Path, columns: Columns) -> None:
             elsewhere.append(name)
 
     def visit(name: str, node: Any) -> None:
+        for key, value in node.attrs.items():
+            if np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf":
+                columns.add(f"{name}/{key}", value)
         if "MATLAB_object_decode" in node.attrs:
             what = f"{name} is a MATLAB object ({_plain(node.attrs.get('MATLAB_class', 'unknown'))}), not an array"
             raise DataError(what, where=path, fix="Save it from MATLAB as arrays, or with writetable as CSV")
@@ -155,6 +158,7 @@ def _load_hdf5(path: Path, columns: Columns) -> None:
         columns.add(name, node[()], _plain(unit))
 
     with h5py.File(path, "r") as file:
+        visit("", file)
         file.visititems(visit)
         file.visititems_links(look)
     if elsewhere:

@@ -10,8 +10,8 @@ from imutool.errors import DataError
 
 from ._source import head
 from ._table_files import kind_of, load
-from ._table_map import rises
 from ._table_text import Columns
+from ._table_times import rises
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40

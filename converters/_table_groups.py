@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import re
 
-from ._table_map import (
-    DIGITS,
-    POSITION_SI,
-    TIME_NS,
-    TIME_WORDS,
-    USUAL_TIME_NS,
-    Entries,
-    Proposal,
-    name_and_unit,
-    rises,
-    split_name,
-)
+from ._table_map import POSITION_SI, TIME_NS, USUAL_TIME_NS, Entries, Proposal
+from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name
+from ._table_rotations import order_by_motion
 from ._table_text import Columns
+from ._table_times import rises
 
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
+QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
 POSITION = r"((p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
-TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|qualisys|leica|ground_?truth|truth|gt)\d*"
+TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
     "time": "synced/time",
@@ -93,6 +86,12 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     for (clock, is_true), leaves in groups.items():
         arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
         q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
+        if (
+            not q
+            and (four := _axes(QUATERNION_ARRAY, leaves, "0123"))
+            and (q := order_by_motion(columns, entries, four, clock))
+        ):
+            reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
         position = _axes(POSITION, leaves, "xyz")
         if q and (position or clock[0] != time):
             poses.append((not is_true, clock, q, position))
@@ -114,7 +113,8 @@ def _axes(pattern: str, leaves: dict[str, str], axes: str) -> list[str]:
     found: dict[str, dict[str, str]] = {}
     for leaf, column in leaves.items():
         if match := re.fullmatch(pattern, leaf):
-            found.setdefault(leaf[: match.start("axis")], {})[match["axis"].translate(DIGITS)] = column
+            axis = match["axis"] if "0" in axes else match["axis"].translate(DIGITS)
+            found.setdefault(leaf[: match.start("axis")], {})[axis] = column
     return next(([columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}), [])
 
 

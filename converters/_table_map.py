@@ -6,6 +6,7 @@ for the user to state in a map file.
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -17,40 +18,19 @@ from imutool.errors import ConfigError
 from imutool.recording.joined_imu import in_order, unit_by_gravity
 from imutool.recording.message_log import KINDS
 
-from ._table_names import triples
+from ._table_names import ROS_WORDS, TIME_WORDS, XSENS_TIME, name_and_unit, split_name, triples
 from ._table_text import Columns
+from ._table_times import COUNTED, PLAUSIBLE_HZ, count_times, counter_of, rises, stated_rate
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
-XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
 GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
-PLAUSIBLE_HZ = 5.0, 10_000.0
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 MOST_SHOWN = 12  # triples of columns in a message
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
-ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
-TIME_WORDS = (
-    rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
-    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
-)
-UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps",
-    "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
-    "mg": r"mg",
-    "g": r"g",
-    "ns": r"ns|nanoseconds?|nsec",
-    "us": r"us|µs|microseconds?|usec",
-    "ms": r"ms|milliseconds?|msec",
-    "s": r"s|sec|seconds?",
-    "m": r"m|met(er|re)s?",
-    "cm": r"cm|centimet(er|re)s?",
-    "mm": r"mm|millimet(er|re)s?",
-}
 POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 UNITS_OF: dict[str, dict[str, float]] = {
     "time_unit": TIME_NS,
@@ -59,7 +39,6 @@ UNITS_OF: dict[str, dict[str, float]] = {
     "truth_time_unit": TIME_NS,
     "position_unit": POSITION_SI,
 }
-DIGITS = str.maketrans("012", "xyz")
 
 
 Entries = dict[str, str | list[str]]  # of a map
@@ -68,8 +47,10 @@ Entries = dict[str, str | list[str]]  # of a map
 class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Map of a table's columns; a column named `-ax` counts with the opposite sign."""
 
-    time: str
-    time_unit: str
+    time: str = ""
+    time_unit: str = ""
+    rate_hz: float = 0.0  # in place of a time: rows are counted, or what a column `counter` counts
+    counter: str = ""
     gyro: list[str]
     gyro_unit: str
     accel: list[str]
@@ -102,8 +83,13 @@ def read_map(path: Path) -> TableMap:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
     except (ValueError, RecursionError, msgspec.ValidationError) as error:
         raise ConfigError(f"is no map of a table ({error})", where=path) from error
+    if not (0.0 < table.rate_hz < np.inf) if not table.time else table.rate_hz:
+        raise ConfigError(
+            "has to name a time or a positive rate_hz", where=path, expected="`time` and `time_unit`, or `rate_hz`"
+        )
+    needless = {"truth_time_unit", *([] if table.time else ["time_unit"])}
     for name, units in UNITS_OF.items():
-        if (unit := getattr(table, name)) not in units and (unit or name != "truth_time_unit"):
+        if (unit := getattr(table, name)) not in units and (unit or name not in needless):
             raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
     if table.pose_kind not in KINDS:
         raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
@@ -119,17 +105,28 @@ class Proposal(msgspec.Struct):
     entries: Entries
     open: list[str]
     reasons: list[str]
+    rate_hz: float = 0.0
+
+    def settle_gyro_unit(self, unit: str, reason: str) -> None:
+        """Enter the unit of the gyro, which was open."""
+        self.open.remove("gyro_unit")
+        self.reasons[:] = [each for each in self.reasons if each != NO_UNIT.format("gyro")] + [reason]
+        self.entries["gyro_unit"] = unit
 
     def toml(self) -> str:
         """The proposal as a map file, with a question behind what is open."""
-        lines = []
-        asked_for = "time", "time_unit", "gyro", "gyro_unit", "accel", "accel_unit"
-        for name in (*asked_for, *(name for name in self.entries if name not in asked_for)):
+        lines = [f"rate_hz = {self.rate_hz}"] if self.rate_hz else []
+        lines += ['rate_hz = "?"  # please state: the samples a second, as a number'] if "rate_hz" in self.open else []
+        times = [] if lines else ["time", "time_unit"]
+        asked_for = *times, "gyro", "gyro_unit", "accel", "accel_unit"
+        for name in (*asked_for, *(name for name in self.entries if name not in {*asked_for, "time", "time_unit"})):
             value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
-            text = f'"{value}"' if isinstance(value, str) else "[" + ", ".join(f'"{part}"' for part in value) + "]"
+            text = json.dumps(value, ensure_ascii=False)
             asked = f"please state: {' or '.join(UNITS_OF.get(name, ['the columns']))}"
             asked = "these, or other columns?" if name in self.entries else asked
             lines.append(f"{name} = {text}" + (f"  # {asked}" if name in self.open else ""))
+        if "time" in self.open:
+            lines.append("# without a column of times: rate_hz = 100.0, the samples a second, in place of time and time_unit")
         lines.append(
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
         )
@@ -150,28 +147,6 @@ def propose(columns: Columns) -> Proposal:
     if "gyro_unit" in proposal.open and not {"gyro", "accel", "accel_unit", "time", "time_unit"} & {*proposal.open}:
         _propose_gyro_unit(proposal, columns)
     return proposal
-
-
-def name_and_unit(column: str, beside: str) -> tuple[str, str]:
-    """Name and unit of a column; a unit `beside` the column counts where its name has none."""
-    name, unit = split_name(column)
-    return name, unit or next((known for known, pattern in UNITS.items() if re.fullmatch(pattern, beside.lower())), "")
-
-
-def split_name(column: str) -> tuple[str, str]:
-    """Name in lower case with underscores, and the unit in brackets or at the end."""
-    text = column.strip().lower()
-    bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
-    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(p, bracket[1].strip())), "")
-    if bracket:
-        text = text[: bracket.start()]
-    name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
-    if not unit and (
-        end := re.search(r"_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
-    ):
-        unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
-        name = name[: end.start()]
-    return name, unit
 
 
 def _propose_sensor(
@@ -210,10 +185,9 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
     kept = in_order(t_ns, np.concatenate([gyro, accel], axis=1), "")
     found = unit_by_gravity(kept.t_ns, kept.values[:, :3], kept.values[:, 3:], GYRO_SI) if len(kept.t_ns) else None
     if found is not None:
-        proposal.open.remove("gyro_unit")
-        proposal.reasons.remove(NO_UNIT.format("gyro"))
-        proposal.entries["gyro_unit"] = found[0]
-        proposal.reasons.append(f"gravity turns in the accelerometer as a gyro in {found[0]} says (correlation {found[1]:.2f})")
+        proposal.settle_gyro_unit(
+            found[0], f"gravity turns in the accelerometer as a gyro in {found[0]} says (t = {found[1]:.1f})"
+        )
 
 
 def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
@@ -238,12 +212,13 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         group = proposal.entries["gyro"][0].rpartition("/")[0]
         found.sort(key=lambda c: c.rpartition("/")[0] != group)
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
-    if not found and len(rising := [c for c, v in columns.values.items() if length in (None, len(v)) and rises(v)]) == 1:
+    counter = counter_of(columns, length or 0)
+    rising = [c for c, v in columns.values.items() if c != counter and length in (None, len(v)) and rises(v)]
+    if not found and len(rising) == 1:
         proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
         found = rising
     if not found:
-        proposal.open += ["time", "time_unit"]
-        proposal.reasons.append("no column that rises looks like a time")
+        _propose_rate(proposal, columns, counter, length)
         return
     column = proposal.entries["time"] = found[0]
     if (unit := names[column][1]) in TIME_NS:
@@ -266,10 +241,17 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
 
 
-def rises(values: np.ndarray) -> bool:
-    """Whether nearly every value exceeds the one before it, and the one half a table before.
-
-    The second tells a time from the nanoseconds of a stamp, which begin again each second.
-    """
-    later = values[len(values) // 2 :].astype(float) - values[: len(values) - len(values) // 2].astype(float)
-    return len(values) > 1 and float(min(np.mean(np.diff(values.astype(float)) > 0), np.mean(later > 0))) > 0.9
+def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:
+    """Sampling rate of samples that are counted, in place of a time."""
+    counted = f"{counter!r} counts the samples" if counter else "no column holds the time: rows are counted"
+    rate = stated_rate(columns)
+    proposal.entries |= {"counter": counter} if counter else {}
+    if rate is not None and length:
+        count_times(columns, rate[1], length, counter)
+        proposal.entries |= {"time": COUNTED, "time_unit": "s"}
+        proposal.rate_hz = rate[1]
+        proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
+    else:
+        proposal.open += ["rate_hz"] if counter else ["time", "time_unit"]
+        what = counted if counter else "no column that rises looks like a time"
+        proposal.reasons.append(f"{what}, and no number in the file is named as a sampling rate")

@@ -1,9 +1,31 @@
-"""Columns of the three axes of a sensor, by their names."""
+"""Names of columns: words for time, gyro and accelerometer, axes, and units."""
 
 from __future__ import annotations
 
 import re
 
+XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
+ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
+TIME_WORDS = (
+    rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
+    r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
+)
+UNITS = {
+    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps",
+    "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
+    "mg": r"mg",
+    "g": r"g",
+    "ns": r"ns|nanoseconds?|nsec",
+    "us": r"us|µs|microseconds?|usec",
+    "ms": r"ms|milliseconds?|msec",
+    "s": r"s|sec|seconds?",
+    "m": r"m|met(er|re)s?",
+    "cm": r"cm|centimet(er|re)s?",
+    "mm": r"mm|millimet(er|re)s?",
+}
+DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
     r"|dreh(rate|geschwindigkeit)",
@@ -37,3 +59,25 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> list[dict[str, st
         if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
             groups.setdefault(match["sensor"], {})[axes.get(match["axis"], match["axis"])] = column
     return [group for group in groups.values() if set(group) == set("xyz")]
+
+
+def name_and_unit(column: str, beside: str) -> tuple[str, str]:
+    """Name and unit of a column; a unit `beside` the column counts where its name has none."""
+    name, unit = split_name(column)
+    return name, unit or next((known for known, pattern in UNITS.items() if re.fullmatch(pattern, beside.lower())), "")
+
+
+def split_name(column: str) -> tuple[str, str]:
+    """Name in lower case with underscores, and the unit in brackets or at the end."""
+    text = column.strip().lower()
+    bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
+    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(p, bracket[1].strip())), "")
+    if bracket:
+        text = text[: bracket.start()]
+    name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
+    if not unit and (
+        end := re.search(r"_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
+    ):
+        unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
+        name = name[: end.start()]
+    return name, unit

@@ -30,16 +30,20 @@ SECONDS, NANOSECONDS = (
     re.compile(r"(.*?)(secs?|seconds?)", re.I),
     ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
 )
+STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
+    r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
+)
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 
 @dataclass
 class Columns:
-    """Columns by name, with units, rotation matrices, the texts of decimals, and remarks."""
+    """Columns by name, with units, matrices, single numbers, texts of decimals, and remarks."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     matrices: dict[str, np.ndarray] = field(default_factory=dict)
+    numbers: dict[str, float] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
     remarks: Remarks = field(default_factory=Remarks)
 
@@ -61,6 +65,8 @@ class Columns:
                 self.values[f"{name}[{number}]"], self.units[f"{name}[{number}]"] = array[:, number], unit
         elif array.size > 1:
             self.values[name], self.units[name] = array.reshape(-1), unit
+        elif array.size == 1:
+            self.numbers[name] = float(array.reshape(-1)[0])
 
     def join_stamps(self) -> None:
         """Make one column of a stamp that has its seconds and its nanoseconds in two, as ROS' header.stamp has."""
@@ -129,6 +135,8 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         raise DataError("has a line of more than 65 536 characters", where=path, expected="a table of text")
     delimiter = _delimiter(lines, least)
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, least)), len(lines))
+    stated = filter(None, map(STATED_NUMBER.fullmatch, lines[:first]))
+    columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     rows = _fields(lines[first:], delimiter)
     if rows and all(row[-1] == "" for row in rows):  # a delimiter ends each row, in the header perhaps none
         rows = [row[:-1] for row in rows]

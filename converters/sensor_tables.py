@@ -26,7 +26,8 @@ from imutool.recording.message_log import MessageLog, Remarks
 from . import Sequence
 from ._archive import is_zip, list_members, read_bounded, refusing
 from ._source import find_folders, name
-from ._table_map import STANDARD_GRAVITY, split_name
+from ._table_map import STANDARD_GRAVITY
+from ._table_names import split_name
 from ._table_text import Columns, read_csv
 
 GENERAL = True

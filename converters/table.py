@@ -26,7 +26,9 @@ from ._table_files import kind_of, load
 from ._table_folder import is_split, load_split
 from ._table_groups import group_entries, known_layout, time_beside
 from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map
+from ._table_rotations import unit_by_poses
 from ._table_text import Columns
+from ._table_times import COUNTED, count_times
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
@@ -63,6 +65,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     remarks = columns.remarks
     table = _proposed(columns, path, remarks) if mapping is None else read_map(mapping)
     place = path if mapping is None else mapping
+    if table.rate_hz:
+        count_times(columns, table.rate_hz, len(_column(columns, table.gyro[0].removeprefix("-"), place)), table.counter)
+        table = msgspec.structs.replace(table, time=COUNTED, time_unit="s")
     gyro_ns = _times(columns, table.time, table.time_unit, place)
     accel_ns = _times(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
     gyro = _vectors(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
@@ -107,17 +112,24 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
     proposal = known_layout(columns) or propose(columns)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
+    if (
+        "gyro_unit" in proposal.open
+        and "quaternion_wxyz" in proposal.entries
+        and (unit := unit_by_poses(columns, proposal.entries))
+    ):
+        proposal.settle_gyro_unit(unit, f"the poses turn as far as a gyro in {unit} says")
     if proposal.open:
-        shown, reasons = ", ".join(list(columns.values)[:40]), "; ".join(proposal.reasons + remarks.losses)
+        shown = ", ".join([column for column in columns.values if column != COUNTED][:40])
+        reasons = "; ".join(proposal.reasons + remarks.losses)
         raise ConfigError(
             f"the meaning of its columns is not certain: {reasons}. Its columns are {shown}",
             where=path,
             fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml()}",
         )
     named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
-    remarks.notes.append("columns: " + ", ".join(f"{key} = {value}" for key, value in named.items()))
+    remarks.notes.append("columns: " + ", ".join(f"{key} = {value}" for key, value in named.items() if value != COUNTED))
     remarks.notes.extend(proposal.reasons)
-    return msgspec.convert(proposal.entries, TableMap)
+    return msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz}, TableMap)
 
 
 def _described(table: TableMap) -> dict[str, str]:

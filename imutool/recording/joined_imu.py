@@ -14,6 +14,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
+from imutool.geometry import quaternion
 from imutool.recording import Imu
 from imutool.recording.columns import longest_run
 
@@ -23,7 +24,8 @@ LONGEST_S = 0.15
 MOST_S = 300.0  # of a longer log, the stretch that turns most
 PARTS = 8  # stretches whose own lags show how sure the delay is
 LEAST_CORRELATION, LEAST_PARTS = 0.6, 4
-MOST_OFF = 1.3  # ratio of the scale that the motion shows to that of a unit
+WINDOW_S, TURN_S = 2.0, 0.02  # over which the specific force is mostly gravity, and the steps of its turns
+LEAST_T = 3.0  # from which on a unit is certain
 
 
 class SensorDelay(NamedTuple):
@@ -61,22 +63,40 @@ def unit_by_gravity(
     accel: Float64[np.ndarray, "n 3"],
     units: Mapping[str, float],
 ) -> tuple[str, float] | None:
-    """Unit of the gyro by which it carries gravity along, and the correlation; else None.
+    """Unit of the gyro that keeps gravity still, and its t value against others; else None.
 
-    `units` are in rad/s. The scale of the least squares of da/dt = -scale omega x a decides, in the whole and in most parts.
+    `units` are in rad/s. In each window the specific force is turned back by the gyro: with the right unit its mean is longest.
+    Half and twice each unit compete, so that a scale which is none of them finds none.
     """
     both = _together(t_ns, gyro, t_ns, accel)
     if both is None:
         return None
-    parts = _products(*both, 0, round(LONGEST_S / STEP_S))
-    together, measured, predicted = np.concatenate([parts.sum(axis=0)[None], parts]).T
-    correlation = together / np.sqrt(np.maximum(measured * predicted, 1e-300))
-    scale = np.where(correlation >= LEAST_CORRELATION, together, 0.0) / np.maximum(predicted, 1e-300)
-    for unit, size in units.items():
-        close = (scale / size < MOST_OFF) & (scale / size > 1.0 / MOST_OFF)
-        if close[0] and close[1:].sum() >= LEAST_PARTS:
-            return unit, float(correlation[0])
-    return None
+    rate, force = (_in_windows(values) for values in both)
+    sizes = [(name, unit * factor) for name, unit in units.items() for factor in (1.0, 0.5, 2.0)]
+    lengths = np.stack([_turned_back(rate * size, force) for _, size in sizes])
+    best = int(np.argmax(lengths.sum(axis=1)))
+    gains = lengths[best] - np.delete(lengths, best, axis=0)
+    t = float((gains.mean(axis=1) * gains.shape[1] ** 0.5 / np.maximum(gains.std(axis=1, ddof=1), 1e-300)).min())
+    name, size = sizes[best]
+    return (name, t) if size == units[name] and t > LEAST_T else None
+
+
+def _in_windows(values: Float64[np.ndarray, "c 3"]) -> Float64[np.ndarray, "w k 3"]:
+    """Means over TURN_S, in windows of WINDOW_S."""
+    inside, length = round(TURN_S / STEP_S), round(WINDOW_S / TURN_S)
+    whole = len(values) // (inside * length)
+    windows: Float64[np.ndarray, "w k 3"] = values[: whole * inside * length].reshape(whole, length, inside, 3).mean(axis=2)
+    return windows
+
+
+def _turned_back(rate: Float64[np.ndarray, "w k 3"], force: Float64[np.ndarray, "w k 3"]) -> Float64[np.ndarray, " w"]:
+    """Length of the mean specific force of each window in the frame of its first sample."""
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (len(rate), 1))
+    total = np.zeros((len(rate), 3))
+    for k in range(rate.shape[1]):
+        total += quaternion.rotate(q, force[:, k])
+        q = quaternion.multiply(q, quaternion.exp(rate[:, k] * TURN_S))
+    return np.asarray(quaternion.length(total) / rate.shape[1])
 
 
 def _together(
@@ -153,9 +173,9 @@ def in_order(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n k"], 
     fresh = np.concatenate([[True], t_ns[1:] > later[:-1]]) if len(t_ns) else np.zeros(0, bool)
     notes = []
     if not finite.all():
-        notes.append(f"{name}: {int((~finite).sum())} samples that are not finite are left out of the IMU")
+        notes.append(f"{name}: {int((~finite).sum())} samples that are not finite are left out")
     if (finite & ~fresh).any():
-        notes.append(f"{name}: {int((finite & ~fresh).sum())} samples whose stamp repeats or goes back are left out of the IMU")
+        notes.append(f"{name}: {int((finite & ~fresh).sum())} samples whose stamp repeats or goes back are left out")
     keep = finite & fresh
     return Cleaned(t_ns[keep], values[keep], notes)
 

@@ -1,0 +1,77 @@
+"""Times of a table; samples are counted where it states only a sampling rate."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.errors import ConfigError
+
+from ._table_text import Columns
+
+COUNTED = "#counted"  # column of the times that are counted
+PLAUSIBLE_HZ = 5.0, 10_000.0
+RATE = r"(.*_)?(fs|f_samp|fsamp|srate|odr|hz|rate|freq|frequency|(sampl(e|ing)|update|output|data)_?(rate|freq|frequency))"
+PERIOD = r"(.*_)?(dt|delta_?t|period|sampl(e|ing)_?(period|interval|time))"
+PERIOD_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
+
+
+def rises(values: np.ndarray) -> bool:
+    """Whether nearly every value exceeds the one before it, and the one half a table before.
+
+    The second tells a time from the nanoseconds of a stamp, which begin again each second.
+    """
+    later = values[len(values) // 2 :].astype(float) - values[: len(values) - len(values) // 2].astype(float)
+    return len(values) > 1 and float(min(np.mean(np.diff(values.astype(float)) > 0), np.mean(later > 0))) > 0.9
+
+
+def stated_rate(columns: Columns) -> tuple[str, float] | None:
+    """Name and value (Hz) of the sampling rate that the file states; None without a sole one."""
+    found: dict[str, float] = {}
+    for name, value in columns.numbers.items():
+        leaf = re.sub(r"[^a-z0-9]+", "_", re.sub(r".*[/.]", "", name).lower()).strip("_")
+        size = 1e3 if leaf.endswith("khz") else 1.0
+        if re.fullmatch(RATE, re.sub(r"(?<=.)_?k?hz$", "", leaf)):
+            found[name] = value * size
+        elif match := re.fullmatch(rf"{PERIOD}(_(?P<unit>s|ms|us|ns))?", leaf):
+            rates = [1.0 / (value * PERIOD_S[u]) for u in ([match["unit"]] if match["unit"] else PERIOD_S) if value > 0.0]
+            plausible = [rate for rate in rates if PLAUSIBLE_HZ[0] <= rate <= PLAUSIBLE_HZ[1]]
+            if len(plausible) == 1:
+                found[name] = plausible[0]
+    found = {name: rate for name, rate in found.items() if PLAUSIBLE_HZ[0] <= rate <= PLAUSIBLE_HZ[1]}
+    if not found or not np.allclose([*found.values()], next(iter(found.values())), rtol=1e-3):
+        return None
+    return next(iter(found.items()))
+
+
+def counter_of(columns: Columns, length: int) -> str:
+    """Column of this length that counts samples, missing ones too; empty without one."""
+    for column, values in columns.values.items():
+        if values.dtype.kind in "iu" and len(values) == length > 1 and np.mean(np.diff(_unwrapped(values)) == 1.0) > 0.5:
+            return column
+    return ""
+
+
+def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> None:
+    """Add the column COUNTED: seconds since the first sample, by a counter or by rows.
+
+    Raises:
+        ConfigError: the counter has another length than the samples, or does not count.
+    """
+    if not counter:
+        counts = np.arange(length, dtype=np.float64)
+    elif len(values := columns.values.get(counter, np.zeros(0))) == length:
+        counts = _unwrapped(values)
+    else:
+        raise ConfigError(f"{counter!r} has {len(values)} rows and the gyro {length}", where="counter", expected="as many")
+    columns.values[COUNTED], columns.units[COUNTED] = counts / rate_hz, "s"
+
+
+def _unwrapped(counts: np.ndarray) -> Float64[np.ndarray, " n"]:
+    """Counts since the first one, of a counter that begins again at a power of two."""
+    values = counts.astype(np.float64)
+    size = next((size for size in WORD_SIZES if values.max(initial=0.0) < size), 2**53)
+    return np.concatenate([[0.0], np.cumsum(np.diff(values) % size)])

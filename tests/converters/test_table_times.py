@@ -1,0 +1,130 @@
+"""Tables without a time, which state a sampling rate, and quaternions and rates whose order and unit the motion shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from scipy.spatial.transform import Rotation
+
+from imutool.converters import table
+from imutool.errors import ConfigError
+
+RATE_HZ = 250.0
+COUNT = 5000
+T_S = np.arange(COUNT) / RATE_HZ
+RNG = np.random.default_rng(11)
+ANGLES = np.stack([0.8 * np.sin(2 * np.pi * f * T_S + k) for k, f in enumerate((0.35, 0.55, 0.2))], axis=1)
+TURNED = Rotation.from_euler("ZYX", ANGLES)
+Q_WXYZ = TURNED.as_quat()[:, [3, 0, 1, 2]]
+GYRO = (TURNED[:-1].inv() * TURNED[1:]).as_rotvec() * RATE_HZ
+GYRO = np.concatenate([GYRO, GYRO[-1:]]) + RNG.normal(0.0, 0.002, (COUNT, 3))
+ACCEL = TURNED.inv().apply([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.02, (COUNT, 3))
+P = 0.3 * np.sin(T_S)[:, None] * np.ones(3)
+NEXT_NS = round(1e9 / RATE_HZ)
+
+
+def read(path: Path, mapping: Path | None = None) -> Any:
+    return table.read_sequence(table.sequences(path)[0], mapping=mapping)
+
+
+def written(path: Path, above: str, names: list[str], columns: list[np.ndarray]) -> Path:
+    rows = (",".join(map(repr, row)) for row in zip(*(column.tolist() for column in columns), strict=True))
+    path.write_text(above + "\n".join([",".join(names), *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms"])
+def test_a_mat_file_with_a_sampling_rate_has_times(tmp_path, stated):
+    number = {"dt": 1.0 / RATE_HZ, "sample_period_ms": 1e3 / RATE_HZ}.get(stated, RATE_HZ)
+    scipy.io.savemat(tmp_path / "trial.mat", {"imu_gyr": GYRO, "imu_acc": ACCEL, stated: number})
+    log = read(tmp_path / "trial.mat")
+    imu = log.imus["/imu0"]
+    assert np.array_equal(imu.t_ns, NEXT_NS * np.arange(COUNT))
+    np.testing.assert_allclose(imu.gyro, GYRO)
+    assert any(f"at the '{stated}' of 250 Hz that the file states" in note for note in log.remarks.notes)
+
+
+def test_the_rate_may_be_an_attribute_of_an_hdf5_file(tmp_path):
+    with h5py.File(tmp_path / "trial.h5", "w") as file:
+        file["imu_gyr"], file["imu_acc"] = GYRO, ACCEL
+        file.attrs["sampling_rate"] = RATE_HZ
+    assert np.array_equal(read(tmp_path / "trial.h5").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
+
+
+def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the_table(tmp_path):
+    names = ["PacketCounter", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
+    received = np.delete(np.arange(COUNT), slice(2000, 2010))
+    columns = [(65_000 + received) % 65_536, *ACCEL[received].T, *GYRO[received].T]
+    path = written(tmp_path / "mtw.txt", "// Start Time: Unknown\n// Update Rate: 250.0Hz\n", names, columns)
+    assert np.array_equal(read(path).imus["/imu0"].t_ns, NEXT_NS * received)
+
+
+def test_a_counter_is_no_time_and_the_map_that_is_proposed_asks_for_the_rate(tmp_path):
+    names = ["sample", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
+    path = written(tmp_path / "count.csv", "", names, [np.arange(COUNT), *ACCEL.T, *GYRO.T])
+    with pytest.raises(ConfigError, match="'sample' counts the samples, and no number in the file is named") as refused:
+        read(path)
+    proposed = refused.value.fix.split("\n\n", 1)[1]
+    assert 'rate_hz = "?"' in proposed
+    (tmp_path / "map.toml").write_text(proposed.replace('rate_hz = "?"', "rate_hz = 250"))
+    assert np.array_equal(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
+
+
+def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
+    names = [*(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
+    path = written(tmp_path / "bare.csv", "", names, [*ACCEL.T, *GYRO.T])
+    with pytest.raises(ConfigError, match="no column that rises looks like a time") as refused:
+        read(path)
+    assert "# without a column of times: rate_hz = 100.0" in refused.value.fix
+    entries = refused.value.fix.split("\n\n", 1)[1].splitlines()
+    kept = [line for line in entries if not line.startswith("time")]
+    (tmp_path / "map.toml").write_text("\n".join([*kept, "rate_hz = 250"]))
+    assert np.array_equal(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
+
+
+@pytest.mark.parametrize("wrong", ['time_unit = "s"\n', "rate_hz = -5\n", 'rate_hz = 100\ntime = "t"\ntime_unit = "s"\n'])
+def test_a_map_has_a_time_or_a_positive_rate(tmp_path, wrong):
+    names = ["t", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a}" for a in "xyz")]
+    path = written(tmp_path / "bare.csv", "", names, [T_S, *ACCEL.T, *GYRO.T])
+    columns = (
+        'gyro = ["gyr_x", "gyr_y", "gyr_z"]\ngyro_unit = "rad/s"\naccel = ["acc_x", "acc_y", "acc_z"]\naccel_unit = "m/s^2"\n'
+    )
+    (tmp_path / "map.toml").write_text(wrong + columns)
+    with pytest.raises(ConfigError, match="has to name a time or a positive rate_hz"):
+        read(path, tmp_path / "map.toml")
+
+
+def test_rates_that_differ_are_not_believed(tmp_path):
+    scipy.io.savemat(tmp_path / "trial.mat", {"imu_gyr": GYRO, "imu_acc": ACCEL, "imu_fs": RATE_HZ, "video_fs": 30.0})
+    with pytest.raises(ConfigError, match="no number in the file is named as a sampling rate"):
+        read(tmp_path / "trial.mat")
+
+
+@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+@pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
+def test_quaternions_of_no_stated_order_are_poses_where_they_turn_as_the_gyro_does(tmp_path, order, unit):
+    mount = Rotation.from_rotvec([0.5, -1.0, 0.3])
+    gyro, accel = mount.apply(GYRO), mount.apply(ACCEL) + 3.0 * np.sin(5.0 * T_S)[:, None]  # gravity does not show the unit
+    arrays = {"gyr": gyro if unit == "rad/s" else np.rad2deg(gyro), "acc": accel, "fs": RATE_HZ, "opt_pos": P}
+    scipy.io.savemat(tmp_path / "trial.mat", arrays | {"opt_quat": Q_WXYZ if order == "wxyz" else Q_WXYZ[:, [1, 2, 3, 0]]})
+    log = read(tmp_path / "trial.mat")
+    assert f"the poses turn as far as a gyro in {unit} says" in log.remarks.notes
+    poses = log.poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.q_wb_wxyz, Q_WXYZ, atol=1e-12)
+    assert np.array_equal(poses.p_wb, P)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, gyro)
+
+
+def test_quaternions_that_turn_otherwise_stay_numbers(tmp_path):
+    angles = np.stack([0.8 * np.sin(2 * np.pi * f * T_S + k) for k, f in enumerate((0.9, 0.27, 0.71))], axis=1)
+    other = Rotation.from_euler("ZYX", angles).as_quat()
+    arrays = {"gyr": GYRO, "acc": ACCEL, "fs": RATE_HZ, "opt_pos": P, "opt_quat": other}
+    scipy.io.savemat(tmp_path / "trial.mat", arrays)
+    log = read(tmp_path / "trial.mat")
+    assert log.poses == {}
+    assert "/opt_quat_3" in log.scalars
