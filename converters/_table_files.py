@@ -13,6 +13,7 @@ import numpy as np
 from imutool.errors import DataError, not_installed
 
 from ._archive import refusing
+from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
 LIMIT = 4 << 30  # bytes of numbers in one file
@@ -62,7 +63,9 @@ def _members(path: Path) -> set[str]:
 
 
 def _load_csv(path: Path, columns: Columns) -> None:
-    read_csv(text_of(path.read_bytes()), columns, path)
+    text = text_of(path.read_bytes())
+    if not read_rows(text, columns, path):
+        read_csv(text, columns, path)
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:

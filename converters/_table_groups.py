@@ -130,7 +130,7 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
         for wanted, values in columns.values.items():
             is_time = _group(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
             if is_time and len(values) == len(columns.values[column]) and rises(values):
-                other = wanted
+                other = other or wanted
         group = _group(group)
     if other in ("", time):
         return None

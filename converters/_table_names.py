@@ -11,8 +11,8 @@ TIME_WORDS = (
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps",
+    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad per sec(ond)?",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps|deg per sec(ond)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
     "mg": r"mg",

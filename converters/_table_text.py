@@ -68,6 +68,16 @@ class Columns:
         elif array.size == 1:
             self.numbers[name] = float(array.reshape(-1)[0])
 
+    def take(self, group: str, other: Columns, label: str) -> None:
+        """Take in the columns and remarks of another table as a group."""
+        for name, values in other.values.items():
+            column = f"{group}/{name}"
+            self.values[column], self.units[column] = values, other.units.get(name, "")
+            if name in other.texts:
+                self.texts[column] = other.texts[name]
+        self.remarks.notes.extend(f"{label}: {note}" for note in other.remarks.notes)
+        self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
+
     def join_stamps(self) -> None:
         """Make one column of a stamp that has its seconds and its nanoseconds in two, as ROS' header.stamp has."""
         for seconds in [column for column in self.values if SECONDS.fullmatch(column)]:

@@ -72,7 +72,7 @@ def test_a_folder_with_a_table_a_sensor_is_one_recording(tmp_path, folder):
     assert np.array_equal(imu.gyro, GYRO[1:])
     late = np.stack([np.interp(T_S[1:], T_S + LATE_S, column) for column in ACCEL.T], axis=1)
     np.testing.assert_allclose(imu.accel, late, atol=1e-6)  # float seconds at an epoch
-    assert f"the gyro is {gyro_name}" in log.remarks.notes
+    assert f"{gyro_name}: the gyro is {gyro_name}" in log.remarks.notes
 
 
 def test_of_several_sensors_the_map_names_the_first_and_the_refusal_all(tmp_path):

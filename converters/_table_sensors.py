@@ -1,0 +1,137 @@
+"""Tables of one sensor each, as files of their own or as rows that name their sensor.
+
+`Gyro.txt` beside `Accel.txt`; `1574572404895 TYPE_GYROSCOPE 0.12 0.35 0.43 3`; `ACCE;0.015;25347.8;0.1;0.2;9.8;3`.
+The columns of the gyroscope and of the accelerometer become `gyro/time`, `gyro/x`, ....
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from ._table_names import UNITS, split_name
+from ._table_text import COMMENTS, Columns, read_csv
+from ._table_times import rises
+
+SENSORS = {  # words in the names of files and of sensors
+    "gyro": r"gyr|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
+    "accel": r"acce?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
+}
+OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
+UNCORRECTED = r"uncal|uncalib|uncalibrated|raw"  # taken where nothing else is there
+WORD = r"[A-Z]?[a-z]+|[A-Z]+"
+POSE = ["time", *(f"position_{a}" for a in "xyz"), *(f"quaternion[{k}]" for k in range(4))]
+SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
+ANDROID, ANDROIDS = r"TYPE_[A-Z_]+", {"gyro": "rad/s", "accel": "m/s^2"}  # constants of Android, which states these units
+MOST_NAMES, LEAST_ROWS, LOOKED_AT = 60, 20, 2000
+NEAR_ONE = 0.01
+PLACES = 3  # first fields of a row, of which one may name its sensor
+
+
+def sensors_among(names: Iterable[str]) -> dict[str, str]:
+    """Names of the gyroscope and of the accelerometer; none of a sensor that has several."""
+    found: dict[str, list[tuple[bool, str]]] = {}
+    for name in names:
+        words = [word.lower() for word in re.findall(WORD, name)]
+        for sensor, pattern in SENSORS.items():
+            if any(re.fullmatch(pattern, word) for word in words) and not any(re.fullmatch(OTHERS, word) for word in words):
+                found.setdefault(sensor, []).append((any(re.fullmatch(UNCORRECTED, word) for word in words), name))
+    best = {sensor: [name for is_raw, name in each if is_raw == min(each)[0]] for sensor, each in found.items()}
+    return {names[0]: sensor for sensor, names in best.items() if len(names) == 1}
+
+
+def read_rows(text: str, columns: Columns, path: Path) -> bool:
+    """Add the columns of each sensor of a text whose rows name theirs; False for any other text."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    plain = [line for line in lines if not line.startswith(COMMENTS)]
+    marks = Counter(mark for line in plain[:LOOKED_AT] for mark in ";\t," if line.count(mark) >= PLACES)
+    if not marks:
+        return False
+    mark = marks.most_common(1)[0][0]
+    rows = [line.split(mark) for line in plain]
+    for place in range(PLACES):
+        counts = Counter(row[place].strip() for row in rows[:LOOKED_AT] if len(row) > place)
+        sensors = sensors_among(name for name, count in counts.items() if count >= LEAST_ROWS)
+        if len(counts) <= MOST_NAMES and {*sensors.values()} == {*SENSORS}:
+            break
+    else:
+        return False
+    tables: dict[str, list[str]] = {}
+    for row in rows:
+        if len(row) > place:
+            tables.setdefault(row[place].strip(), []).append(mark.join(row[:place] + row[place + 1 :]))
+    header = (
+        tables.pop(rows[0][place].strip()) if not any(re.fullmatch(r"[-+.\deE]+", field.strip()) for field in rows[0]) else []
+    )
+    for name, table in tables.items():
+        stated = (match for line in lines if (match := re.search(rf"\b{re.escape(name + mark)}(.*[a-zA-Z].*)", line)))
+        above = next((match[1].rstrip("'\" ") for match in stated if match.string.startswith(COMMENTS)), None)
+        part = Columns()
+        read_csv("\n".join([*(header if above is None else [above]), *table]), part, path, least=2)
+        group = sensors.get(name, name)
+        if name in sensors:
+            part.remarks.notes.append(f"its rows are the {group}")
+        if part.values:
+            android = ANDROIDS.get(group, "") if re.fullmatch(ANDROID, name) else ""
+            name_columns(part, sensors.get(name, ""), split_name(name)[1] or android)
+        columns.take(group, part, name)
+    return True
+
+
+def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
+    """Name the time and the axes of a sensor, and the columns of a pose without a header.
+
+    The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
+    """
+    names = [*table.values]
+    has_header = names != [f"column {number}" for number in range(1, len(names) + 1)]
+    if not sensor:
+        pose = POSE if len(names) == len(POSE) and _turns(table, names[-4:]) else POSE[:1]
+        new = {} if has_header or not rises(table.values[names[0]]) else dict(zip(names, pose, strict=False))
+    else:
+        first = next((n for n, name in enumerate(names) if not rises(table.values[name])), len(names))
+        first = min(first, len(names) - 3)  # in place of a header: where the axes begin
+        axes = _axes(names) if has_header else dict(zip(names[first:], "xyz", strict=False))
+        if len(axes) < 3:
+            return
+        clocks = [name for name in names[: names.index(next(iter(axes)))] if rises(table.values[name])]
+        for clock in clocks[-1:]:
+            table.units[clock] = table.units.get(clock) or split_name(clock)[1]
+        new = {**axes, **dict.fromkeys(clocks[-1:], "time")}
+        for name in axes:
+            table.units[name] = table.units.get(name) or _unit(name) or unit
+    order = {name: new.get(name, name) for name in sorted(names, key=lambda name: new.get(name) != "time")}
+    table.values = {name: table.values[name] for name in order}
+    table.values = {order[name]: values for name, values in table.values.items()}
+    table.texts = {order[name]: texts for name, texts in table.texts.items()}
+    table.units = {order[name]: each for name, each in table.units.items() if name in order}
+
+
+def _turns(table: Columns, names: list[str]) -> bool:
+    """Whether four columns are quaternions."""
+    size = np.linalg.norm([table.values[name].astype(float) for name in names], axis=0)
+    return bool(abs(np.median(size) - 1.0) < NEAR_ONE)
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[a-z0-9]+", re.sub(SPACED, "_", name).lower())
+
+
+def _axes(names: list[str]) -> dict[str, str]:
+    """Columns of the first three that differ by x, y, z alone."""
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in names:
+        words = _words(name)
+        axis = next((word for word in words if word in ("x", "y", "z")), "")
+        found.setdefault(tuple(word for word in words if word != axis), {})[name] = axis
+    return next((axes for axes in found.values() if sorted(axes.values()) == ["x", "y", "z"]), {})
+
+
+def _unit(name: str) -> str:
+    """Unit in brackets, at the end of a name, or in words behind the axis."""
+    behind = re.sub(r".*\b[xyz]\b ?", "", " ".join(_words(name)))
+    return split_name(name)[1] or next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, behind)), "")

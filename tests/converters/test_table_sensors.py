@@ -1,0 +1,72 @@
+"""Text whose rows name their sensor, in the layouts of phones' loggers: made-up values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.converters import table
+from imutool.recording.message_log import MessageLog
+
+COUNT = 60
+START_MS, LATE_NS = 1_600_000_000_000, 2_000_000
+GYRO = np.random.default_rng(13).normal(0.0, 0.1, (COUNT, 3))
+ACCEL = np.tile([0.1, 0.2, 9.8], (COUNT, 1))
+ANDROID = ["#\tstartTime:1600000000000", f"{START_MS}\tTYPE_WIFI\thome\t-50"]
+GETSENSORDATA = [
+    "% LogFile Data format:",
+    "% Accelerometer data: \t'ACCE;AppTimestamp(s);SensorTimestamp(s);Acc_X(m/s^2);Acc_Y(m/s^2);Acc_Z(m/s^2)'",
+    "% Gyroscope data: \t'GYRO;AppTimestamp(s);SensorTimestamp(s);Gyr_X(rad/s);Gyr_Y(rad/s);Gyr_Z(rad/s)'",
+]
+GNSSLOGGER = [
+    "# UncalAccel,utcTimeMillis,elapsedRealtimeNanos,UncalAccelXMps2,UncalAccelYMps2,UncalAccelZMps2,BiasX,BiasY,BiasZ",
+    "# UncalGyro,utcTimeMillis,elapsedRealtimeNanos,"
+    "UncalGyroXRadPerSec,UncalGyroYRadPerSec,UncalGyroZRadPerSec,DriftXRadPerSec,DriftYRadPerSec,DriftZRadPerSec",
+]
+NAMED = ["ms,sensor,x,y,z"]
+
+
+def row(mark: str, *fields: object) -> str:
+    return mark.join(map(str, fields))
+
+
+for number, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+    ms, late = START_MS + 10 * number, 0.001 * (number % 3)
+    ANDROID += [row("\t", ms, "TYPE_GYROSCOPE", *gyro, 3), row("\t", ms + 2, "TYPE_ACCELEROMETER", *accel, 3)]
+    ANDROID += [
+        row("\t", ms, "TYPE_GYROSCOPE_UNCALIBRATED", *accel, 0, 0, 0, 3),
+        row("\t", ms, "TYPE_LINEAR_ACCELERATION", *gyro, 3),
+    ]
+    GETSENSORDATA += [f"GYRO;{number / 100 + late:.3f};{number / 100 + 5e4:.6f};{row(';', *gyro)}"]
+    GETSENSORDATA += [f"ACCE;{number / 100 + late:.3f};{number / 100 + 5e4 + 0.002:.6f};{row(';', *accel)}"]
+    GNSSLOGGER += [row(",", "UncalGyro", ms, 10**13 + number * 10**7, *gyro, 0.0, 0.0, 0.0)]
+    GNSSLOGGER += [row(",", "UncalAccel", ms, 10**13 + number * 10**7 + LATE_NS, *accel, 0.0, 0.0, 0.0), "Raw,1,2,3,4"]
+    NAMED += [row(",", ms, "gyro [rad/s]", *gyro), row(",", ms + 2, "accel [m/s^2]", *accel)]
+
+
+def read(path: Path, lines: list[str]) -> MessageLog:
+    path.write_text("\n".join(lines) + "\n")
+    return table.read_sequence(table.sequences(path)[0])
+
+
+@pytest.mark.parametrize(
+    "lines", [ANDROID, GETSENSORDATA, GNSSLOGGER, NAMED], ids=["android", "getsensordata", "gnsslogger", "named"]
+)
+def test_rows_that_name_their_sensor_become_one_imu(tmp_path, lines):
+    log = read(tmp_path / "walk.txt", lines)
+    imu = log.imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 2, 10_000_000))  # the first has no accelerometer sample before it
+    assert np.array_equal(imu.gyro, GYRO[1:])
+    np.testing.assert_allclose(imu.accel, ACCEL[1:], rtol=1e-12)
+    assert any("became one IMU" in note for note in log.remarks.notes)
+
+
+def test_a_table_with_words_in_it_is_read_as_one(tmp_path):
+    lines = ["t,gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],state"]
+    lines += [
+        row(",", n / 100, *gyro, *accel, "gyro" if n % 2 else "accel")
+        for n, (gyro, accel) in enumerate(zip(GYRO, ACCEL, strict=True))
+    ]
+    assert np.array_equal(read(tmp_path / "log.csv", lines).imus["/imu0"].gyro, GYRO)
