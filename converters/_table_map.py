@@ -20,7 +20,7 @@ from imutool.recording.message_log import KINDS
 
 from ._table_names import ROS_WORDS, TIME_WORDS, XSENS_TIME, name_and_unit, split_name, triples
 from ._table_text import Columns
-from ._table_times import COUNTED, PLAUSIBLE_HZ, count_times, counter_of, rises, stated_rate
+from ._table_times import COUNTED, PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
@@ -28,6 +28,7 @@ GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
+LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 MOST_SHOWN = 12  # triples of columns in a message
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
@@ -144,7 +145,7 @@ def propose(columns: Columns) -> Proposal:
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
-    if "gyro_unit" in proposal.open and not {"gyro", "accel", "accel_unit", "time", "time_unit"} & {*proposal.open}:
+    if proposal.open == ["gyro_unit"]:
         _propose_gyro_unit(proposal, columns)
     return proposal
 
@@ -171,6 +172,11 @@ def _propose_sensor(
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
         _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
+    if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
+        level = float(np.nanmedian(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0)))
+        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"user_?acc", names[chosen[0]][0]):
+            proposal.open.append("accel")
+            proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
 
 
 def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
@@ -207,13 +213,14 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     """Column of the time and its unit, from its name or from a plausible rate."""
     length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
     found = [c for c, (name, _) in names.items() if re.fullmatch(rf"(.*_)?{TIME_WORDS}", name or names[c][1])]
-    found = [c for c in found if length in (None, len(columns.values[c])) and rises(columns.values[c])]
+    found = [c for c in found if length in (None, len(columns.values[c])) and goes_on(columns.values[c])]
     if "gyro" in proposal.entries:
         group = proposal.entries["gyro"][0].rpartition("/")[0]
         found.sort(key=lambda c: c.rpartition("/")[0] != group)
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     counter = counter_of(columns, length or 0)
-    rising = [c for c, v in columns.values.items() if c != counter and length in (None, len(v)) and rises(v)]
+    measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
+    rising = [c for c, v in columns.values.items() if c not in measured and length in (None, len(v)) and rises(v)]
     if not found and len(rising) == 1:
         proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
         found = rising

@@ -16,6 +16,7 @@ PLAUSIBLE_HZ = 5.0, 10_000.0
 RATE = r"(.*_)?(fs|f_samp|fsamp|srate|odr|hz|rate|freq|frequency|(sampl(e|ing)|update|output|data)_?(rate|freq|frequency))"
 PERIOD = r"(.*_)?(dt|delta_?t|period|sampl(e|ing)_?(period|interval|time))"
 PERIOD_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
 
 
@@ -26,6 +27,12 @@ def rises(values: np.ndarray) -> bool:
     """
     later = values[len(values) // 2 :].astype(float) - values[: len(values) - len(values) // 2].astype(float)
     return len(values) > 1 and float(min(np.mean(np.diff(values.astype(float)) > 0), np.mean(later > 0))) > 0.9
+
+
+def goes_on(values: np.ndarray) -> bool:
+    """Whether a column named as a time is one: rounded, it may stand still, but not go back."""
+    steps = np.diff(values.astype(float))
+    return rises(values) or (len(steps) > 0 and float(np.mean(steps > 0)) > 0.5 and float(np.mean(steps >= 0)) > 0.99)
 
 
 def stated_rate(columns: Columns) -> tuple[str, float] | None:
@@ -50,8 +57,10 @@ def stated_rate(columns: Columns) -> tuple[str, float] | None:
 def counter_of(columns: Columns, length: int) -> str:
     """Column of this length that counts samples, missing ones too; empty without one."""
     for column, values in columns.values.items():
-        if values.dtype.kind in "iu" and len(values) == length > 1 and np.mean(np.diff(_unwrapped(values)) == 1.0) > 0.5:
-            return column
+        if values.dtype.kind in "iu" and len(values) == length > 1:
+            steps = np.diff(_unwrapped(values))
+            if 1.0 <= np.median(steps) <= MOST_STEP and np.mean(steps == np.median(steps)) > 0.5:
+                return column
     return ""
 
 
@@ -65,6 +74,7 @@ def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> 
         counts = np.arange(length, dtype=np.float64)
     elif len(values := columns.values.get(counter, np.zeros(0))) == length:
         counts = _unwrapped(values)
+        counts /= max(float(np.median(np.diff(counts))), 1.0)  # a packet's number also counts those of other sensors
     else:
         raise ConfigError(f"{counter!r} has {len(values)} rows and the gyro {length}", where="counter", expected="as many")
     columns.values[COUNTED], columns.units[COUNTED] = counts / rate_hz, "s"

@@ -105,3 +105,41 @@ def test_the_proposed_map_keeps_the_poses_and_the_refusal_names_what_cannot_be_r
     (poses,) = log.poses.values()
     np.testing.assert_allclose(np.abs(poses.q_wb_wxyz), np.abs(q_wxyz), atol=1e-12)
     assert set(log.kinds.values()) == {"estimate"}  # nothing says that they are truth
+
+
+def test_motion_without_gravity_is_asked_about(tmp_path):
+    names = ["time", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"motionUserAcceleration{a}(G)" for a in "XYZ")]
+    for accel in (0.01 * ACCEL / 9.8, 0.3 * ACCEL / 9.8):
+        (tmp_path / "log.csv").write_text(",".join(names) + "\n" + rows(T_S, GYRO, accel))
+        with pytest.raises(ConfigError, match="gravity was taken out"):
+            table.read_sequence(table.sequences(tmp_path / "log.csv")[0])
+
+
+def test_a_packets_number_is_no_clock_and_counts_samples_whatever_its_step(tmp_path):
+    names = ["Packet number", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    packets = 2 * np.arange(COUNT) + 4 * (np.arange(COUNT) > 99)  # of two sensors; two packets of this are missing
+    body = "".join(
+        f"{n}," + row.partition(",")[2] for n, row in zip(packets, rows(T_S, GYRO, ACCEL).splitlines(True), strict=True)
+    )
+    (tmp_path / "log.csv").write_text(",".join(names) + "\n" + body)
+    (sequence,) = table.sequences(tmp_path / "log.csv")
+    with pytest.raises(ConfigError, match="'Packet number' counts the samples") as refused:
+        table.read_sequence(sequence)
+    mapping = tmp_path / "map.toml"
+    mapping.write_text(re.sub("rate_hz = .*", "rate_hz = 100.0", refused.value.fix.partition("\n\n")[2]))
+    steps = np.diff(table.read_sequence(sequence, mapping=mapping).imus["/imu0"].t_ns)
+    assert np.array_equal(steps, np.where(np.arange(COUNT - 1) == 99, 30_000_000, 10_000_000))
+
+
+def test_a_rounded_time_is_a_time_and_an_open_unit_beside_a_counter_no_error(tmp_path):
+    names = [*(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    t_s = np.floor(np.arange(COUNT) / 1.2) / 100.0  # every sixth stands twice
+    (tmp_path / "log.csv").write_text(",".join(["time", *names]) + "\n" + rows(t_s, GYRO, ACCEL))
+    imu = table.read_sequence(table.sequences(tmp_path / "log.csv")[0]).imus["/imu0"]
+    assert np.array_equal(imu.t_ns, np.unique(np.rint(t_s * 1e9).astype(np.int64)))
+    text = ",".join(["n", *names]).replace("gyro_x [rad/s]", "gyro_x") + "\n" + rows(np.arange(COUNT), GYRO, ACCEL)
+    (tmp_path / "log.csv").write_text(
+        text.replace(".000000,", ",").replace("gyro_y [rad/s]", "gyro_y").replace("gyro_z [rad/s]", "gyro_z")
+    )
+    with pytest.raises(ConfigError, match="rate_hz"):
+        table.read_sequence(table.sequences(tmp_path / "log.csv")[0])
