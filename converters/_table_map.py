@@ -26,7 +26,7 @@ USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
 GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
-ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0}
+ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01}
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 MOST_SHOWN = 12  # triples of columns in a message
@@ -174,7 +174,7 @@ def _propose_sensor(
         _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
     if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
         level = float(np.nanmedian(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0)))
-        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"user_?acc", names[chosen[0]][0]):
+        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"(user|free)_?acc", names[chosen[0]][0]):
             proposal.open.append("accel")
             proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
 
@@ -200,11 +200,12 @@ def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
     """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
         level = float(np.nanmedian(np.linalg.norm(values, axis=1)))
-        for unit, size in ACCEL_SI.items():
-            if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND:
-                proposal.entries["accel_unit"] = unit
-                proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {unit}")
-                return
+        near = [unit for unit, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND]
+        if near:
+            proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
+        if len(near) == 1:
+            proposal.entries["accel_unit"] = near[0]
+            return
     proposal.open.append(f"{sensor}_unit")
     proposal.reasons.append(NO_UNIT.format(sensor))
 

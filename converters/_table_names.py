@@ -14,12 +14,13 @@ UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad per sec(ond)?",
     "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps|deg per sec(ond)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
+    "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "mg": r"mg",
     "g": r"g",
     "ns": r"ns|nanoseconds?|nsec",
     "us": r"us|µs|microseconds?|usec",
-    "ms": r"ms|milliseconds?|msec",
+    "ms": r"ms|milliseconds?|msecs?",
     "s": r"s|sec|seconds?",
     "m": r"m|met(er|re)s?",
     "cm": r"cm|centimet(er|re)s?",
@@ -29,8 +30,8 @@ DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
     r"|dreh(rate|geschwindigkeit)",
-    "accel": r"accel(eration|erometer)?|acce?|ac|a|linear_?acceleration|specific_?force|sp_?force|(linear)?beschleunigung"
-    r"|a_rs_s",
+    "accel": r"accel(eration|erometer)?|acce?|ac|a|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
+    r"|(linear)?beschleunigung|a_rs_s",
 }
 STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column
 FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw may also be that of a command
@@ -64,7 +65,12 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> list[dict[str, st
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:
     """Name and unit of a column; a unit `beside` the column counts where its name has none."""
     name, unit = split_name(column)
-    return name, unit or next((known for known, pattern in UNITS.items() if re.fullmatch(pattern, beside.lower())), "")
+    return name, unit or unit_named(beside)
+
+
+def unit_named(text: str) -> str:
+    """Unit that a text is; empty for other texts."""
+    return next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, text.strip("[]").lower())), "")
 
 
 def split_name(column: str) -> tuple[str, str]:

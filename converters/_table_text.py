@@ -17,12 +17,14 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times
+from ._table_names import unit_named
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
 LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 LEAST_NUMBERS = 4  # in a row: a time and a vector
+MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 LOOKED_AT = 200  # first lines, which show whether text is a table
 COMMENTS = "#", "%", "//"
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
@@ -188,9 +190,11 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     """
     rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
     rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
+    rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) < MOSTLY * width]  # CAL, CAL, ...
     units: list[str] = []
     if len(rows) > 1 and (
         sum(bool(UNIT_TEXT.fullmatch(text)) for text in rows[-1]) >= width - 1
+        or sum(bool(unit_named(text)) for text in rows[-1]) >= width / 2
         or (_repeats(rows[-1]) and len({*rows[-2]} - {""}) >= width - 1)
     ):
         units = [re.sub(r"^[\[(](.*)[\])]$", r"\1", text) for text in rows.pop()]

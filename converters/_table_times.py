@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 
 from imutool.array_types import Float64
 from imutool.errors import ConfigError
+from imutool.recording.message_log import MessageLog
 
 from ._table_text import Columns
 
+NS = 10**9
 COUNTED = "#counted"  # column of the times that are counted
 PLAUSIBLE_HZ = 5.0, 10_000.0
 RATE = r"(.*_)?(fs|f_samp|fsamp|srate|odr|hz|rate|freq|frequency|(sampl(e|ing)|update|output|data)_?(rate|freq|frequency))"
@@ -85,3 +88,17 @@ def _unwrapped(counts: np.ndarray) -> Float64[np.ndarray, " n"]:
     values = counts.astype(np.float64)
     size = next((size for size in WORD_SIZES if values.max(initial=0.0) < size), 2**53)
     return np.concatenate([[0.0], np.cumsum(np.diff(values) % size)])
+
+
+def begun_at_zero(log: MessageLog) -> MessageLog:
+    """Log without negative times, which a clock that counts from a launch or another start has."""
+    parts = [*log.imus.values(), *log.poses.values(), *log.scalars.values()]
+    first = min((int(part.t_ns[0]) for part in parts if len(part.t_ns)), default=0)
+    if first >= 0:
+        return log
+    later = -(first // NS) * NS
+    log.remarks.notes.append(f"the times begin at {first / NS:.3f} s: all are {later // NS} s later in the log")
+    imus = {topic: replace(imu, t_ns=imu.t_ns + later) for topic, imu in log.imus.items()}
+    poses = {topic: replace(part, t_ns=part.t_ns + later) for topic, part in log.poses.items()}
+    scalars = {topic: replace(part, t_ns=part.t_ns + later) for topic, part in log.scalars.items()}
+    return replace(log, imus=imus, poses=poses, scalars=scalars)

@@ -29,6 +29,7 @@ from ._source import find_folders, name
 from ._table_map import STANDARD_GRAVITY
 from ._table_names import split_name
 from ._table_text import Columns, read_csv
+from ._table_times import begun_at_zero
 
 GENERAL = True
 IMU_TOPIC = "/imu0"
@@ -83,7 +84,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     files, remarks = _files(sequence.path), Remarks()
     is_oxts = any(map(OXTS.fullmatch, files.names))
     imu, poses, scalars = (_oxts if is_oxts else _phone)(files, sequence.path, remarks)
-    return MessageLog(
+    log = MessageLog(
         sequence.name,
         sequence.path.name,
         imus={IMU_TOPIC: imu},
@@ -93,6 +94,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         metadata={"imutool": {"format": "sensor_tables", "sequence": sequence.name}},
         remarks=remarks,
     )
+    return begun_at_zero(log)
 
 
 def read(source: Path) -> Iterator[MessageLog]:

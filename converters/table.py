@@ -28,7 +28,7 @@ from ._table_groups import group_entries, known_layout, time_beside
 from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map
 from ._table_rotations import unit_by_poses
 from ._table_text import Columns
-from ._table_times import COUNTED, count_times
+from ._table_times import COUNTED, begun_at_zero, count_times
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
@@ -82,7 +82,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     if poses and table.truth_time and not table.truth_file:
         used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
     scalars, constants = _further(columns, table, used, gyro_ns, place)
-    return MessageLog(
+    log = MessageLog(
         sequence.name,
         path.name,
         imus={table.topic: imu},
@@ -96,6 +96,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
         },
         remarks=remarks,
     )
+    return begun_at_zero(log)
 
 
 def read(source: Path) -> Iterator[MessageLog]:

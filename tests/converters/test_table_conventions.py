@@ -127,6 +127,7 @@ NAMES_OF_AXES = [
     ["gyro_roll", "gyro_pitch", "gyro_yaw", *(f"accel_{a}" for a in "xyz")],
     ["rollrate", "pitchrate", "yawrate", *(f"acc_{a}" for a in "xyz")],
     [*(f"S1_Gyro_{a}_CAL" for a in "XYZ"), *(f"S1_Accel_LN_{a}_CAL" for a in "XYZ")],
+    [*(f"Gyro{a}" for a in "XYZ"), *(f"GForce{a}" for a in "XYZ")],
     [*(f"gyro_{a}" for a in "xyz"), *(f"accel_{a}" for a in "xyz"), "roll_rate", "pitch_rate", "yaw_rate"],
 ]
 
@@ -150,6 +151,13 @@ HEADERS = {
     ],
     "time,left,,right,\n,acc_x,gyr_x,acc_x,gyr_x": ["time", "left.acc_x", "left.gyr_x", "right.acc_x", "right.gyr_x"],
     "time,left,right,top,low\nms,m/(s^2),m/(s^2),no_units,no_units": ["time", "left", "right", "top", "low"],
+    "a,a,a,b,b\ntime,left,right,left,right\nCAL,CAL,CAL,CAL,CAL\nmSecs,deg/sec,m/(sec^2),deg/sec,no_units": [
+        "a.time",
+        "a.left",
+        "a.right",
+        "b.left",
+        "b.right",
+    ],
     "time,left,right,top,low, ": ["time", "left", "right", "top", "low"],
     "x,x,y,x,y": ["x", "x (2)", "y", "x (3)", "y (2)"],
     "INFO\nStart,1,2\n\nDATA\ntime,left,right,top,low": ["time", "left", "right", "top", "low"],
@@ -164,7 +172,8 @@ def test_no_column_is_lost_to_its_header(tmp_path, header, end):
     columns = load(path, kind_of(path.read_bytes(), path))
     assert [values[5] for values in columns.values.values()] == [5, 1, 2, 3, 4]
     assert [*columns.values] == HEADERS[header]
-    assert columns.units.get("left", "") == ("m/(s^2)" if "no_units" in header else "")
+    assert columns.units.get("left", "") == ("m/(s^2)" if "m/(s^2)" in header else "")
+    assert columns.units.get("a.left", "") == ("deg/sec" if "CAL" in header else "")
 
 
 CLOCKS = {
@@ -196,3 +205,19 @@ def test_objects_of_matlab_are_refused_with_what_to_save(tmp_path):
     (tmp_path / "log.mat").write_bytes(header + np.array([14, len(array)], np.uint32).tobytes() + array)
     with pytest.raises(DataError, match="holds MATLAB objects"):
         table.read_sequence(table.sequences(tmp_path / "log.mat")[0])
+
+
+def test_gravity_in_hundredths_is_asked_about_where_two_units_fit():
+    names = ["t", *(f"gyro_{a}_dps" for a in "xyz"), *(f"acc_{a}" for a in "xyz")]
+    for size, near in ((100.0, ["accel_unit"]), (1.0, [])):
+        proposal = propose(Columns(dict(zip(names, [T_NS, *GYRO.T, *(size * ACCEL.T)], strict=True))))
+        assert proposal.open == near
+
+
+def test_times_before_the_start_are_moved(tmp_path):
+    t_s = np.arange(COUNT) / 200.0 - 1.25  # before a launch
+    log = table.read_sequence(
+        table.sequences(written(tmp_path / "log.csv", ["time [s]", *IMU_NAMES], [t_s, *GYRO.T, *ACCEL.T]))[0]
+    )
+    assert log.imus["/imu0"].t_ns[[0, -1]].tolist() == [750_000_000, 2_745_000_000]
+    assert any("2 s later in the log" in note for note in log.remarks.notes)
