@@ -28,9 +28,9 @@ UNITS = {
 }
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
-    "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
+    "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
     r"|dreh(rate|geschwindigkeit)",
-    "accel": r"accel(eration|erometer)?|acce?|ac|a|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
+    "accel": r"accel(eration|erometer)?|acce?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
     r"|(linear)?beschleunigung|a_rs_s",
 }
 STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column

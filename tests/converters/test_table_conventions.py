@@ -127,6 +127,7 @@ NAMES_OF_AXES = [
     ["gyro_roll", "gyro_pitch", "gyro_yaw", *(f"accel_{a}" for a in "xyz")],
     ["rollrate", "pitchrate", "yawrate", *(f"acc_{a}" for a in "xyz")],
     [*(f"S1_Gyro_{a}_CAL" for a in "XYZ"), *(f"S1_Accel_LN_{a}_CAL" for a in "XYZ")],
+    [*(f"imu.wb[{k}]" for k in range(3)), *(f"imu.fb[{k}]" for k in range(3))],
     [*(f"Gyro{a}" for a in "XYZ"), *(f"GForce{a}" for a in "XYZ")],
     [*(f"gyro_{a}" for a in "xyz"), *(f"accel_{a}" for a in "xyz"), "roll_rate", "pitch_rate", "yaw_rate"],
 ]
