@@ -86,7 +86,8 @@ def _locate_log(
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
     misfit = np.concatenate([misfit - np.median(misfit, axis=0) for _, misfit in segments])
     each = [pair.variables() for pair, _ in segments]
-    variables = {name: (unit, np.concatenate([own[name][1] for own in each])) for name, (unit, _) in each[0].items()}
+    common = set.intersection(*map(set, each))  # a channel that is constant, or starts late, is not in every segment
+    variables = {n: (unit, np.concatenate([own[n][1] for own in each])) for n, (unit, _) in each[0].items() if n in common}
     return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals, certain)
 
 

@@ -7,7 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from imutool.diagnosis.localization import locate
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.localization import locate, locate_findings
+from imutool.diagnosis.settings import LocalizationSettings
+from imutool.sensor.samples import IdealMotion
 
 RATE_HZ, DURATION_S = 100.0, 40.0
 NOISE = np.array([0.003] * 3 + [0.03] * 3)
@@ -131,3 +134,13 @@ def test_stretches_of_one_log_are_placed_on_its_clock_and_the_hole_between_them_
     t_s, misfit = T[there], acting(1, np.ones(len(T), bool))[there]
     (one,) = locate(t_s, misfit, NOISE, {}, {"gyro": 1e-9})
     assert one.intervals_s == ((0.0, 10.0), (30.0, DURATION_S))
+
+
+def test_a_channel_that_one_segment_lacks_is_no_variable_of_the_log() -> None:
+    ideal = IdealMotion(T, NOTHING[:, :3], NOTHING[:, 3:], NOTHING[:, :3])
+    first, every = T < 20.0, np.ones(len(T) // 2, bool)
+    alone = Pair("log", T[first], NOTHING[first], every, ~every, ideal=ideal, channels={"/load": T[first]})
+    pairs = [alone, Pair("log", T[~first], NOTHING[~first], every, ~every, ideal=ideal)]  # constant there
+    before, misfit = [NOTHING[first], NOTHING[~first]], acting(1, np.ones(len(T), bool))
+    (one,) = locate_findings(pairs, before, [misfit[first], misfit[~first]], NOISE, [], {"gyro": 1e-9}, LocalizationSettings())
+    assert one.intervals_s == ((0.0, DURATION_S),)
