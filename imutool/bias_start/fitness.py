@@ -241,7 +241,7 @@ def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
 def _refuted(share: Share) -> Iterator[str]:
     """Sentence on a correction of which the log asks for less than half."""
     if LEAST_SHARE < share.value < HALF - SURE * share.std:
-        yield f"{_asked(share)}: its scale and misalignment are another unit's"
+        yield f"{_asked(share)}: what it corrects there is another unit's"
 
 
 def _asked(share: Share) -> str:

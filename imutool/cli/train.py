@@ -18,7 +18,7 @@ from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
 
 if TYPE_CHECKING:
-    from imutool.bias.model import BiasModel
+    pass
 
 
 @app.command(
@@ -80,7 +80,10 @@ def train(
         if "left_out" in trained.card and not quiet:
             with redirect_stdout(sys.stderr):  # how the model was chosen is no result
                 left_out_table(trained.card["left_out"])
-                _say_effects(trained)
+                for line in lines_of_choice(trained.card):
+                    say(line)
+                if channel := getattr(trained.config, "temperature", UNSET):
+                    say(f"the bias follows {channel}")
         say(str(model))
 
 
@@ -104,12 +107,16 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
     say(", ".join(f"{sensor}: {kept}" for sensor, kept in left_out["kept"].items()) + " kept, the simplest that is not beaten")
 
 
-def _say_effects(trained: BiasModel) -> None:
-    """Print the effects of each sensor, and the temperature that its bias follows."""
-    for sensor, found in trained.card.get("physics", {}).items():
-        say(f"{sensor}: {', '.join(found['effects']) or 'no effect'}")
-    if channel := getattr(trained.config, "temperature", UNSET):
-        say(f"the bias follows {channel}")
+def lines_of_choice(card: Mapping[str, Any]) -> list[str]:
+    """Effects of each sensor, and what the neural ODE changes on held-out time."""
+    lines = [f"{sensor}: {', '.join(found['effects']) or 'no effect'}" for sensor, found in card.get("physics", {}).items()]
+    compared = card.get("compared", {})
+    if ode := compared.get("effects and neural_ode"):
+        kept = "kept" if card["held_out"] == ode else "dropped"
+        before = {sensor: found["error"] for sensor, found in compared["effects"].items()}
+        errors = (f"{sensor} {before[sensor]:.3g} to {found['error']:.3g} {found['unit']}" for sensor, found in ode.items())
+        lines.append(f"neural ODE {kept}: held-out error of {', of '.join(errors)}")
+    return lines
 
 
 class TrainingLog(Section, frozen=True):

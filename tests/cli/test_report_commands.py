@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -15,6 +16,7 @@ from typer.testing import CliRunner, Result
 
 from imutool import diagnosis_output
 from imutool.cli import load
+from imutool.cli.train import lines_of_choice
 from imutool.errors import DataError, ModelError
 from imutool.fleet import page as fleet_page
 from imutool.fleet.task import Result as Done
@@ -136,3 +138,21 @@ def test_evaluate_scores_the_other_models_and_names_the_one_that_does_not_apply(
     results = json.loads((tmp_path / "said.json").read_text())["results"]
     assert [row["model"] for row in results] == ["raw", "linear"]
     assert "the model static is not scored" in done.output
+
+
+@pytest.mark.parametrize("kept", ["kept", "dropped"])
+def test_training_tells_whether_the_neural_ode_is_in_the_model_and_what_it_changes(kept: str) -> None:
+    def errors(gyro: float, accel: float) -> dict[str, Any]:
+        return {"gyro": {"error": gyro, "unit": "rad"}, "accel": {"error": accel, "unit": "m/s"}}
+
+    card = {
+        "physics": {"gyro": {"effects": []}, "accel": {"effects": ["accel_scale"]}},
+        "held_out": errors(8.84e-4, 0.068) if kept == "kept" else errors(8.76e-4, 0.0781),
+        "compared": {"effects": errors(8.76e-4, 0.0781), "effects and neural_ode": errors(8.84e-4, 0.068)},
+    }
+    assert lines_of_choice(card) == [
+        "gyro: no effect",
+        "accel: accel_scale",
+        f"neural ODE {kept}: held-out error of gyro 0.000876 to 0.000884 rad, of accel 0.0781 to 0.068 m/s",
+    ]
+    assert lines_of_choice({}) == []
