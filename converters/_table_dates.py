@@ -12,9 +12,10 @@ HOUR_NS = 3600 * 10**9
 HALF_DAY_S = 43_200
 LAST_NS = 2**63 - 1  # in the year 2262
 DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123; 11/21/2026 3:04:05 PM
-    r"(?:(?P<year>\d{4})(?P<mark>[-/.])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
-    r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))[T ]+"
-    r"(?P<clock>\d\d?:\d\d:\d\d)(?:[.,:](?P<fraction>\d{1,9})\d*)? ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?",
+    r"(?:(?P<year>\d{4})(?P<mark>[-/._])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
+    r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))(?:[T ]+|_|--?)"
+    r"(?P<clock>\d\d?(?P<colon>[:_-])\d\d(?P=colon)\d\d)(?:(?:[.,]|(?P=colon))(?P<fraction>\d{1,9})\d*)?"
+    r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
 CLOCK = re.compile(r"(?:(\d\d?):)?(\d\d?):(\d\d)(?:[.,](\d{1,9})\d*)?")  # of one day or, as Excel shows times, of one hour
@@ -36,11 +37,11 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
         day, month = (match["second"], match["first"]) if month_first else (match["first"], match["second"])
         date = f"{match['year'] or match['last']}-{(match['month'] or month).zfill(2)}-{(match['day'] or day).zfill(2)}"
         try:
-            seconds = int(np.datetime64(f"{date}T{match['clock'].zfill(8)}", "s").astype(np.int64))
+            seconds = int(np.datetime64(f"{date}T{match['clock'].zfill(8).replace(match['colon'], ':')}", "s").astype(np.int64))
         except ValueError:
             return None
         if half := match["half"]:
-            seconds += HALF_DAY_S * ((half.upper() == "PM") - (match["clock"].startswith("12:")))
+            seconds += HALF_DAY_S * ((half.upper() == "PM") - (match["clock"].startswith("12")))
         if (zone := match["zone"]) and zone[0] in "+-":
             seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[-2:]))
         stamps.append(seconds * 10**9 + int((match["fraction"] or "0").ljust(9, "0")))

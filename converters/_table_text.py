@@ -127,6 +127,8 @@ def _is_row(line: str, delimiter: str | None, least: int) -> bool:
 
 
 def _is_number(text: str) -> bool:
+    if "_" in text:  # Python reads 2026_06_15 as a number, nobody else does
+        return False
     try:
         float(text)
     except ValueError:
@@ -241,6 +243,8 @@ def _distinct(names: list[str]) -> list[str]:
 
 
 def _numbers(texts: list[str]) -> np.ndarray | None:
+    if any("_" in text for text in texts):
+        return None
     try:
         return np.array(list(map(int, texts)), np.int64)
     except (ValueError, OverflowError):

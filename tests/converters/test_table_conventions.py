@@ -180,6 +180,9 @@ def test_no_column_is_lost_to_its_header(tmp_path, header, end):
 CLOCKS = {
     "2026/3/4 15:04:05.25": 15.0 * 3600,
     "2026-03-04 15:04:05:250": 15.0 * 3600,
+    "2026_03_04_15_04_05.250": 15.0 * 3600,
+    "2026-3-4--15-04-05-250": 15.0 * 3600,
+    "2026-03-04 15:04:05.25-0100": 16.0 * 3600,
     "3/4/2026 3:04:05.25 PM": 15.0 * 3600,
     "3/4/2026 12:04:05.25 am": 0.0,
     "23/4/2026 15:04:05.25": 50 * 86_400.0 + 15.0 * 3600,
@@ -222,3 +225,14 @@ def test_times_before_the_start_are_moved(tmp_path):
     )
     assert log.imus["/imu0"].t_ns[[0, -1]].tolist() == [750_000_000, 2_745_000_000]
     assert any("2 s later in the log" in note for note in log.remarks.notes)
+
+
+def test_a_time_in_underscores_is_a_date_and_no_number(tmp_path):
+    """Python's float reads 2026_03_04_15_04_59.5 as 20260304150459.5: over a minute that jumps by 41."""
+    stamps = [f"2026_03_04_15_{4 + n // 60:02d}_{n % 60:02d}.5" for n in range(COUNT)]
+    rows = [
+        ",".join([stamp, *map(repr, row)]) for stamp, row in zip(stamps, np.column_stack([GYRO, ACCEL]).tolist(), strict=True)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(["UTC_Time", *IMU_NAMES]), *rows]) + "\n")
+    imu = table.read_sequence(table.sequences(tmp_path / "log.csv")[0]).imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10**9))
