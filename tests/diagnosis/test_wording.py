@@ -316,6 +316,7 @@ def test_a_clock_that_wanders_says_from_where_to_where() -> None:
         "at_0": Estimate(2.73e-3, 1.1e-4, "s"),
         "at_30": Estimate(6.8e-4, 6e-5, "s"),
         "at_60": Estimate(-5.5e-4, 6e-5, "s"),
+        "at_90": Estimate(8e-3, 3e-3, "s"),  # at rest, where no clock shows
     }
     assert named_sentence(diagnoses.ARM, finding("clock_wander", offsets)) == (
         "the clock of the recording wanders, by -0.55 ± 0.06 ms to 2.73 ± 0.11 ms (clock_wander)"

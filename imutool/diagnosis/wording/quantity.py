@@ -11,6 +11,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.units import AXES, with_superscripts
 
 SHOWN = 3  # numbers of one quantity; a matrix has up to nine
+VAGUE = 10.0  # times the least deviation of a course: from here on a time shows too little to count in its span
 RAISED = ("⁰", "¹", "²", "³", "⁴", "⁵", "⁶", "⁷", "⁸", "⁹")
 
 # A quantity of a unit is shown in the first step that it is not too small for: (from, size of the step, its symbol).
@@ -34,11 +35,12 @@ class Quantity:
     estimates: tuple[Estimate, ...]
 
     def __str__(self) -> str:
-        """`12.4 ± 0.3 ms`, `(0.213, -0.051, 0.120) ± 0.004 m`, the clearest three of many, or the ends of a course."""
+        """`12.4 ± 0.3 ms`, `(0.213, -0.051, 0.120) ± 0.004 m`, the clearest three of many, or the span of a course."""
         if len(self.estimates) == 1:
             return value(self.estimates[0])
         if self.axes[0].startswith("at "):
-            least, most = (value(extreme(self.estimates, key=lambda e: e.value)) for extreme in (min, max))
+            sure = [e for e in self.estimates if e.std <= VAGUE * min(other.std for other in self.estimates)]
+            least, most = (value(extreme(sure, key=lambda e: e.value)) for extreme in (min, max))
             return f"{least} to {most}"
         if self.axes == AXES:
             return vector(self.estimates)
