@@ -27,7 +27,8 @@ WORD = r"[A-Z]?[a-z]+|[A-Z]+"
 POSE = ["time", *(f"position_{a}" for a in "xyz"), *(f"quaternion[{k}]" for k in range(4))]
 SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
 ANDROID, ANDROIDS = r"TYPE_[A-Z_]+", {"gyro": "rad/s", "accel": "m/s^2"}  # constants of Android, which states these units
-MOST_NAMES, LEAST_ROWS, LOOKED_AT = 60, 20, 2000
+MOST_NAMES, LEAST_ROWS = 60, 20
+LOOKED_AT = 200_000  # first characters of a text, which show whether its rows name sensors
 NEAR_ONE = 0.01
 PLACES = 3  # first fields of a row, of which one may name its sensor
 
@@ -46,20 +47,12 @@ def sensors_among(names: Iterable[str]) -> dict[str, str]:
 
 def read_rows(text: str, columns: Columns, path: Path) -> bool:
     """Add the columns of each sensor of a text whose rows name theirs; False for any other text."""
+    found = _sensor_rows(text[:LOOKED_AT])
+    if found is None:
+        return False
+    mark, place, sensors = found
     lines = [line for line in text.splitlines() if line.strip()]
-    plain = [line for line in lines if not line.startswith(COMMENTS)]
-    marks = Counter(mark for line in plain[:LOOKED_AT] for mark in ";\t," if line.count(mark) >= PLACES)
-    if not marks:
-        return False
-    mark = marks.most_common(1)[0][0]
-    rows = [line.split(mark) for line in plain]
-    for place in range(PLACES):
-        counts = Counter(row[place].strip() for row in rows[:LOOKED_AT] if len(row) > place)
-        sensors = sensors_among(name for name, count in counts.items() if count >= LEAST_ROWS)
-        if len(counts) <= MOST_NAMES and {*sensors.values()} == {*SENSORS}:
-            break
-    else:
-        return False
+    rows = [line.split(mark) for line in lines if not line.startswith(COMMENTS)]
     tables: dict[str, list[str]] = {}
     for row in rows:
         if len(row) > place:
@@ -80,6 +73,22 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
             name_columns(part, sensors.get(name, ""), split_name(name)[1] or android)
         columns.take(group, part, name)
     return True
+
+
+def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
+    """Delimiter, place of the sensor's name in a row, and names of gyro and accel; None for any other text."""
+    lines = [line for line in start.splitlines()[:-1] if line.strip() and not line.startswith(COMMENTS)]
+    marks = Counter(mark for line in lines for mark in ";\t," if line.count(mark) >= PLACES)
+    if not marks:
+        return None
+    mark = marks.most_common(1)[0][0]
+    rows = [line.split(mark) for line in lines]
+    for place in range(PLACES):
+        counts = Counter(row[place].strip() for row in rows if len(row) > place)
+        sensors = sensors_among(name for name, count in counts.items() if count >= LEAST_ROWS)
+        if len(counts) <= MOST_NAMES and {*sensors.values()} == {*SENSORS}:
+            return mark, place, sensors
+    return None
 
 
 def name_columns(table: Columns, sensor: str, unit: str = "") -> None:

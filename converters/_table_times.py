@@ -16,8 +16,9 @@ from ._table_text import Columns
 NS = 10**9
 COUNTED = "#counted"  # column of the times that are counted
 PLAUSIBLE_HZ = 5.0, 10_000.0
-RATE = r"(.*_)?(fs|f_samp|fsamp|srate|odr|hz|rate|freq|frequency|(sampl(e|ing)|update|output|data)_?(rate|freq|frequency))"
-PERIOD = r"(.*_)?(dt|delta_?t|period|sampl(e|ing)_?(period|interval|time))"
+OF = r"imu|gyr(o(scope)?)?|acce?(l(erometer)?)?|sensors?|data|log(ging)?|record(ing)?|acquisition|sampl(e|ing)|update|output"
+RATE = rf"(({OF})_?)*(fs|f_?samp|srate|odr|hz|rate|freq|frequency)(_({OF}))*"  # no baud rate, no rate of frames
+PERIOD = rf"(({OF})_?)*(dt|delta_?t|period|interval)|sampl(e|ing)_?time"
 PERIOD_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
@@ -46,7 +47,7 @@ def stated_rate(columns: Columns) -> tuple[str, float] | None:
         size = 1e3 if leaf.endswith("khz") else 1.0
         if re.fullmatch(RATE, re.sub(r"(?<=.)_?k?hz$", "", leaf)):
             found[name] = value * size
-        elif match := re.fullmatch(rf"{PERIOD}(_(?P<unit>s|ms|us|ns))?", leaf):
+        elif match := re.fullmatch(rf"({PERIOD})(_(?P<unit>s|ms|us|ns))?", leaf):
             rates = [1.0 / (value * PERIOD_S[u]) for u in ([match["unit"]] if match["unit"] else PERIOD_S) if value > 0.0]
             plausible = [rate for rate in rates if PLAUSIBLE_HZ[0] <= rate <= PLAUSIBLE_HZ[1]]
             if len(plausible) == 1:

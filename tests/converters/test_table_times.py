@@ -38,7 +38,7 @@ def written(path: Path, above: str, names: list[str], columns: list[np.ndarray])
     return path
 
 
-@pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms"])
+@pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms", "Fs_imu", "gyro_rate_hz"])
 def test_a_mat_file_with_a_sampling_rate_has_times(tmp_path, stated):
     number = {"dt": 1.0 / RATE_HZ, "sample_period_ms": 1e3 / RATE_HZ}.get(stated, RATE_HZ)
     scipy.io.savemat(tmp_path / "trial.mat", {"imu_gyr": GYRO, "imu_acc": ACCEL, stated: number})
@@ -99,8 +99,9 @@ def test_a_map_has_a_time_or_a_positive_rate(tmp_path, wrong):
         read(path, tmp_path / "map.toml")
 
 
-def test_rates_that_differ_are_not_believed(tmp_path):
-    scipy.io.savemat(tmp_path / "trial.mat", {"imu_gyr": GYRO, "imu_acc": ACCEL, "imu_fs": RATE_HZ, "video_fs": 30.0})
+@pytest.mark.parametrize("others", [{"fs": RATE_HZ, "accel_fs": 30.0}, {"baud_rate": 9600}, {"frame_rate": 30.0}])
+def test_rates_that_differ_or_are_of_something_else_are_not_believed(tmp_path, others):
+    scipy.io.savemat(tmp_path / "trial.mat", {"imu_gyr": GYRO, "imu_acc": ACCEL} | others)
     with pytest.raises(ConfigError, match="no number in the file is named as a sampling rate"):
         read(tmp_path / "trial.mat")
 
