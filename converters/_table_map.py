@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -22,6 +24,7 @@ from ._table_names import ROS_WORDS, TIME_WORDS, XSENS_TIME, name_and_unit, spli
 from ._table_text import Columns
 from ._table_times import COUNTED, PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
 
+IMU_TOPIC = "/imu0"
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
 GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
@@ -46,22 +49,25 @@ Entries = dict[str, str | list[str]]  # of a map
 
 
 class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """Map of a table's columns; a column named `-ax` counts with the opposite sign."""
+    """Map of a table's columns; a column named `-ax` counts with the opposite sign.
+
+    Without `gyro` and `accel` it holds for each of several IMUs, which the names of the columns show.
+    """
 
     time: str = ""
     time_unit: str = ""
     rate_hz: float = 0.0  # in place of a time: rows are counted, or what a column `counter` counts
     counter: str = ""
-    gyro: list[str]
+    gyro: list[str] = []
     gyro_unit: str
-    accel: list[str]
+    accel: list[str] = []
     accel_unit: str
     accel_time: str = ""
     gyro_scale: float | list[float] = 1.0
     gyro_offset: float | list[float] = 0.0
     accel_scale: float | list[float] = 1.0
     accel_offset: float | list[float] = 0.0
-    topic: str = "/imu0"
+    topic: str = IMU_TOPIC
     truth_file: str = ""
     truth_time: str = ""
     truth_time_unit: str = ""
@@ -94,7 +100,7 @@ def read_map(path: Path) -> TableMap:
             raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
     if table.pose_kind not in KINDS:
         raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
-    for name in ("gyro", "accel"):
+    for name in ("gyro", "accel") if table.gyro or table.accel else ():
         if len(getattr(table, name)) != 3:
             raise ConfigError(f"{name} names {len(getattr(table, name))} columns", where=path, expected="three: x, y, z")
     return table
@@ -114,18 +120,23 @@ class Proposal(msgspec.Struct):
         self.reasons[:] = [each for each in self.reasons if each != NO_UNIT.format("gyro")] + [reason]
         self.entries["gyro_unit"] = unit
 
-    def toml(self) -> str:
+    def toml(self, several: Sequence[str] = ()) -> str:
         """The proposal as a map file, with a question behind what is open."""
         lines = [f"rate_hz = {self.rate_hz}"] if self.rate_hz else []
         lines += ['rate_hz = "?"  # please state: the samples a second, as a number'] if "rate_hz" in self.open else []
         times = [] if lines else ["time", "time_unit"]
-        asked_for = *times, "gyro", "gyro_unit", "accel", "accel_unit"
-        for name in (*asked_for, *(name for name in self.entries if name not in {*asked_for, "time", "time_unit"})):
+        asked_for = (*times, "gyro_unit", "accel_unit") if several else (*times, "gyro", "gyro_unit", "accel", "accel_unit")
+        left_out = {*asked_for, "time", "time_unit", *(("gyro", "accel") if several else ())}
+        for name in (*asked_for, *(name for name in self.entries if name not in left_out)):
             value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
             text = json.dumps(value, ensure_ascii=False)
             asked = f"please state: {' or '.join(UNITS_OF.get(name, ['the columns']))}"
             asked = "these, or other columns?" if name in self.entries else asked
             lines.append(f"{name} = {text}" + (f"  # {asked}" if name in self.open else ""))
+        if several:
+            lines.append(
+                f"# it holds for {', '.join(several)}; for one of them alone, name its columns: gyro = [...], accel = [...]"
+            )
         if "time" in self.open:
             lines.append("# without a column of times: rate_hz = 100.0, the samples a second, in place of time and time_unit")
         lines.append(
@@ -136,6 +147,20 @@ class Proposal(msgspec.Struct):
             " truth_file if they are in another table"
         )
         return "\n".join(lines)
+
+
+def imus_apart(columns: Columns) -> dict[str, Columns]:
+    """Columns without those of other IMUs, by topic; empty unless several pair by name."""
+    names = {column: split_name(column)[0] for column in columns.values}
+    gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
+    if len(gyros) < 2 or gyros.keys() != accels.keys():
+        return {}
+    of = {owner: {*gyros[owner].values(), *accels[owner].values()} for owner in gyros}
+    apart = {}
+    for owner, own in of.items():
+        values = {c: v for c, v in columns.values.items() if c in own or not any(c in other for other in of.values())}
+        apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
+    return apart
 
 
 def propose(columns: Columns) -> Proposal:
@@ -156,7 +181,7 @@ def _propose_sensor(
     """Columns of the three axes, and their unit."""
     plain = {column: name for column, (name, _) in names.items()}
     spaced = {c: split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", c))[0] for c in names}  # UncompGyro_0
-    whole = triples(sensor, plain, spaced)
+    whole = [*triples(sensor, plain, spaced).values()]
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
         shown = "".join(f"{': ' if n == 0 else ', '}{triple['x']}/y/z" for n, triple in enumerate(whole[:MOST_SHOWN]))

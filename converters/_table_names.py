@@ -44,22 +44,24 @@ AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z"}
 
 
-def triples(sensor: str, *names: dict[str, str]) -> list[dict[str, str]]:
-    """Columns of three axes, in the first form of names that has all three.
+def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
+    """Columns of three axes by what they are of, in the first form of names that has all three.
 
-    `names` are spellings of the columns' names.
+    `names` are spellings of the columns' names; `left_gyr_x` is of `left`.
     """
     tries = (_triples(sensor, spelled, form) for form in FORMS for spelled in names)
-    return next(filter(None, tries), [])
+    return next(filter(None, tries), {})
 
 
-def _triples(sensor: str, names: dict[str, str], form: str) -> list[dict[str, str]]:
+def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[str, str]]:
     groups: dict[str, dict[str, str]] = {}
     axes = TURNS if sensor == "gyro" else AXES
     for column, name in names.items():
         if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
             groups.setdefault(match["sensor"], {})[axes.get(match["axis"], match["axis"])] = column
-    return [group for group in groups.values() if set(group) == set("xyz")]
+    whole = {name: group for name, group in groups.items() if set(group) == set("xyz")}
+    owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name in whole]
+    return dict(zip(owners if len({*owners}) == len(whole) else whole, whole.values(), strict=True))
 
 
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
-from imutool.recording import Poses, Scalars, unit_quaternions
+from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
 
@@ -25,7 +25,18 @@ from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_folder import is_split, load_split
 from ._table_groups import group_entries, known_layout, time_beside
-from ._table_map import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, TableMap, propose, read_map
+from ._table_map import (
+    ACCEL_SI,
+    GYRO_SI,
+    IMU_TOPIC,
+    POSITION_SI,
+    TIME_NS,
+    Proposal,
+    TableMap,
+    imus_apart,
+    propose,
+    read_map,
+)
 from ._table_rotations import unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times
@@ -62,36 +73,26 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     """
     path = sequence.path
     columns = load_split(path) if path.is_dir() else load(path, kind_of(head(path), path))
-    remarks = columns.remarks
-    table = _proposed(columns, path, remarks) if mapping is None else read_map(mapping)
-    place = path if mapping is None else mapping
-    if table.rate_hz:
-        count_times(columns, table.rate_hz, len(_column(columns, table.gyro[0].removeprefix("-"), place)), table.counter)
-        table = msgspec.structs.replace(table, time=COUNTED, time_unit="s")
-    gyro_ns = _times(columns, table.time, table.time_unit, place)
-    accel_ns = _times(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
-    gyro = _vectors(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
-    accel = _vectors(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
-    for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
-        if len(t_ns) != len(values):
-            raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
-    imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
-    remarks.notes.extend(notes)
-    used = {table.time, table.accel_time, *(c.removeprefix("-") for c in (*table.gyro, *table.accel))}
+    remarks, place = columns.remarks, path if mapping is None else mapping
+    tables = _proposed(columns, path, remarks) if mapping is None else _mapped(columns, mapping)
+    tables = [_counted(columns, table, place) for table in tables]
+    table = tables[0]  # other columns are on its clock
+    imus = {each.topic: _imu(columns, each, place) for each in tables}
+    used = {c.removeprefix("-") for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
     if poses and table.truth_time and not table.truth_file:
         used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
-    scalars, constants = _further(columns, table, used, gyro_ns, place)
+    scalars, constants = _further(columns, table, used, place)
     log = MessageLog(
         sequence.name,
         path.name,
-        imus={table.topic: imu},
+        imus=imus,
         poses=poses,
         kinds=dict.fromkeys(poses, table.pose_kind),
         scalars=scalars,
         metadata={
             "imutool": {"format": "table", "sequence": sequence.name},
-            "imutool/map": _described(table),
+            **{f"imutool/map{each.topic if len(tables) > 1 else ''}": _described(each) for each in tables},
             **({"imutool/constants": constants} if constants else {}),
         },
         remarks=remarks,
@@ -104,33 +105,80 @@ def read(source: Path) -> Iterator[MessageLog]:
     return map(read_sequence, sequences(source))
 
 
-def _proposed(columns: Columns, path: Path, remarks: Remarks) -> TableMap:
-    """Map from the columns' names.
+def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
+    """Map of each IMU from the columns' names.
 
     Raises:
         ConfigError: something is open; the message holds a map file to complete.
     """
+    apart = {} if known_layout(columns) else imus_apart(columns)
+    proposals = {topic: _proposal(part) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
+    maps = []
+    for topic, proposal in proposals.items():
+        if proposal.open:
+            shown = ", ".join([column for column in columns.values if column != COUNTED][:40])
+            reasons = "; ".join(proposal.reasons + remarks.losses)
+            raise ConfigError(
+                f"the meaning of its columns is not certain: {reasons}. Its columns are {shown}",
+                where=path,
+                fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart])}",
+            )
+        named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
+        said = "columns: " + ", ".join(f"{key} = {value}" for key, value in named.items() if value != COUNTED)
+        remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
+        maps.append(msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz, "topic": topic}, TableMap))
+    return maps
+
+
+def _mapped(columns: Columns, mapping: Path) -> list[TableMap]:
+    """Map of a file, or one for each IMU where it names no gyro and accel.
+
+    Raises:
+        ConfigError: the file is no map, or it names no columns and they show no IMUs apart.
+    """
+    table = read_map(mapping)
+    if table.gyro:
+        return [table]
+    named = {topic: propose(part).entries for topic, part in imus_apart(columns).items()}
+    if not named:
+        what = "names no gyro and accel, and the columns' names do not show several IMUs"
+        raise ConfigError(what, where=mapping, expected="gyro = [x, y, z] and accel = [x, y, z]")
+    return [
+        msgspec.convert(msgspec.structs.asdict(table) | {s: entries[s] for s in ("gyro", "accel")} | {"topic": topic}, TableMap)
+        for topic, entries in named.items()
+    ]
+
+
+def _proposal(columns: Columns) -> Proposal:
+    """Map of one IMU and its poses, by names, magnitudes and motion."""
     proposal = known_layout(columns) or propose(columns)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
-    if (
-        "gyro_unit" in proposal.open
-        and "quaternion_wxyz" in proposal.entries
-        and (unit := unit_by_poses(columns, proposal.entries))
-    ):
+    if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, proposal.entries)):
         proposal.settle_gyro_unit(unit, f"the poses turn as far as a gyro in {unit} says")
-    if proposal.open:
-        shown = ", ".join([column for column in columns.values if column != COUNTED][:40])
-        reasons = "; ".join(proposal.reasons + remarks.losses)
-        raise ConfigError(
-            f"the meaning of its columns is not certain: {reasons}. Its columns are {shown}",
-            where=path,
-            fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml()}",
-        )
-    named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
-    remarks.notes.append("columns: " + ", ".join(f"{key} = {value}" for key, value in named.items() if value != COUNTED))
-    remarks.notes.extend(proposal.reasons)
-    return msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz}, TableMap)
+    return proposal
+
+
+def _counted(columns: Columns, table: TableMap, place: Path) -> TableMap:
+    """The map with the column of counted times, where it has a rate in place of a time."""
+    if not table.rate_hz:
+        return table
+    count_times(columns, table.rate_hz, len(_column(columns, table.gyro[0].removeprefix("-"), place)), table.counter)
+    return msgspec.structs.replace(table, time=COUNTED, time_unit="s")
+
+
+def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
+    """IMU of a map, on the gyro's stamps."""
+    gyro_ns = _times(columns, table.time, table.time_unit, place)
+    accel_ns = _times(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
+    gyro = _vectors(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
+    accel = _vectors(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
+    for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
+        if len(t_ns) != len(values):
+            raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
+    imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
+    columns.remarks.notes.extend(notes)
+    return imu
 
 
 def _described(table: TableMap) -> dict[str, str]:
@@ -212,10 +260,9 @@ def _quaternions(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, 
     return quaternion.unit(Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]])
 
 
-def _further(
-    columns: Columns, table: TableMap, used: set[str], t_ns: Int64[np.ndarray, " n"], where: Path
-) -> tuple[dict[str, Scalars], dict[str, str]]:
+def _further(columns: Columns, table: TableMap, used: set[str], where: Path) -> tuple[dict[str, Scalars], dict[str, str]]:
     """Further columns as topics, on the clock of their group or on the IMU's, and short ones without time as texts."""
+    t_ns = _times(columns, table.time, table.time_unit, where)
     clocks: dict[str, Int64[np.ndarray, " n"]] = {}
     constants, left = {}, []
     for column in [c for c in columns.values if c not in used]:

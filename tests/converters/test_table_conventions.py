@@ -23,6 +23,7 @@ GYRO = RNG.normal(0.0, 0.1, (COUNT, 3))
 ACCEL = RNG.normal(0.0, 0.02, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
 P = RNG.normal(0.0, 1.0, (COUNT, 3))
 Q_WXYZ = (raw := RNG.normal(0.0, 1.0, (COUNT, 4))) / np.linalg.norm(raw, axis=1, keepdims=True)
+SIX = [*((f"gyr_{a}", "rad/s") for a in "xyz"), *((f"acc_{a}", "m/s^2") for a in "xyz")]
 IMU_NAMES = [*(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"accel_{a} [m/s^2]" for a in "xyz")]
 
 
@@ -236,3 +237,49 @@ def test_a_time_in_underscores_is_a_date_and_no_number(tmp_path):
     (tmp_path / "log.csv").write_text("\n".join([",".join(["UTC_Time", *IMU_NAMES]), *rows]) + "\n")
     imu = table.read_sequence(table.sequences(tmp_path / "log.csv")[0]).imus["/imu0"]
     assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10**9))
+
+
+@pytest.mark.parametrize("written_by", ["one clock", "groups with clocks", "a rate"])
+def test_several_imus_of_one_table_are_several_imus_of_one_log(tmp_path, written_by):
+    right = GYRO[::-1], ACCEL[::-1]
+    if written_by == "one clock":
+        names = ["t_ns", *(f"{of}_{s} [{u}]" for of in ("left", "right") for s, u in SIX)]
+        path = written(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *right[0].T, *right[1].T])
+    else:
+        path = tmp_path / "gait.h5"
+        with h5py.File(path, "w") as file:
+            for of, (gyro, accel) in {"left": (GYRO, ACCEL), "right": right}.items():
+                file[f"{of}/gyr"], file[f"{of}/acc"] = gyro, accel
+                file[f"{of}/gyr"].attrs["unit"], file[f"{of}/acc"].attrs["unit"] = "rad/s", "m/s^2"
+                if written_by == "groups with clocks":
+                    file[f"{of}/time_ns"] = T_NS + 1_000_000 * (of == "right")
+            file.attrs["fs"] = 200.0
+    log = table.read_sequence(table.sequences(path)[0])
+    assert {*log.imus} == {"/left/imu", "/right/imu"}
+    np.testing.assert_allclose(log.imus["/left/imu"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/right/imu"].gyro, right[0])
+    np.testing.assert_allclose(log.imus["/right/imu"].accel, right[1])
+    late_ns = log.imus["/right/imu"].t_ns - log.imus["/left/imu"].t_ns
+    assert np.array_equal(late_ns, np.full(COUNT, 1_000_000 if written_by == "groups with clocks" else 0))
+    assert log.scalars == {}
+    assert log.metadata["imutool/map/right/imu"]["topic"] == "/right/imu"
+
+
+def test_one_map_holds_for_several_imus_whose_unit_is_open(tmp_path):
+    names = ["t_ns", *(f"{of}_{s}" for of in ("left", "right") for s, _ in SIX)]
+    path = written(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *(2.0 * GYRO).T, *ACCEL.T])
+    with pytest.raises(ConfigError, match="state no unit of the gyro") as refused:
+        table.read_sequence(table.sequences(path)[0])
+    proposed = refused.value.fix.split("\n\n", 1)[1]
+    assert "# it holds for /left/imu, /right/imu" in proposed
+    (tmp_path / "map.toml").write_text(proposed.replace('gyro_unit = "?"', 'gyro_unit = "rad/s"'))
+    log = table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml")
+    np.testing.assert_allclose(log.imus["/left/imu"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/right/imu"].gyro, 2.0 * GYRO)
+
+
+def test_a_map_without_columns_needs_names_that_show_several_imus(tmp_path):
+    path = written(tmp_path / "one.csv", ["t_ns", *IMU_NAMES], [T_NS, *GYRO.T, *ACCEL.T])
+    (tmp_path / "map.toml").write_text('time = "t_ns"\ntime_unit = "ns"\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n')
+    with pytest.raises(ConfigError, match="do not show several IMUs"):
+        table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml")

@@ -76,7 +76,8 @@ def test_a_folder_with_a_table_a_sensor_is_one_recording(tmp_path, folder):
 
 
 def test_of_several_sensors_the_map_names_the_first_and_the_refusal_all(tmp_path):
-    names = [f"{side}_{sensor}_{a}" for side in ("left", "right") for sensor in ("acc", "gyr") for a in "xyz"]
+    groups = "left_acc", "left_gyr", "coarse_acc", "right_gyr"  # which of them belong together is not said
+    names = [f"{group}_{a}" for group in groups for a in "xyz"]
     (tmp_path / "log.csv").write_text(",".join(["time", *names]) + "\n" + rows(T_S, ACCEL, GYRO, 2 * ACCEL, 2 * GYRO))
     (sequence,) = table.sequences(tmp_path / "log.csv")
     with pytest.raises(ConfigError, match="left_gyr_x/y/z, right_gyr_x/y/z") as refused:

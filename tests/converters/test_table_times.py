@@ -61,7 +61,9 @@ def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the
     received = np.delete(np.arange(COUNT), slice(2000, 2010))
     columns = [(65_000 + received) % 65_536, *ACCEL[received].T, *GYRO[received].T]
     path = written(tmp_path / "mtw.txt", "// Start Time: Unknown\n// Update Rate: 250.0Hz\n", names, columns)
-    assert np.array_equal(read(path).imus["/imu0"].t_ns, NEXT_NS * received)
+    log = read(path)
+    assert np.array_equal(log.imus["/imu0"].t_ns, NEXT_NS * received)
+    assert log.scalars == {}
 
 
 def test_a_counter_is_no_time_and_the_map_that_is_proposed_asks_for_the_rate(tmp_path):
