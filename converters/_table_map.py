@@ -22,7 +22,7 @@ from imutool.recording.message_log import KINDS
 
 from ._table_names import ROS_WORDS, TIME_WORDS, XSENS_TIME, name_and_unit, split_name, triples
 from ._table_text import Columns
-from ._table_times import COUNTED, PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
+from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
 
 IMU_TOPIC = "/imu0"
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
@@ -280,8 +280,7 @@ def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: in
     rate = stated_rate(columns)
     proposal.entries |= {"counter": counter} if counter else {}
     if rate is not None and length:
-        count_times(columns, rate[1], length, counter)
-        proposal.entries |= {"time": COUNTED, "time_unit": "s"}
+        proposal.entries |= {"time": count_times(columns, rate[1], length, counter), "time_unit": "s"}
         proposal.rate_hz = rate[1]
         proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
     else:

@@ -14,7 +14,7 @@ from imutool.recording.message_log import MessageLog
 from ._table_text import Columns
 
 NS = 10**9
-COUNTED = "#counted"  # column of the times that are counted
+COUNTED = "#counted "  # begins the name of a column of times that are counted
 PLAUSIBLE_HZ = 5.0, 10_000.0
 OF = r"imu|gyr(o(scope)?)?|acce?(l(erometer)?)?|sensors?|data|log(ging)?|record(ing)?|acquisition|sampl(e|ing)|update|output"
 RATE = rf"(({OF})_?)*(fs|f_?samp|srate|odr|hz|rate|freq|frequency)(_({OF}))*"  # no baud rate, no rate of frames
@@ -68,8 +68,8 @@ def counter_of(columns: Columns, length: int) -> str:
     return ""
 
 
-def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> None:
-    """Add the column COUNTED: seconds since the first sample, by a counter or by rows.
+def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> str:
+    """Add a column of seconds since the first sample, by a counter or by rows; its name.
 
     Raises:
         ConfigError: the counter has another length than the samples, or does not count.
@@ -81,7 +81,9 @@ def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> 
         counts /= max(float(np.median(np.diff(counts))), 1.0)  # a packet's number also counts those of other sensors
     else:
         raise ConfigError(f"{counter!r} has {len(values)} rows and the gyro {length}", where="counter", expected="as many")
-    columns.values[COUNTED], columns.units[COUNTED] = counts / rate_hz, "s"
+    name = f"{COUNTED}{counter or length}"
+    columns.values[name], columns.units[name] = counts / rate_hz, "s"
+    return name
 
 
 def _unwrapped(counts: np.ndarray) -> Float64[np.ndarray, " n"]:

@@ -116,7 +116,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
     maps = []
     for topic, proposal in proposals.items():
         if proposal.open:
-            shown = ", ".join([column for column in columns.values if column != COUNTED][:40])
+            shown = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
             reasons = "; ".join(proposal.reasons + remarks.losses)
             raise ConfigError(
                 f"the meaning of its columns is not certain: {reasons}. Its columns are {shown}",
@@ -124,7 +124,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
                 fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart])}",
             )
         named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
-        said = "columns: " + ", ".join(f"{key} = {value}" for key, value in named.items() if value != COUNTED)
+        said = "columns: " + ", ".join(f"{key} = {v}" for key, v in named.items() if not v.startswith(COUNTED))
         remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
         maps.append(msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz, "topic": topic}, TableMap))
     return maps
@@ -160,11 +160,12 @@ def _proposal(columns: Columns) -> Proposal:
 
 
 def _counted(columns: Columns, table: TableMap, place: Path) -> TableMap:
-    """The map with the column of counted times, where it has a rate in place of a time."""
+    """The map with a column of counted times, where it has a rate in place of a time."""
     if not table.rate_hz:
         return table
-    count_times(columns, table.rate_hz, len(_column(columns, table.gyro[0].removeprefix("-"), place)), table.counter)
-    return msgspec.structs.replace(table, time=COUNTED, time_unit="s")
+    length = len(_column(columns, table.gyro[0].removeprefix("-"), place))
+    time = count_times(columns, table.rate_hz, length, table.counter)
+    return msgspec.structs.replace(table, time=time, time_unit="s")
 
 
 def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
