@@ -277,13 +277,14 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
 def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:
     """Sampling rate of samples that are counted, in place of a time."""
     counted = f"{counter!r} counts the samples" if counter else "no column holds the time: rows are counted"
-    rate = stated_rate(columns)
+    rate = stated_rate(columns, proposal.entries.get("gyro", [""])[0])
     proposal.entries |= {"counter": counter} if counter else {}
-    if rate is not None and length:
-        proposal.entries |= {"time": count_times(columns, rate[1], length, counter), "time_unit": "s"}
-        proposal.rate_hz = rate[1]
-        proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
-    else:
+    if rate is None:
         proposal.open += ["rate_hz"] if counter else ["time", "time_unit"]
         what = counted if counter else "no column that rises looks like a time"
         proposal.reasons.append(f"{what}, and no number in the file is named as a sampling rate")
+        return
+    proposal.rate_hz = rate[1]
+    proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
+    if length:
+        proposal.entries |= {"time": count_times(columns, rate[1], length, counter), "time_unit": "s"}

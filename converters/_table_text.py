@@ -77,6 +77,7 @@ class Columns:
             self.values[column], self.units[column] = values, other.units.get(name, "")
             if name in other.texts:
                 self.texts[column] = other.texts[name]
+        self.numbers |= {f"{group}/{name}": value for name, value in other.numbers.items()}
         self.remarks.notes.extend(f"{label}: {note}" for note in other.remarks.notes)
         self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
 

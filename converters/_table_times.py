@@ -39,11 +39,17 @@ def goes_on(values: np.ndarray) -> bool:
     return rises(values) or (len(steps) > 0 and float(np.mean(steps > 0)) > 0.5 and float(np.mean(steps >= 0)) > 0.99)
 
 
-def stated_rate(columns: Columns) -> tuple[str, float] | None:
-    """Name and value (Hz) of the sampling rate that the file states; None without a sole one."""
+def stated_rate(columns: Columns, gyro: str) -> tuple[str, float] | None:
+    """Name and value (Hz) of the sampling rate that the file states; None without a sole one.
+
+    One in a group counts for the column `gyro` of that group only: a camera has a rate, too.
+    """
     found: dict[str, float] = {}
     for name, value in columns.numbers.items():
-        leaf = re.sub(r"[^a-z0-9]+", "_", re.sub(r".*[/.]", "", name).lower()).strip("_")
+        group = re.sub(r"[^/.]*$", "", name)
+        if not gyro.startswith(group.strip("/.")):
+            continue
+        leaf = re.sub(r"[^a-z0-9]+", "_", name[len(group) :].lower()).strip("_")
         size = 1e3 if leaf.endswith("khz") else 1.0
         if re.fullmatch(RATE, re.sub(r"(?<=.)_?k?hz$", "", leaf)):
             found[name] = value * size

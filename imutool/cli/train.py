@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -16,9 +16,6 @@ from imutool.cli.app import MODEL, Imu, Json, Logs, Overwrite, Quiet, Truth, Ver
 from imutool.cli.terminal import epoch_line, progress, say, table, write_json
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
-
-if TYPE_CHECKING:
-    pass
 
 
 @app.command(

@@ -56,6 +56,24 @@ def test_the_rate_may_be_an_attribute_of_an_hdf5_file(tmp_path):
     assert np.array_equal(read(tmp_path / "trial.h5").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
 
 
+def test_a_rate_in_a_group_is_that_of_its_own_sensor(tmp_path):
+    with h5py.File(tmp_path / "trial.h5", "w") as file:
+        file["imu/gyr"], file["imu/acc"], file["camera/exposure"] = GYRO, ACCEL, np.ones(90)
+        file["camera"].attrs["fs"] = 30.0
+    with pytest.raises(ConfigError, match="no number in the file is named as a sampling rate"):
+        read(tmp_path / "trial.h5")
+    with h5py.File(tmp_path / "trial.h5", "a") as file:
+        file["imu/gyr"].attrs["fs"] = RATE_HZ
+    assert np.array_equal(read(tmp_path / "trial.h5").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
+
+
+def test_a_rate_is_kept_where_the_gyro_is_not_recognised(tmp_path):
+    scipy.io.savemat(tmp_path / "trial.mat", {"turning": GYRO, "imu_acc": ACCEL, "fs": RATE_HZ})
+    with pytest.raises(ConfigError, match="0 triples of columns look like the gyro") as refused:
+        read(tmp_path / "trial.mat")
+    assert "rate_hz = 250.0" in refused.value.fix
+
+
 def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the_table(tmp_path):
     names = ["PacketCounter", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
     received = np.delete(np.arange(COUNT), slice(2000, 2010))
