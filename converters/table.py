@@ -116,15 +116,17 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
     maps = []
     for topic, proposal in proposals.items():
         if proposal.open:
-            shown = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
+            names = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
             reasons = "; ".join(proposal.reasons + remarks.losses)
             raise ConfigError(
-                f"the meaning of its columns is not certain: {reasons}. Its columns are {shown}",
+                f"the meaning of its columns is not certain: {reasons}. Its columns are {names}",
                 where=path,
                 fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart])}",
             )
         named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
-        said = "columns: " + ", ".join(f"{key} = {v}" for key, v in named.items() if not v.startswith(COUNTED))
+        counted = {key for key, value in named.items() if value.startswith(COUNTED)}
+        shown = {key: value for key, value in named.items() if key.removesuffix("_unit") not in counted}
+        said = "columns: " + ", ".join(f"{key} = {value}" for key, value in shown.items())
         remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
         maps.append(msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz, "topic": topic}, TableMap))
     return maps
