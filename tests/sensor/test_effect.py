@@ -342,6 +342,23 @@ def test_a_late_gyro_has_the_phase_of_its_delay_and_the_rest_stays(f_hz: float, 
     assert out.alpha is felt.alpha
 
 
+@pytest.mark.parametrize("n", [2, 3, 510, 1001])  # periods of 2 n - 2 samples: 1018 is twice a prime
+@pytest.mark.parametrize("late", [1e-9, 0.4, -2.0, 3.0 + 1e-12, 11.7])
+def test_a_late_gyro_is_the_turned_spectrum_of_its_mirrored_column(n: int, late: float) -> None:
+    still = np.zeros((n, 3))
+    felt = IdealMotion(0.005 * np.arange(n), np.random.default_rng(2).normal(size=(n, 3)), still, still)
+    x = felt.gyro[:, 0]
+    ramp = np.linspace(x[0], x[-1], n)
+    mirrored = np.fft.rfft(np.concatenate([x - ramp, (ramp - x)[-2:0:-1]]))
+    turn = np.exp(-2j * np.pi * np.fft.rfftfreq(2 * n - 2) * late)
+    exact = ramp - late * (x[-1] - x[0]) / (n - 1) + np.fft.irfft(mirrored * turn, 2 * n - 2)[:n]
+    out = act("gyro_delay", felt, late / felt.rate_hz)
+    close(out.gyro[:, 0], exact)
+    turned = act("mount_rotation", felt, 0.0, 0.0, 0.1)
+    assert (act("gyro_delay", turned, 0.004).gyro[:, 2] == act("gyro_delay", felt, 0.004).gyro[:, 2]).all()
+    assert act("gyro_delay", felt, late / felt.rate_hz).gyro is out.gyro  # a derivative asks for it again and again
+
+
 @pytest.mark.parametrize("width", [0.02, 0.3])
 def test_a_dead_band_starts_at_its_width_beside_a_bias_and_noise(width: float) -> None:
     felt = lively()
