@@ -11,6 +11,7 @@ outliers and the attitude under the accelerometer stay those of all logs (`tests
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,10 +40,14 @@ from imutool.training.segments import Pool
 from imutool.training.statistics import speed_of, turn_on_prior
 from imutool.units import SENSORS, Sensor
 
+logger = logging.getLogger(__name__)
+
 STARTS = ("auto", "smooth", "truth")
 CANDIDATES = ("constant", "linear", "effects")  # from the simplest
 LEAST_GAIN = 0.03  # of the error, for a candidate to be worth its parameters
 LEAST_ERROR = 1e-6  # ° or m/s
+CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 40 logs of noise keep 0.43 at least
+LONG_ENOUGH_S = 34.0  # for a calibration of a log alone: the length of these
 LONGEST_S = 120.0  # of a log that is scored
 DRIFT_S = 5.0
 
@@ -59,15 +64,34 @@ class Score:
 
 
 @dataclass(frozen=True)
+class Contradiction:
+    """Log that other logs' scale and misalignment make worse: its errors over that without."""
+
+    log: str
+    sensor: Sensor
+    others: float
+    own: float
+
+    def __str__(self) -> str:
+        """What a user should look at."""
+        return (
+            f"{self.log}: contradicts the other logs: their {self.sensor} scale and misalignment leave {self.others:.0%} of "
+            f"its error, its own {self.own:.0%}. Another unit or mount, or turned poses? Train a model for each unit"
+        )
+
+
+@dataclass(frozen=True)
 class Comparison:
-    """Scores of all left-out logs, and the candidate that is kept for each sensor."""
+    """Scores of left-out logs, the candidates kept, and the logs that contradict the others."""
 
     scores: tuple[Score, ...]
     kept: Mapping[Sensor, str]
+    contradicting: tuple[Contradiction, ...] = ()
 
     def card(self) -> dict[str, Any]:
         """Entry of a model card."""
-        return {"kept": dict(self.kept), "scores": [vars(score) for score in self.scores]}
+        scores, contradicting = ([vars(entry) for entry in entries] for entries in (self.scores, self.contradicting))
+        return {"kept": dict(self.kept), "scores": scores, "contradicting": contradicting}
 
 
 def compare(
@@ -97,7 +121,25 @@ def compare(
 
     logs = list(enumerate(_logs(recordings, pool, fits["gyro"])))
     scores = [score for some in of_each(of_log, logs, long=True) for score in some]
-    return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS})
+    contradictions = contradicting(pool, fits)
+    for contradiction in contradictions:
+        logger.warning("%s", contradiction)
+    return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS}, contradictions)
+
+
+def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contradiction, ...]:
+    """Logs of another unit or mount, or with turned poses; of two logs it could be either."""
+    found = []
+    for sensor, fit in fits.items():
+        if len(fit.problem.own) == len(pool.names) > 2:  # logs, not folds of them
+            other = [name for name in fit.effects if name not in LINEAR[sensor]]
+            every, without = (parameter_columns(fit.forms, names) for names in ((*other, *LINEAR[sensor]), other))
+            losses = [fit.problem.predicted(every, by_itself=alone) for alone in (False, True)]
+            shares = (torch.stack(losses, dim=1) / fit.problem.predicted(without)[:, None]).clamp_min(0.0).sqrt()
+            found += [Contradiction(name, sensor, *share) for name, share in zip(pool.names, shares.tolist(), strict=True)]
+    lengths_ns = {name: end - begin for name, (begin, end) in zip(pool.names, pool.spans_ns, strict=True)}
+    long = (log for log in found if lengths_ns[log.log] >= nanoseconds(LONG_ENOUGH_S))
+    return tuple(log for log in long if log.others > 1.0 and log.own < CONTRADICTS)
 
 
 def keep(scores: Sequence[Score], sensor: Sensor) -> str:

@@ -105,9 +105,11 @@ class Problem:
 
     def without(self, index: int) -> Problem:
         """The problem of all logs but one."""
-        kept = [i for i in range(len(self.own)) if i != index]
-        fit, judged = (Equations(e.H[kept], e.g[kept], e.c[kept]) for e in (self.fit, self.judged))
-        return replace(self, own=self.own[kept], fit=fit, judged=judged)
+        return self._of([i for i in range(len(self.own)) if i != index])
+
+    def alone(self, index: int) -> Problem:
+        """The problem of one log, which counts in full."""
+        return replace(self._of([index], self.design_effect), design_effect=1.0)
 
     def own_at(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "logs o"]:
         """Unknowns of each log, for given parameters."""
@@ -115,17 +117,22 @@ class Problem:
         own: Tensor = self.own - torch.linalg.solve(H, g)
         return own
 
-    def predicted(self, columns: Sequence[int]) -> Float[Tensor, " logs"]:
-        """Loss of each log with parameters from the other logs, its own unknowns solved for; nuisances keep their prior."""
+    def predicted(self, columns: Sequence[int], *, by_itself: bool = False) -> Float[Tensor, " logs"]:
+        """Loss of each log with parameters of the other logs, or `by_itself`; its own are solved for."""
         p, losses = len(self.prior), []
         held = torch.where(torch.arange(len(self.own_prior)).to(self.prior) < self.free, 0.0, self.own_prior)
         for i, at in enumerate(self.own):
-            judged = self.judged.moved(self.solve(columns, without=i).theta - self.theta)
+            theta = self.alone(i).solve(columns).theta if by_itself else self.solve(columns, without=i).theta
+            judged = self.judged.moved(theta - self.theta)
             H, g = judged.H[i, p:, p:] + torch.diag(held), judged.g[i, p:] + held * at
             least = RIDGE * H.diagonal().mean().clamp_min(RIDGE)
             own = -torch.linalg.solve(H + least * torch.eye(len(g)).to(H), g)
             losses.append(judged.c[i] + held @ at.square() + 2 * g @ own + own @ H @ own)
         return torch.stack(losses)
+
+    def _of(self, logs: Sequence[int], factor: float = 1.0) -> Problem:
+        fit, judged = (Equations(e.H[logs], e.g[logs], e.c[logs]).times(factor) for e in (self.fit, self.judged))
+        return replace(self, own=self.own[logs], fit=fit, judged=judged)
 
     def _own_equations(self, fit: Equations) -> tuple[Float[Tensor, "logs o o"], Float[Tensor, "logs o"]]:
         p = len(self.prior)
@@ -135,12 +142,6 @@ class Problem:
 def design_effect(pool: Pool) -> float:
     """Kish's design effect 1 + (n - 1) rho of errors that n logs share."""
     return 1.0 + SHARED * (len(pool.spans_ns) - 1)
-
-
-def prior_std(effect: LinearForm, sensors: SensorPrior | None = None) -> Float64[np.ndarray, " p"]:
-    """Standard deviation of the prior of each parameter, which is about zero."""
-    same: float | None = getattr(sensors or SensorPrior(), effect.name, None)
-    return effect.plausible if same is None else np.full(len(effect.parameters), same)
 
 
 @dataclass(frozen=True)
@@ -173,8 +174,8 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
         DataError: a log without a window that is free of gaps.
     """
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
-    std = [prior_std(effect, seen.sensors) for effect in effects]
-    prior = torch.from_numpy(np.concatenate([np.zeros(0), *std]) ** -2.0).to(seen.pool.t)
+    std = np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)])
+    prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own = torch.zeros_like(prior), prior.new_zeros(logs, len(width))
     terms = torch.from_numpy(_terms(seen.signals, effects)).to(seen.pool.t)

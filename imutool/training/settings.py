@@ -8,10 +8,13 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 
 from imutool import registry
+from imutool.array_types import Float64
 from imutool.config import Settings
 from imutool.errors import ConfigError
+from imutool.sensor.linear_form import LinearForm
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -80,6 +83,11 @@ class SensorPrior(Settings, frozen=True):
     accel_quadratic: Positive = 1e-3  # s²/m: MPU-6050 0.5 % of a full scale of 2 g
     accel_bias_drift: Positive = 0.1  # m/s²: a choice
     clock_offset: Positive = 0.01  # s: a choice
+
+    def std_of(self, effect: LinearForm) -> Float64[np.ndarray, " p"]:
+        """Standard deviation of the prior of each parameter of an effect."""
+        same: float | None = getattr(self, effect.name, None)
+        return effect.plausible if same is None else np.full(len(effect.parameters), same)
 
 
 class TrainSettings(Settings, frozen=True):

@@ -16,7 +16,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm, compiled
 from imutool.sensor.signals import SignalFilter
 from imutool.training.calibration import FOLDS, LINEAR, Calibration, calibrate, folded
-from imutool.training.normal_equations import design_effect, prior_std
+from imutool.training.normal_equations import design_effect
 from imutool.training.segments import Pool
 from imutool.training.settings import SensorPrior
 from imutool.units import Sensor
@@ -54,7 +54,7 @@ def measured(recording: Recording, effects: Sequence[LinearForm], theta: np.ndar
 
 def planted_theta(effects: Sequence[LinearForm]) -> np.ndarray:
     """A third of what is plausible, alternately up and down."""
-    plausible = np.concatenate([prior_std(effect) for effect in effects])
+    plausible = np.concatenate([SensorPrior().std_of(effect) for effect in effects])
     signs = np.where(np.arange(len(plausible)) % 2, -1.0, 1.0)
     return 0.3 * plausible * signs
 
@@ -127,7 +127,7 @@ def test_where_nothing_is_planted_scale_and_misalignment_are_near_zero_and_nothi
     calibration = without_effects(first, sensor)
     assert calibration.effects == LINEAR[sensor]
     assert max(calibration.gains.values()) < 0.06
-    prior = np.concatenate([prior_std(form) for form in catalogue.trained(sensor, LINEAR[sensor])])
+    prior = np.concatenate([SensorPrior().std_of(form) for form in catalogue.trained(sensor, LINEAR[sensor])])
     assert np.abs(calibration.theta.numpy()).max() < 0.1 * prior.min()
     assert np.abs(z_scores(calibration, np.zeros(9))).max() < SURE
 
@@ -218,7 +218,7 @@ def test_what_a_planar_motion_cannot_show_stays_at_its_prior_and_is_named(flight
     calibration = found([planar(flight) for flight in flights], "gyro", effects, ["gyro_misalignment"])
     never = {f"gyro_misalignment.{pair}" for pair in ("xy", "yx")}
     assert never <= set(calibration.unseen) <= never | {f"gyro_misalignment.{pair}" for pair in ("zx", "zy")}
-    theta, widths = planted_theta(effects), prior_std(effects[0])
+    theta, widths = planted_theta(effects), SensorPrior().std_of(effects[0])
     for parameter, value, planted, width in zip(effects[0].parameters, calibration.theta.numpy(), theta, widths, strict=True):
         if parameter.name in ("xz", "yz"):  # what turning about z adds to the others
             assert abs(value - planted) < 0.1 * abs(planted), parameter.name

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from support.switchings_on import Switchings, log
@@ -12,8 +13,11 @@ from support.switchings_on import Switchings, log
 from imutool.config import load
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
-from imutool.training.left_out import Score, beaten, keep
+from imutool.recording import Recording
+from imutool.training.calibration import LINEAR, calibrate
+from imutool.training.left_out import Contradiction, Score, beaten, contradicting, keep
 from imutool.training.run import train
+from imutool.training.segments import Pool
 from imutool.training.settings import settings_of
 
 KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0)
@@ -83,3 +87,26 @@ def test_a_gain_counts_beyond_its_scatter_from_log_to_log() -> None:
     assert not beaten(errors, errors - 0.01), "too little"
     assert not beaten(errors, errors - np.array([0.5, -0.4, 0.1])), "no agreement"
     assert not beaten(errors, np.full(3, np.nan))
+
+
+def contradictions(recordings: list[Recording]) -> list[Contradiction]:
+    pool = Pool.of(recordings)
+    return list(contradicting(pool, {"gyro": calibrate(pool, "gyro", pool.gyro, LINEAR["gyro"])}))
+
+
+def test_a_log_of_another_unit_is_named_among_logs_of_one() -> None:
+    """Its mount and clock differ no more than those of the others."""
+    kind = msgspec.structs.replace(KIND, scale=0.03, duration_s=35.0)
+    one_unit = [log(seed, 0, kind) for seed in range(4)]
+    assert not contradictions(one_unit)
+    stranger = log(4, 0, msgspec.structs.replace(kind, sensor_seed=2))
+    (found,) = contradictions([*one_unit, stranger])
+    assert (found.log, found.sensor) == (stranger.name, "gyro")
+    assert found.own < 0.2
+    assert found.others > 1.0
+    assert stranger.name in str(found)
+
+
+def test_parts_of_a_log_contradict_nothing() -> None:
+    """They are one unit, and two logs do not tell which of them is the stranger."""
+    assert not contradictions([log(seed, 0, msgspec.structs.replace(KIND, sensor_seed=seed)) for seed in range(2)])
