@@ -42,7 +42,7 @@ class _Delay(NamedTuple):
     mirrored: Complex128[np.ndarray, " f"]  # and of h(i + j)
 
     @staticmethod
-    @lru_cache(maxsize=16)
+    @lru_cache(maxsize=4)
     def of(n: int, samples: float) -> _Delay:
         """Delay of n rows by some samples; the same object again, by which a motion knows its columns behind it."""
         from scipy.fft import next_fast_len, rfft
