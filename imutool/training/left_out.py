@@ -46,8 +46,8 @@ STARTS = ("auto", "smooth", "truth")
 CANDIDATES = ("constant", "linear", "effects")  # from the simplest
 LEAST_GAIN = 0.03  # of the error, for a candidate to be worth its parameters
 LEAST_ERROR = 1e-6  # ° or m/s
-CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 40 logs of noise keep 0.43 at least
-LONG_ENOUGH_S = 34.0  # for a calibration of a log alone: the length of these
+CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
+LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
 LONGEST_S = 120.0  # of a log that is scored
 DRIFT_S = 5.0
 
@@ -136,10 +136,10 @@ def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contr
             every, without = (parameter_columns(fit.forms, names) for names in ((*other, *LINEAR[sensor]), other))
             losses = [fit.problem.predicted(every, by_itself=alone) for alone in (False, True)]
             shares = (torch.stack(losses, dim=1) / fit.problem.predicted(without)[:, None]).clamp_min(0.0).sqrt()
-            found += [Contradiction(name, sensor, *share) for name, share in zip(pool.names, shares.tolist(), strict=True)]
-    lengths_ns = {name: end - begin for name, (begin, end) in zip(pool.names, pool.spans_ns, strict=True)}
-    long = (log for log in found if lengths_ns[log.log] >= nanoseconds(LONG_ENOUGH_S))
-    return tuple(log for log in long if log.others > 1.0 and log.own < CONTRADICTS)
+            for name, (begin, end), (others, own) in zip(pool.names, pool.spans_ns, shares.tolist(), strict=True):
+                if end - begin >= nanoseconds(LONG_ENOUGH_S) and others > 1.0 and own < CONTRADICTS:
+                    found.append(Contradiction(name, sensor, others, own))
+    return tuple(found)
 
 
 def keep(scores: Sequence[Score], sensor: Sensor) -> str:

@@ -96,7 +96,7 @@ def contradictions(recordings: list[Recording]) -> list[Contradiction]:
 
 def test_a_log_of_another_unit_is_named_among_logs_of_one() -> None:
     """Its mount and clock differ no more than those of the others."""
-    kind = msgspec.structs.replace(KIND, scale=0.03, duration_s=35.0)
+    kind = msgspec.structs.replace(KIND, scale=0.03, duration_s=45.0)
     one_unit = [log(seed, 0, kind) for seed in range(4)]
     assert not contradictions(one_unit)
     stranger = log(4, 0, msgspec.structs.replace(kind, sensor_seed=2))
@@ -105,6 +105,13 @@ def test_a_log_of_another_unit_is_named_among_logs_of_one() -> None:
     assert found.own < 0.2
     assert found.others > 1.0
     assert stranger.name in str(found)
+
+
+def test_logs_that_need_no_matrix_contradict_nothing() -> None:
+    """Each log's own matrix fits its noise."""
+    kind = msgspec.structs.replace(KIND, scale=0.001, misalignment_rad=0.0005, rest_s=4.0, duration_s=45.0)
+    for first in range(0, 20, 4):
+        assert not contradictions([log(seed, 0, kind) for seed in range(first, first + 4)])
 
 
 def test_parts_of_a_log_contradict_nothing() -> None:

@@ -38,7 +38,7 @@ class _Delay(NamedTuple):
 
     samples: float
     length: int
-    behind: Complex128[np.ndarray, " f"]  # spectrum of h(i - j)
+    direct: Complex128[np.ndarray, " f"]  # spectrum of h(i - j)
     mirrored: Complex128[np.ndarray, " f"]  # and of h(i + j)
 
     @staticmethod
@@ -64,7 +64,7 @@ class _Delay(NamedTuple):
         ramp = np.linspace(x[0], x[-1], n := len(x))
         slope = (x[-1] - x[0]) / max(n - 1, 1)
         spectrum = rfft(x - ramp, self.length)
-        later = irfft(spectrum * self.behind - spectrum.conj() * self.mirrored, self.length)[:n]
+        later = irfft(spectrum * self.direct - spectrum.conj() * self.mirrored, self.length)[:n]
         return np.asarray(ramp - slope * self.samples + later)
 
 
