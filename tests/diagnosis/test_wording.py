@@ -155,7 +155,7 @@ def test_a_curve_of_which_no_number_is_distinguished_still_has_a_sentence() -> N
         (
             0.06,
             True,
-            "be noise. What remains of the accel is 0.06 against 0.05 m/s² of noise, and cannot be told from noise.",
+            "be noise. What remains of the accel is 0.06 against 0.05 m/s² of noise, and may exceed it by chance.",
         ),
         (0.06, False, "has no name. What remains of the accel is 0.06 against 0.05 m/s² of noise, and has no explanation yet."),
     ],

@@ -34,6 +34,7 @@ KNOTS, FINE_KNOTS = 9, 33
 PLAUSIBLE, PLAUSIBLE_LAG_S = {"gyro": 0.1, "accel": 1.0}, 0.2
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
 QUANTILES, BY_RANGE = 1001, 0.35  # places between which knots are found, and how many of them by the range alone
+REPEATED = 0.01  # of a channel's variance, left by the IMU's samples: below it the channel is these samples
 SPREAD = 1e-9  # relative: knots that lie closer are one
 
 
@@ -47,6 +48,8 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
         size = float(np.std(np.concatenate([pair.channels[name] for pair in pairs])))
         if size <= 0 or any(need in name for need in named):
             continue  # constant, or the catalogue has a name for that
+        if all(_repeats(pair, name) for pair in pairs):
+            continue  # the IMU itself is no cause of its error
         for signal in SENSORS:
             effect = channel_effect(signal, name)
             plausible = (PLAUSIBLE[signal] / size,) * 3 + (PLAUSIBLE_LAG_S,)
@@ -61,6 +64,14 @@ def driven(pairs: Sequence[Pair]) -> Iterator[Effect]:
                 variable=name,
                 variant=f"{name}:{signal}",
             )
+
+
+def _repeats(pair: Pair, name: str) -> bool:
+    """Whether a channel is the IMU's own samples again, calibrated or not."""
+    rows = pair.fitted | pair.held_out
+    samples, channel = (x[rows] - x[rows].mean(axis=0) for x in (pair.real, pair.channels[name]))
+    gain = np.linalg.lstsq(samples, channel)[0]
+    return float(np.var(channel - samples @ gain)) < REPEATED * float(np.var(channel))
 
 
 UNIT_OF = {"omega": "rad/s", "f": "m/s²", "alpha": "rad/s²", "t": "s"}

@@ -13,7 +13,7 @@ from imutool.diagnosis.wording.quantity import percent, symbol
 from imutool.units import UNITS
 
 NO_EXPLANATION = "has no explanation yet"
-MAY_BE_NOISE = "cannot be told from noise"
+MAY_BE_NOISE = "may exceed it by chance"
 QUIET = "nothing else stands above the noise"
 UNKNOWN = "This log has no usable reference, and its samples alone show no defect."
 NULL = "Nothing but a constant bias and noise separates the two."

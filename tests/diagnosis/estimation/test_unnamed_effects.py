@@ -28,6 +28,14 @@ def test_each_channel_may_drive_each_sensor_and_none_that_the_catalogue_names() 
     assert [one.key for one in unnamed.driven([pair])] == ["driven:/motor:gyro", "driven:/motor:accel"]
 
 
+def test_the_imus_own_samples_under_another_name_drive_nothing() -> None:
+    """Calibrated, they are not even equal to the raw ones."""
+    ideal = planted.rich()
+    calibrated = ideal.gyro @ [0.02, 1.03, -0.01] + 0.1
+    pair = planted.pair(planted.rich(channels={"/calibrated_gyro_y": calibrated, "/motor": CURRENT}))
+    assert {one.key.split(":")[1] for one in unnamed.driven([pair])} == {"/motor"}
+
+
 def test_only_channels_of_all_logs_may_drive() -> None:
     pairs = [planted.pair(planted.rich(channels={"/motor": CURRENT, name: CURRENT**2})) for name in ("/one", "/other")]
     assert {one.key.split(":")[1] for one in unnamed.driven(pairs)} == {"/motor"}
