@@ -86,6 +86,7 @@ class TimestampSettings(Settings, frozen=True):
     clipped_share: Share = 0.995  # of the limit, from which a sample is clipped
     limit_error: Positive = 1e-3  # relative deviation that a limit is stated with
     least_jitter_s: Positive = 2e-5  # standard deviation of the stamps
+    jitter_s: Positive = 0.25  # on both sides of a stamp: its jitter is its distance from their median
     least_digits: Positive = 0.3  # of the noise: finer steps leave no trace in it
     grid_share: Share = 0.98  # of the samples that have to lie on a grid
     line_samples: Count = 15  # of the local polynomial that the samples follow

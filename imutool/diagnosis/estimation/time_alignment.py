@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
 from imutool.diagnosis.estimation.noise_estimate import wiener_filter
+from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
@@ -157,6 +158,7 @@ def _simulated(
     """Simulated motion without noise on an even clock, and the noise that was filtered out."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
+    t_sim = without_jitter(t_sim, samples, settings.timestamps)
     period_s = float(np.median(np.diff(t_sim)))
     ideal = _by_poses(sim, samples, noise, 1.0 / period_s, settings)
     if ideal is not None:

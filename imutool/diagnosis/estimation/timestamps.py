@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
@@ -20,6 +21,7 @@ from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 LEAST_VALUES = 3  # of a grid
 LEAST_ROWS = 100
+UNEVEN = "stamps jitter, samples do not"
 
 
 def even(
@@ -90,17 +92,7 @@ def jitter(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
 
     unsure = float(np.mean([x.std() / np.sqrt(len(x)) for _, x in corrections]))  # of the even clock's start
     share = (Parameter("share", "-", 1.0), Parameter("begins_off", "s", unsure), Parameter("ends_off", "s", 2.0 * unsure))
-    return (
-        Effect(
-            "timestamp_jitter",
-            Stage.CLOCK,
-            ("gyro", "accel"),
-            "stamps jitter, samples do not",
-            share,
-            "it moves, and stamps are uneven",
-            forward,
-        ),
-    )
+    return (Effect("timestamp_jitter", Stage.CLOCK, SENSORS, UNEVEN, share, "it moves, and stamps are uneven", forward),)
 
 
 def dropped(pairs: Sequence[Pair]) -> list[Finding]:
@@ -171,27 +163,16 @@ def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAU
 def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
     """Saturation whose readings still carry noise: one candidate a sensor, bias included."""
     candidates = []
-    for k, signal in enumerate(("gyro", "accel")):
+    for k, signal in enumerate(SENSORS):
         if any(signal in limits(pair.real, pair.settings.timestamps) for pair in pairs):
             continue
         part = slice(3 * k, 3 * k + 3)
-        bias = np.mean([b[part] for b in biases], axis=0)
+        clip = _Clip(k, np.mean([b[part] for b in biases], axis=0))
         most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
-        unit = UNITS[signal]
-        candidates.append(
-            Effect(
-                "saturation",
-                Stage.CONVERTER,
-                ("gyro",) if k == 0 else ("accel",),
-                f"{signal} = clip({signal}, -L, L)",
-                (Parameter(f"{signal}_limit", unit, most, positive=True, null_value=np.inf, step=1e-4),),
-                "the limit is reached",
-                _Clip(k, bias),
-                linear=False,
-                starts=starts_at(*([share * most] for share in SHARES)),
-                variant="" if k == 0 else "accel",
-            )
-        )
+        limit = Parameter(f"{signal}_limit", UNITS[signal], most, positive=True, null_value=np.inf, step=1e-4)
+        text, starts = f"{signal} = clip({signal}, -L, L)", starts_at(*([share * most] for share in SHARES))
+        effect = Effect("saturation", Stage.CONVERTER, (signal,), text, (limit,), "the limit is reached", clip, False, starts)
+        candidates.append(replace(effect, variant=("", "accel")[k]))
     return tuple(candidates)
 
 
@@ -260,23 +241,44 @@ def late_stamps(pairs: Sequence[Pair]) -> list[Finding]:
     lateness = [pair.stamp_s - even(pair.stamp_s, settings)[0] for pair in pairs]
     if min(float(x.std()) for x in lateness) < settings.least_jitter_s:
         return []
-    followed_sum, weight = 0.0, 0.0
-    for pair, late in zip(pairs, lateness, strict=True):
-        for column in pair.real.T:
-            share, size = _followed(column, late, pair.period_s, settings)
-            followed_sum, weight = followed_sum + share * size, weight + size
-    if weight <= 0.0:
-        return []
-    share, sigma = followed_sum / weight, 1.0 / np.sqrt(weight)
-    if share > 0.5 or 1.0 - share < settings.even_sigma * sigma:
+    logs = ((pair.real, late, pair.period_s) for pair, late in zip(pairs, lateness, strict=True))
+    chance = _chance_of_following(logs, settings)
+    if chance == 1.0:
         return []
     all_s = np.concatenate(lateness)
     std = float(all_s.std())
     length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
-    chance = float(norm.sf((1.0 - share) / sigma))
     parameters = {"std": Estimate(std, std / np.sqrt(2.0 * len(all_s)), "s")}
     held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
-    return [Finding("timestamp_jitter", "both", 0.0, chance, chance, parameters, "stamps jitter, samples do not", held_out)]
+    return [Finding("timestamp_jitter", "both", 0.0, chance, chance, parameters, UNEVEN, held_out)]
+
+
+def without_jitter(
+    stamp_s: Float64[np.ndarray, " n"], samples: Float64[np.ndarray, "n k"], settings: TimestampSettings = DEFAULT.timestamps
+) -> Float64[np.ndarray, " n"]:
+    """Stamps without jitter that the samples do not follow; holes and slow wander stay."""
+    steps = np.diff(stamp_s)
+    if steps.std() < settings.least_jitter_s:
+        return stamp_s
+    period_s = float(np.median(steps))
+    late = stamp_s - stamp_s[0] - period_s * np.arange(len(stamp_s))
+    late -= median_filter(late, 1 + 2 * round(settings.jitter_s / period_s), mode="nearest")
+    return stamp_s if _chance_of_following([(samples, late, period_s)], settings) == 1.0 else stamp_s - late
+
+
+def _chance_of_following(
+    logs: Iterable[tuple[Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"], float]], settings: TimestampSettings
+) -> float:
+    """p-value of samples that follow their stamps' lateness, given with the period; 1 unless they clearly do not."""
+    followed_sum, weight = 0.0, 0.0
+    for samples, late, period_s in logs:
+        for column in samples.T:
+            share, size = _followed(column, late, period_s, settings)
+            followed_sum, weight = followed_sum + share * size, weight + size
+    if weight <= 0.0:
+        return 1.0
+    share, sigma = followed_sum / weight, 1.0 / np.sqrt(weight)
+    return 1.0 if share > 0.5 or 1.0 - share < settings.even_sigma * sigma else float(norm.sf((1.0 - share) / sigma))
 
 
 def _followed(

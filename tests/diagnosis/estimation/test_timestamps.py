@@ -109,6 +109,19 @@ def test_even_stamps_do_not_jitter() -> None:
     assert timestamps.jitter([planted.pair(planted.rich(), stamp_s=clean())]) == ()
 
 
+@pytest.mark.parametrize("follows", [True, False])
+def test_jitter_is_taken_off_stamps_that_samples_do_not_follow(follows: bool) -> None:
+    """A slow wander of the same clock stays, and so do holes."""
+    even = np.delete(clean() + 5e-3 * np.sin(0.3 * clean()), [700, 701, 1800])
+    stamps = even + 5e-4 * np.random.default_rng(4).normal(size=len(even))
+    samples = planted.ideal(planted.rich(), (), stamps if follows else even) + planted.noise(len(even), 3)
+    got = timestamps.without_jitter(stamps, samples)
+    if follows:
+        np.testing.assert_array_equal(got, stamps)
+    else:
+        assert float((got - even)[50:-50].std()) < 0.35 * 5e-4
+
+
 # ── digits ──
 
 
