@@ -30,7 +30,7 @@ SAME_S = 1e-7  # a stamp's rounding; the fastest motion goes nowhere in it
 INSTANTS, RECENT = 3, 16  # entries that a sampler keeps: sets of instants, and columns
 JOINED = "stamp_s", "gyro", "accel", "alpha"
 NOTHING: Mapping[str, Float64[np.ndarray, " n"]] = MappingProxyType({})
-Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], Any]  # the last a csr_array or None
+Instants = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " m"], Any]  # the last a csr_array or a slice
 
 
 class Sampler:
@@ -62,13 +62,13 @@ class Sampler:
 
     def _at_instants(self, x: Float64[np.ndarray, "n k"], instants: Instants) -> Float64[np.ndarray, "m k"]:
         weights = instants[2]
-        if weights is None:
-            return self._values.made(x, instants, x.view)
+        if isinstance(weights, slice):
+            return self._values.made(x, instants, lambda: x[weights])
         coefficients = self._coefficients.changed(x, None, _coefficients)
         return self._values.changed(coefficients, instants, weights.__matmul__)
 
     def _at(self, t_s: Times, taken_s: Float64[np.ndarray, " m"]) -> Instants:
-        """Clock, instants, and matrix from coefficients to values; none at the clock's instants.
+        """Clock, instants, and matrix from coefficients to values, or the rows of the clock's own instants.
 
         Raises:
             DataError: a clock that is not even.
@@ -76,8 +76,10 @@ class Sampler:
         for last in self._instants:
             if _same(last[0], t_s) and _same(last[1], taken_s):
                 return last
-        own = len(t_s) == len(taken_s) and bool(np.abs(t_s - taken_s).max() <= SAME_S)
-        found: Instants = (t_s, taken_s, None if own else _weights(t_s, taken_s))
+        first = int(np.abs(t_s - taken_s[0]).argmin())
+        rows = slice(first, first + len(taken_s))
+        own = len(t_s[rows]) == len(taken_s) and bool(np.abs(t_s[rows] - taken_s).max() <= SAME_S)
+        found: Instants = (t_s, taken_s, rows if own else _weights(t_s, taken_s))
         self._instants = (found, *self._instants[: INSTANTS - 1])
         return found
 
@@ -125,17 +127,13 @@ class Recent:
         return None
 
     def _kept(self, of: object, at: object, value: Columns) -> Columns:
-        self._known = ((of, at, _fixed(value)), *self._known[: RECENT - 1])
+        value.flags.writeable = False
+        self._known = ((of, at, value), *self._known[: RECENT - 1])
         return value
 
 
 def _same(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " m"]) -> bool:
     return a is b or np.array_equal(a, b)
-
-
-def _fixed(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
-    x.flags.writeable = False
-    return x
 
 
 def _weights(t_s: Float64[np.ndarray, " n"], taken_s: Float64[np.ndarray, " m"]) -> Any:

@@ -580,6 +580,16 @@ def test_beyond_the_ends_what_was_there_is_held() -> None:
     close(out.accel, felt.accel[[0, -1]])
 
 
+def test_instants_of_the_motions_own_clock_read_its_rows() -> None:
+    """Also where the clock goes on before and behind them: a spline there would only cost time."""
+    felt = lively()
+    for rows in (slice(0, -1), slice(1, None), slice(3, 40), slice(None)):
+        out = felt.sample(felt.t_s[rows], felt.t_s[rows])
+        assert np.shares_memory(out.gyro, felt.gyro)
+        np.testing.assert_array_equal(out.accel, felt.accel[rows])
+    assert not np.shares_memory(felt.sample(felt.t_s[1:] + 1e-5, felt.t_s[1:]).gyro, felt.gyro)
+
+
 def test_what_is_remembered_never_outlives_a_change() -> None:
     felt, t = lively(), clock() + 0.001
     fresh = replace(felt, gyro=felt.gyro * 2.0, channels={"/x": felt.t_s, "/y": -felt.t_s})

@@ -14,7 +14,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.significance import bic
+from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
@@ -33,6 +33,7 @@ CLOCKS = (*STEADY, WANDER)
 FILTERS = ("low_pass", "mount_resonance", "gyro_delay")
 REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
+Starts = Mapping[str, Sequence[Theta]]
 
 
 # ── what the motion can show ──
@@ -119,19 +120,18 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
     return now
 
 
-def with_steady_clock(
-    logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Mapping[str, Sequence[Theta]]
-) -> Fit:
+def with_steady_clock(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
     """Fit with one or two of offset, skew and jump for a clock that wanders, if as good (BIC)."""
-    others = tuple(entry for entry in now.chosen if entry[0].name != WANDER)
+    others, best = tuple(entry for entry in now.chosen if entry[0].name != WANDER), now
     if len(others) == len(now.chosen):
         return now
-    steady, fits = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys], [now]
+    steady = [effect for effect in named if effect.name in STEADY and effect.key not in now.keys]
     for some in chain(combinations(steady, 1), combinations(steady, 2)):
         on_trend = len(some) > 1 and any(effect.name == "clock_skew" for effect in some)
         at = {"clock_offset": 0, "clock_skew": 0, "clock_jump": -1 if on_trend else 0}
-        fits.append(fit(logs, (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some)), near=now))
-    return min(fits, key=bic)
+        begun = (*others, *((effect, starts[effect.key][at[effect.name]]) for effect in some))
+        best = min(best, fit(logs, begun, near=now, give_up_above=bic(best) - parameter_cost(now, begun)), key=bic)
+    return best
 
 
 def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
@@ -141,10 +141,10 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[
         sizes = _plainer(complex_one.name, theta, poses=poses)
         rest = tuple(entry for entry in now.chosen if entry[0] is not complex_one)
         plainer = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
-        starts = [sizes[effect.name] for effect in plainer]
-        parts = [(with_free(e, free, complex_one.sensors), np.array(at)) for e, (free, at) in zip(plainer, starts, strict=True)]
-        trials = [fit(logs, (*rest, part), near=now) for part in parts]
+        parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
         margin = now.logs[0].pair.settings.search.clearly_better * max(1.0, now.reduced_chi_square)
+        limits = [bic(now) + margin - parameter_cost(now, (*rest, part)) for part in parts]
+        trials = [fit(logs, (*rest, part), near=now, give_up_above=at) for part, at in zip(parts, limits, strict=True)]
         best = min(trials, key=bic, default=now)
         now = best if bic(best) < bic(now) + margin else now
     return now

@@ -51,12 +51,14 @@ def unnamed_count(found: Fit) -> int:
 
 
 def bic(found: Fit) -> float:
-    """Bayesian information criterion (BIC): squares left and the cost of the parameters.
+    """Bayesian information criterion (BIC): squares left and the cost of the parameters."""
+    return found.objective + parameter_cost(found, found.chosen)
 
-    An effect outside the catalogue costs more.
-    """
-    count, penalty = len(parameters_of(found.chosen)), found.logs[0].pair.settings.search.unnamed_penalty
-    return found.objective + count * float(np.log(found.numbers)) + penalty * unnamed_count(found)
+
+def parameter_cost(like: Fit, chosen: Chosen) -> float:
+    """Squares that parameters cost by the BIC on a fit's logs; more outside the catalogue."""
+    search, unnamed = like.logs[0].pair.settings.search, sum(effect.kind != "catalogue" for effect, _ in chosen)
+    return len(parameters_of(chosen)) * float(np.log(like.numbers)) + search.unnamed_penalty * unnamed
 
 
 def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:

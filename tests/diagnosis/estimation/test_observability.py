@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support import planted
 
-from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
     below_model_error,
     beyond_the_band,
     unobservable,
     with_plainer_effects,
+    with_steady_clock,
 )
+from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor import catalogue
+from imutool.sensor.effects import clock_wander
 
 SETTINGS = SearchSettings()
 
@@ -163,6 +168,26 @@ def test_a_clock_that_runs_fast_is_no_jump_in_the_middle_of_the_log() -> None:
     simpler = with_plainer_effects(logs, found, (jump, *others))
     assert simpler.keys == ("clock_skew",)
     assert simpler.chosen[0][1][0] == pytest.approx(2e-4, rel=0.1)
+
+
+def test_a_steady_clock_stands_for_one_that_wanders_and_is_given_up_where_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
+    logs = [planted.weighed(planted.pair(planted.rich(), {"clock_jump": [4.0, 0.01], "clock_skew": [5e-4]}))]
+    clocks = catalogue.diagnosed(["clock_offset", "clock_skew", "clock_jump"])
+    best = found = fit(logs, ((clock_wander.until(15.0), np.array([0.0, 0.02])),))
+    trials: list[tuple[float, Fit]] = []
+
+    def recorded(logs: Sequence[WhitenedLog], begun: Chosen, *, near: Fit, give_up_above: float = np.inf) -> Fit:
+        trials.append((give_up_above, fit(logs, begun, near=near, give_up_above=give_up_above)))
+        return trials[-1][1]
+
+    monkeypatch.setattr("imutool.diagnosis.estimation.observability.fit", recorded)
+    steady = with_steady_clock(logs, found, clocks, {effect.key: logs[0].pair.starts(effect) for effect in clocks})
+    assert steady.keys == ("clock_skew", "clock_jump")
+    assert len(trials) == 6
+    for limit, trial in trials:
+        assert limit == pytest.approx(bic(best) - parameter_cost(found, trial.chosen))
+        best = min(best, trial, key=bic)
+    assert best is steady
 
 
 @pytest.mark.parametrize(
