@@ -67,7 +67,8 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     """Entries for an accelerometer with a time of its own, and for poses on any time.
 
     Of several groups with poses true ones come first. None are taken whose quaternions have no certain order, and none of
-    the IMU's own group without positions: an orientation alone is one that the sensor itself estimates.
+    the IMU's own group without positions: an orientation alone is one that the sensor itself estimates, unless it is named as
+    that of a motion capture.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
     other = time_beside(columns, entries["accel"][0], time, unit)
@@ -93,7 +94,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         ):
             reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
         position = _axes(POSITION, leaves, "xyz")
-        if q and (position or clock[0] != time):
+        if q and (position or is_true or clock[0] != time):
             poses.append((not is_true, clock, q, position))
         elif clock[0] == time:
             continue

@@ -195,7 +195,8 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
     rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) < MOSTLY * width]  # CAL, CAL, ...
     units: list[str] = []
-    if len(rows) > 1 and (
+    axes = bool(rows) and {"x", "y", "z"} <= {text.lower() for text in rows[-1]}
+    if (len(rows) > 1 and not axes) and (
         sum(bool(UNIT_TEXT.fullmatch(text)) for text in rows[-1]) >= width - 1
         or sum(bool(unit_named(text)) for text in rows[-1]) >= width / 2
         or (_repeats(rows[-1]) and len({*rows[-2]} - {""}) >= width - 1)
@@ -205,13 +206,23 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
         return [f"column {number}" for number in range(1, width + 1)], {}
     names = rows[-1]
     if len(rows) > 1 and _repeats(names):
-        group, joint = "", []
-        for above, text in zip(rows[-2], names, strict=True):
-            group = above or group  # it stands above the first of its columns, or above each
-            joint.append(".".join(filter(None, (group, text))))
-        names = names if _repeats(joint) else joint
+        joint, below = _below_groups(rows[-2], names, " " if axes else ".")
+        names, units = (names, units) if _repeats(joint) else (joint, units or below)
     names = _distinct(names)
     return names, dict(zip(names, units, strict=True)) if units else {}
+
+
+def _below_groups(groups: list[str], names: list[str], between: str) -> tuple[list[str], list[str]]:
+    """Names of columns joined to those of their groups, and the units that stand below a group of one column.
+
+    A group's name stands above the first of its columns, or above each.
+    """
+    group, joint, units = "", list[str](), list[str]()
+    for above, text, following in zip(groups, names, [*groups[1:], "end"], strict=True):
+        group = above or group
+        units.append(text if above and following and unit_named(text) else "")
+        joint.append(group if units[-1] else between.join(filter(None, (group, text))))
+    return joint, units
 
 
 def _repeats(texts: list[str]) -> bool:

@@ -80,7 +80,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c.removeprefix("-") for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
-    if poses and table.truth_time and not table.truth_file:
+    if poses and not table.truth_file:
         used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
     scalars, constants = _further(columns, table, used, place)
     log = MessageLog(
@@ -247,11 +247,14 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         else np.zeros((len(q_wxyz), 3))
     )
     if not table.position:
-        remarks.notes.append("the truth has no positions: those of its poses are zero")
+        remarks.notes.append("the truth has no positions: those of its poses are zero, and nothing is compared with them")
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
+    q_wxyz = np.where(q_wxyz.any(axis=1, keepdims=True), q_wxyz, np.nan)  # zeros stand where a pose is missing
     kept = in_order(t_ns, np.concatenate([p, q_wxyz], axis=1), "/ground_truth/pose")
     remarks.notes.extend(kept.notes)
+    if not len(kept.t_ns):
+        return {}
     topic = "/ground_truth/pose" if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
 

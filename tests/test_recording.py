@@ -442,3 +442,12 @@ def test_what_is_no_array_is_refused_by_its_name() -> None:
     with pytest.raises(DataError, match=r"Rows\.values is a list; expected a numpy array of float64"):
         Rows(np.array([0, 1]), [[0.0, 0.0, 0.0]] * 2).check(values=(3,))
     Rows(np.array([0, 1]), None).check(values=(3,))
+
+
+def test_positions_that_are_zero_while_the_body_turns_are_none() -> None:
+    q = unit(np.random.default_rng(0), 5)
+    t_ns, still = np.arange(5), np.tile(q[:1], (5, 1))
+    assert not Poses(t_ns, np.zeros((5, 3)), q).has_positions
+    assert Poses(t_ns, np.ones((5, 3)), q).has_positions
+    assert Poses(t_ns, np.zeros((5, 3)), q, np.ones((5, 3))).has_positions
+    assert Poses(t_ns, np.zeros((5, 3)), still).has_positions, "it rests at the origin"

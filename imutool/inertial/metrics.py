@@ -64,6 +64,7 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
     """Absolute errors of orientation, position and velocity: AOE, APE, velocity RMSE.
 
     The aligned figures are None if positions (of either) do not span a plane, the velocity figure if a velocity is missing.
+    Figures of position and velocity are None for a truth of orientations alone.
 
     Raises:
         DataError: stamps differ, or no row is valid.
@@ -71,7 +72,7 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
     """
     estimate, truth = _scored(estimate, truth, valid)
     q_est, q_true = _unit(estimate), _unit(truth)
-    p_est, p_true = estimate.p_wb, truth.p_wb
+    p_est, p_true, known = estimate.p_wb, truth.p_wb, truth.has_positions
     with np.errstate(over="ignore", invalid="ignore"):  # `_check_finite` checks the figures
         motion = align(p_est, p_true)
         aligned: tuple[float | None, float | None] = (None, None)
@@ -86,9 +87,9 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
         figures = {
             "aoe_deg": _rms(np.degrees(quaternion.angle_between(q_est, q_true))),
             "aoe_aligned_deg": aligned[0],
-            "ape_m": _rms(p_est - p_true),
+            "ape_m": _rms(p_est - p_true) if known else None,
             "ape_aligned_m": aligned[1],
-            "velocity_rmse_m_s": None if v_est is None or v_true is None else _rms(v_est - v_true),
+            "velocity_rmse_m_s": None if v_est is None or v_true is None or not known else _rms(v_est - v_true),
         }
     _check_finite(figures)
     return figures

@@ -84,6 +84,12 @@ class Poses(Columns):
             row = int(np.argmax(error))
             raise DataError(f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}", expected="norm 1")
 
+    @property
+    def has_positions(self) -> bool:
+        """Whether the poses say where the body is; of orientations alone every position is zero while it turns."""
+        turns = len(self) > 0 and bool(np.ptp(self.q_wb_wxyz, axis=0).any())
+        return not turns or bool(self.p_wb.any() or (self.v_w is not None and self.v_w.any()))
+
     def at(self, t_ns: Times, max_gap_s: float | None = None) -> tuple[Poses, Bool[np.ndarray, " n"]]:
         """Poses interpolated at other times, and a mask of the valid ones.
 

@@ -123,6 +123,35 @@ def test_an_orientation_alone_stays_numbers(tmp_path):
     assert set(log.scalars) == {f"/q{a}" for a in "wxyz"}
 
 
+@pytest.mark.parametrize("time", [("Time (s)", ""), ("Time", "s")])
+def test_axes_below_a_sensor_are_of_it_and_orientations_of_a_motion_capture_are_true(tmp_path, time):
+    groups = [time[0], "Vicon Orientation", "", "", "", "IMU Acceleration", "", "", "IMU Gyroscope", "", "", "IMU Magnetometer"]
+    axes = [time[1], *"WXYZ", *"XYZ", *"XYZ", *"XYZ"]
+    missing = np.where(np.arange(COUNT)[:, None] < 7, 0.0, Q_WXYZ)  # the markers are hidden at first
+    rows = np.column_stack([(T_NS - START_NS) * 1e-9, missing, ACCEL, GYRO, RNG.normal(size=(COUNT, 3))]).tolist()
+    path, mapping = tmp_path / "wand.csv", tmp_path / "map.toml"
+    path.write_text("\n".join(";".join(map(str, row)) for row in ([*groups, "", ""], axes, *rows)) + "\n")
+    with pytest.raises(ConfigError) as refused:  # noise shows no unit of a gyro
+        table.read_sequence(table.sequences(path)[0])
+    proposed = str(refused.value.fix).partition("\n\n")[2]
+    mapping.write_text(proposed.replace('gyro_unit = "?"', 'gyro_unit = "rad/s"'))
+    log = table.read_sequence(table.sequences(path)[0], mapping=mapping)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
+    poses = log.poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.q_wb_wxyz, Q_WXYZ[7:], atol=1e-15)
+    assert not poses.has_positions
+    assert set(log.scalars) == {f"/IMU_Magnetometer_{a}" for a in "XYZ"}
+
+
+def test_a_motion_capture_without_any_pose_is_no_truth(tmp_path):
+    names = ["t_ns", *IMU_NAMES, *(f"vicon_orientation_{a}" for a in "wxyz")]
+    path = written(tmp_path / "rest.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *np.zeros((4, COUNT))])
+    log = table.read_sequence(table.sequences(path)[0])
+    assert log.poses == {}
+    assert f"/ground_truth/pose: {COUNT} samples that are not finite are left out" in log.remarks.notes
+
+
 NAMES_OF_AXES = [
     [*(f"{a} Gyro [x8005]" for a in "XYZ"), *(f"{a} Accel [x8004]" for a in "XYZ")],
     ["gyro_roll", "gyro_pitch", "gyro_yaw", *(f"accel_{a}" for a in "xyz")],
