@@ -129,7 +129,8 @@ def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str
     if not len(found.orientation_rad):
         return {"drift_orientation_deg": None, "drift_velocity_m_s": None, "drift_window_s": DRIFT_S}
     rms = [float(np.sqrt(np.mean(errors**2))) for errors in (found.orientation_rad, found.velocity_m_s)]
-    return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": rms[1], "drift_window_s": DRIFT_S}
+    velocity = rms[1] if truth.has_positions else None
+    return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": velocity, "drift_window_s": DRIFT_S}
 
 
 def _over(imu: Imu, true: Poses) -> Imu:

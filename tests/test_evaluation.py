@@ -67,6 +67,21 @@ FIELDS = {  # contracts.md, JSON of evaluate
 }
 
 
+def test_a_truth_of_orientations_alone_scores_the_orientation_alone(recording: Recording, tmp_path: Path) -> None:
+    turned = {topic: Poses(p.t_ns, np.zeros_like(p.p_wb), p.q_wb_wxyz) for topic, p in recording.truths.items()}
+    write(recording, tmp_path / "whole.mcap")
+    write(replace(recording, truths=turned), tmp_path / "turned.mcap")
+    whole, alone = (evaluate(tmp_path / f"{name}.mcap", models=["static"], init="truth") for name in ("whole", "turned"))
+    for one, other in zip(whole, alone, strict=True):
+        assert other["aoe_deg"] == pytest.approx(one["aoe_deg"], rel=1e-9)
+        assert other["drift_orientation_deg"] == pytest.approx(one["drift_orientation_deg"], rel=1e-9)
+        for name in ("ape_m", "ape_aligned_m", "aoe_aligned_deg", "velocity_rmse_m_s", "drift_velocity_m_s"):
+            assert (one[name] is None, other[name]) == (False, None), name
+        assert set(other["rpe_m"].values()) == {None}
+    np.testing.assert_allclose(alone[1]["gyro_bias"], whole[1]["gyro_bias"], rtol=1e-9)
+    assert alone[1]["accel_bias"] == [0.0, 0.0, 0.0]
+
+
 # ── real recordings ──────────────────────────────────────────────────────────────────────────────────────────────────
 
 

@@ -28,6 +28,7 @@ from imutool.recording import Recording, seconds
 
 TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 LEAST_TRUTH_S = 1.0
+NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses without positions
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room (docs/diagnosis.md)
 ITERATIONS = 4
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
@@ -62,6 +63,8 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - bias_over(model, piece, start.rest)
     offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows])
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
+    if not truth.has_positions:
+        offset[3:], variance[3:] = 0.0, NOT_SEEN**2
     start = replace(start, std=supported_std(start.std, start.least_std, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     how = f"truth over {length_s:.1f} s{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"

@@ -57,7 +57,7 @@ class Score(Section, frozen=True, kw_only=True):
     duration_s: float
     aoe_deg: float
     aoe_aligned_deg: float | None
-    ape_m: float
+    ape_m: float | None
     ape_aligned_m: float | None
     velocity_rmse_m_s: float | None
     roe_deg: dict[str, float | None]

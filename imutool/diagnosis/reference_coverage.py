@@ -130,7 +130,9 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
         stretch = next(part for part in motion.stretches if part.start_s <= ideal.t_s[0] <= part.end_s)
         started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
         since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
-        yield with_truth(chosen, since, started_ns, _band_hz(stretch, settings.reference), settings)
+        pair = with_truth(chosen, since, started_ns, _band_hz(stretch, settings.reference), settings)
+        of_gyro = np.tile(np.arange(6) < 3, (len(pair.stamp_s), 1))  # without positions nothing is known of the accelerometer
+        yield pair if chosen.truth.has_positions else replace(pair, known=of_gyro)
 
 
 def _shared_stretches(real: Recording, sim: Recording) -> list[tuple[int, int, Stretch]]:
@@ -176,6 +178,7 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
         DataError: no axis is left.
     """
     known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real))
+    known &= True if pair.known is None else pair.known
     if known.all():
         return pair
     reduced = replace(pair, known=known)

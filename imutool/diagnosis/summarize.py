@@ -279,6 +279,8 @@ def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
     for pair in pairs:
         if axes := unusable_axes(pair):
             yield f"{pair.name}: {'; '.join(axes)}. These samples are no measurement; the diagnosis uses all others"
+        if not pair.exact and pair.truth is not None and not pair.truth.has_positions:
+            yield f"{pair.name}: the true poses have no positions, so the accelerometer was not compared with them"
         if pair.aligned_s:
             yield (
                 f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "

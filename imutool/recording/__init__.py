@@ -86,7 +86,7 @@ class Poses(Columns):
 
     @property
     def has_positions(self) -> bool:
-        """Whether the poses say where the body is; of orientations alone every position is zero while it turns."""
+        """Whether positions are known; of orientations alone all are zero while the body turns."""
         turns = len(self) > 0 and bool(np.ptp(self.q_wb_wxyz, axis=0).any())
         return not turns or bool(self.p_wb.any() or (self.v_w is not None and self.v_w.any()))
 

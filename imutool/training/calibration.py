@@ -227,9 +227,10 @@ class PhysicsFirst:
         model = hybrid.Network(msgspec.structs.replace(config, temperature=msgspec.UNSET), pool.rate_hz).double()
         signals, loads = loaded_signals(recordings, pool, scale, config.effects("gyro"), settings.sensors)
         gyro, fits = pool.gyro, {}
-        for sensor in SENSORS:
+        model.take("accel", (), torch.zeros(0), torch.zeros(0, 0))  # until it is fitted
+        for sensor in pool.sensors:
             report(note(f"looking for effects on the {sensor}"))
-            chosen = calibrate(pool, sensor, gyro, model.config.effects(sensor), "train", signals, None, settings.sensors)
+            chosen = calibrate(pool, sensor, gyro, config.effects(sensor), "train", signals, None, settings.sensors)
             own_prior = chosen.problem.own_prior
             whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals, own_prior, settings.sensors)
             of_choice = ("gains", "forms", "problem", "named")

@@ -128,7 +128,7 @@ class Training:
 
         Without `statistics` they are left to `store_statistics`, for a model that may not be kept.
         """
-        for sensor in SENSORS:
+        for sensor in self.pool.sensors:
             if sensor in self.done:
                 continue
             if self.stage is None:

@@ -38,7 +38,7 @@ from imutool.recording import Imu, Poses, Recording, nanoseconds
 from imutool.training.calibration import LINEAR, Calibration, effects_beyond_chance, parameter_columns
 from imutool.training.segments import Pool
 from imutool.training.statistics import speed_of, turn_on_prior
-from imutool.units import SENSORS, Sensor
+from imutool.units import Sensor
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +124,7 @@ def compare(
     contradictions = contradicting(pool, fits)
     for contradiction in contradictions:
         logger.warning("%s", contradiction)
-    return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in SENSORS}, contradictions)
+    return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in fits}, contradictions)
 
 
 def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contradiction, ...]:
@@ -227,9 +227,9 @@ def left_out_model(
         network.take_temperature(scale.channel, temperature_tensors(scale, [], {}))
     for name, value in trained.named_buffers(recurse=False):
         getattr(network, name).copy_(value)
-    per_log = len(fits["gyro"].problem.own) // len(pool.names)
-    spans = [span for span in pool.spans_ns for _ in range(per_log)]
-    turn_on = turn_on_prior(np.concatenate(rest, axis=1), spans[:index] + spans[index + 1 :])
+    spans = [span for span in pool.spans_ns for _ in range(len(fits["gyro"].problem.own) // len(pool.names))]
+    unknown = [np.full_like(rest[0], np.nan)] * (2 - len(rest))
+    turn_on = turn_on_prior(np.concatenate([*rest, *unknown], axis=1), spans[:index] + spans[index + 1 :])
     network.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     network.prior_std.copy_(torch.from_numpy(turn_on.std))
     model = network.frozen()
@@ -296,5 +296,5 @@ def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]
 def _score(log: Recording, model: str, start: str, imu: Imu) -> Score:
     path, truth, valid = along_truth(imu, log.truth, log.name)
     speeds = drift(path, truth, valid, DRIFT_S).velocity_m_s
-    drift_m_s = float(np.sqrt(np.mean(speeds**2))) if len(speeds) else None
+    drift_m_s = float(np.sqrt(np.mean(speeds**2))) if len(speeds) and truth.has_positions else None
     return Score(log.name, model, start, float(metrics.absolute(path, truth, valid)["aoe_deg"] or 0.0), drift_m_s)

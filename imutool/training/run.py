@@ -92,6 +92,9 @@ def train(
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     pool = Pool.of(recordings)
     check_trainable(recordings, pool)
+    if "accel" not in pool.sensors:
+        names = ", ".join(recording.name for recording in recordings if not recording.truth.has_positions)
+        logger.warning("the true poses of %s have no positions: the gyro alone is trained", names)
     descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
     trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():
@@ -222,7 +225,7 @@ def settings_from_physics(physics: Path) -> tuple[list[str], tuple[str, ...]]:
 
 def helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
     """Whether a descent lowers one held-out error enough and does not raise the other."""
-    gains = [1 - after[sensor] / before[sensor] for sensor in SENSORS]
+    gains = [1 - after[sensor] / before[sensor] for sensor in before]
     return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN
 
 
@@ -267,7 +270,7 @@ def _shared(recordings: Sequence[Recording], key: str) -> str | None:
 
 
 def _held_out(training: Training) -> dict[str, Any]:
-    return {sensor: {"error": training.done[sensor], "unit": UNITS[sensor]} for sensor in SENSORS}
+    return {sensor: {"error": error, "unit": UNITS[sensor]} for sensor, error in training.done.items()}
 
 
 def _turn_on(training: Training) -> dict[str, Any]:

@@ -73,6 +73,7 @@ class Pool:
     late: Bool[Tensor, " n"]  # samples are missing just before this one
     spans_ns: tuple[tuple[int, int], ...]  # stamps of the first and last sample of each log
     floors: Float[Tensor, "logs 2"]  # least residual of each log's windows: gyro (rad), accel (m/s)
+    sensors: tuple[Sensor, ...] = SENSORS  # those that the truth shows: the gyro alone where a log's poses have no positions
 
     @classmethod
     def of(
@@ -99,6 +100,7 @@ class Pool:
             rate_hz=float(np.median(rates)),
             log=log,
             spans_ns=tuple(pool.spans_ns[0] for pool in pools),
+            sensors=min((pool.sensors for pool in pools), key=len),
             **columns,
         )
 
@@ -119,6 +121,7 @@ class Pool:
             names=(recording.name,),
             rate_hz=1.0 / imu.period_s,
             spans_ns=((int(imu.t_ns[0]), int(imu.t_ns[-1])),),
+            sensors=SENSORS if both.truth.has_positions else sensors_up_to("gyro"),
             t=torch.tensor(t, dtype=dtype, device=device),
             log=torch.zeros(len(t), dtype=torch.long, device=device),
             floors=torch.tensor([floors.of(recording.kind_of(next(iter(recording.truths))))], dtype=dtype, device=device),
@@ -227,7 +230,7 @@ def _without_motion(model: BiasNetwork, pool: Pool) -> Pool:
     return replace(pool, gyro=left[:, :3].clone(), accel=left[:, 3:].clone())
 
 
-def sensors_up_to(sensor: Sensor) -> Sequence[Sensor]:
+def sensors_up_to(sensor: Sensor) -> tuple[Sensor, ...]:
     """A sensor and those trained before it.
 
     The accelerometer's errors depend on the gyro, not the other way round.

@@ -77,19 +77,19 @@ def store_statistics(
     """
     scored, left = corrected(model, pool)
     rest, std = rest.clone(), torch.zeros_like(rest)
-    for sensor in SENSORS:
+    shown = np.repeat([sensor in pool.sensors for sensor in SENSORS], 3)
+    model.noise_std.copy_(torch.from_numpy(white_noise(torch.cat([pool.gyro, pool.accel], dim=1).cpu().numpy())))
+    for sensor in pool.sensors:
         columns = COLUMNS[sensor]
         solution = closed_form.solve(scored, sensor, left, rest, window_s[sensor], matrix=False, part="all")
         rest[:, columns], std[:, columns] = solution.rest, solution.std
-        u = pool.gyro if sensor == "gyro" else pool.accel
-        model.noise_std[columns] = torch.from_numpy(white_noise(u.cpu().numpy())).to(rest)
     biases = rest.cpu().double().numpy()
-    turn_on = turn_on_prior(biases, pool.spans_ns)
+    turn_on = turn_on_prior(np.where(shown, biases, np.nan), pool.spans_ns)
     model.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     model.prior_std.copy_(torch.from_numpy(turn_on.std))
     model.truth_std.copy_(_start_spread(scored, left, rest))
     model.walk_std.copy_(_walk(scored, left, rest, window_s))
-    at_rest = rest_differences(scored.frozen(), _samples(left), biases)
+    at_rest = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases)]
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
     return turn_on
 
@@ -121,8 +121,10 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
     this is the least variance, of a sensor that repeats its bias as well as between the logs of one session.
     Within a session the variance comes from n logs, as many degrees of freedom too few to be known: the next log follows
     Student's t, whose variance is n / (n - 2) times larger, at most `MOST_TAIL`. Where most logs that follow each other closely
-    differ all the same, the next log is of a session of its own, and no session is returned.
+    differ all the same, the next log is of a session of its own, and no session is returned. A bias that no log shows is NaN:
+    zero is expected of it, with `TURN_ON_STD`.
     """
+    known, rest = np.isfinite(rest).all(axis=0), np.nan_to_num(rest)
     groups, broken = _sessions(rest, spans_ns)
     means = np.stack([rest[group].mean(axis=0) for group in groups])
     usual, turn_on = (np.repeat([size[sensor] for sensor in SENSORS], 3) for size in (USUAL_STD, TURN_ON_STD))
@@ -132,6 +134,7 @@ def turn_on_prior(rest: Float64[np.ndarray, "logs 6"], spans_ns: Sequence[tuple[
     mean, count = means.mean(axis=0), len(groups)
     apart = ((means - mean) ** 2).sum(axis=0)
     most, least = ((apart + one_more) / count * (1 + 1 / count) + within for one_more in (turn_on**2, 0.0))
+    most, least, within = (np.where(known, variance, turn_on**2) for variance in (most, least, within))
     sessions = [
         Session(
             min(spans_ns[log][0] for log in group),
@@ -186,12 +189,12 @@ def _walk(
     names = tuple(f"{name} {half}" for name in pool.names for half in ("early", "late"))
     halves = replace(pool, log=2 * pool.log + later, names=names, floors=pool.floors.repeat_interleave(2, dim=0))
     both, out = rest.repeat_interleave(2, dim=0), []
-    for sensor in SENSORS:
+    for sensor in pool.sensors:
         columns = COLUMNS[sensor]
         both[:, columns] = closed_form.solve(model, sensor, halves, both, window_s[sensor], matrix=False, part="all").rest
         change = both[1::2, columns] - both[::2, columns]
         out.append((change.square() * (3.0 * pool.rate_hz / length)[:, None]).mean(0).sqrt())
-    return torch.cat(out)
+    return torch.cat([*out, *[rest.new_zeros(3)] * (len(SENSORS) - len(out))])
 
 
 @torch.no_grad()
@@ -216,11 +219,13 @@ def _start_spread(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"])
 
     starts = [(log, first) for log, rows in enumerate(rows_of) for first in rows[:: max(1, n // 2)].tolist()]
     off = [bias for bias in of_each(missed, starts) if bias is not None]
+    unknown = torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
     if len(off) < FEWEST_STARTS:
-        return torch.tensor([TURN_ON_STD["gyro"]] * 3 + [TURN_ON_STD["accel"]] * 3).to(rest)
+        return unknown
     floor = torch.tensor([FLOOR_STD["gyro"]] * 3 + [FLOOR_STD["accel"]] * 3)
     spread = MAD_TO_STD * np.median(np.abs(off), axis=0)
-    return torch.maximum(torch.from_numpy(spread), floor).to(rest)
+    shown = torch.tensor([sensor in pool.sensors for sensor in SENSORS]).repeat_interleave(3).to(rest.device)
+    return torch.where(shown, torch.maximum(torch.from_numpy(spread), floor).to(rest), unknown)
 
 
 def _samples(pool: Pool) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from imutool.diagnosis.diagnose import diagnose
-from imutool.diagnosis.reference_coverage import align
+from imutool.diagnosis.reference_coverage import align, align_all
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
@@ -43,6 +43,13 @@ def test_it_is_trusted_as_far_as_the_poses_are() -> None:
     assert alone.band_hz is not None
     assert band_hz(real, along(real)) == pytest.approx(alone.band_hz)
     assert band_hz(real, along(replace(real, truths={"/vicon": real.truth}))) == pytest.approx(alone.band_hz)
+
+
+def test_orientations_alone_say_nothing_of_the_accelerometer() -> None:
+    real = made(MEASURED)
+    turned = replace(real.truth, p_wb=np.zeros_like(real.truth.p_wb), v_w=None)
+    pairs, _ = align_all([replace(real, truths={TRUTH_TOPIC: turned})], None, None, DiagnoseSettings())
+    assert [pair.axes.tolist() for pair in pairs] == [[True] * 3 + [False] * 3]
 
 
 def test_a_bad_stretch_of_the_poses_says_nothing_of_the_others() -> None:

@@ -18,14 +18,16 @@ from imutool.bias.io import load
 from imutool.config import build
 from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
-from imutool.recording import Imu, Recording
+from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import flight
 from imutool.training.calibration import config_of
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objectives.objective import AdamW, WindowEndObjective
 from imutool.training.run import checkpoint_path, helps, settings_from_physics, train
 from imutool.training.settings import settings_of
+from imutool.training.statistics import TURN_ON_STD
 from imutool.units import Sensor
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -80,6 +82,30 @@ def test_the_card_holds_everything_needed_to_repeat_the_training(logs: list[Path
     assert card["torch"] == torch.__version__
     assert {(sensor, held["unit"]) for sensor, held in card["held_out"].items()} == {("gyro", "rad"), ("accel", "m/s")}
     assert all(held["error"] > 0 for held in card["held_out"].values())
+
+
+@pytest.mark.parametrize("method", ["hybrid", "neural_ode", "linear"])
+def test_orientations_alone_train_the_gyro_and_leave_the_accelerometer_as_it_is(
+    logs: list[Path], tmp_path: Path, caplog: pytest.LogCaptureFixture, method: str
+) -> None:
+    turned = []
+    for log in logs:
+        recording = read(log)
+        truths = {topic: Poses(p.t_ns, np.zeros_like(p.p_wb), p.q_wb_wxyz) for topic, p in recording.truths.items()}
+        turned.append(tmp_path / log.name)
+        write(Recording(recording.name, recording.imu, truths, metadata=recording.metadata), turned[-1])
+    tiny = TINY.model if method == "neural_ode" else {}
+    settings = msgspec.structs.replace(TINY, model=tiny, compare=method != "linear")  # two logs choose no matrix
+    model = train(turned, tmp_path / "m.safetensors", method=method, settings=settings)
+    assert "flight_1, flight_2 have no positions: the gyro alone is trained" in caplog.text
+    assert set(model.card["held_out"]) == {"gyro"}
+    assert model.prior_mean[:3].all()
+    assert model.prior_mean[3:].tolist() == [0.0] * 3
+    assert model.prior_std[3:].tolist() == pytest.approx([TURN_ON_STD["accel"]] * 3)
+    imu = read(logs[0]).imu
+    moved = model.stream(np.zeros(6))(seconds(imu.t_ns, int(imu.t_ns[0])), imu.gyro, imu.accel)
+    assert moved[:, :3].any()
+    assert not moved[:, 3:].any()
 
 
 def test_the_same_command_writes_the_same_bytes(logs: list[Path], expected: bytes, tmp_path: Path) -> None:

@@ -33,8 +33,8 @@ class Stretch(NamedTuple):
 
 
 def held_out_stretches(trace: Traces) -> Iterator[Stretch]:
-    """Unseen stretches without gaps, at most ten seconds long; none without known poses."""
-    if trace.truth is None or trace.ideal is None:
+    """Unseen stretches without gaps, at most ten seconds long; none without known positions."""
+    if trace.truth is None or trace.ideal is None or not trace.truth.has_positions:
         return
     rows = np.flatnonzero(held_out_mask(trace) & np.isfinite(trace.ideal).all(axis=1))
     breaks = np.flatnonzero(np.diff(trace.t_s[rows]) > GAP_PERIODS / rate_hz(trace)) + 1

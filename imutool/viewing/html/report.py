@@ -230,6 +230,8 @@ def _windows(data: RunData) -> Iterator[str]:
             windows = [next((w for w in trace.windows if w.length_s == length), None) for trace in runs]
             values = [None if window is None else float(getattr(window, name)) for window in windows]
             values = [value if value is not None and np.isfinite(value) else None for value in values]
+            if all(value is None for value in values):
+                continue
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
             yield f"<tr><td>{words}</td>{_cells(values, index_of_best(values, name))}</tr>"
     yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'

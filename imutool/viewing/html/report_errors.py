@@ -41,10 +41,9 @@ def error_curves(data: RunData) -> Picture | None:
         "vertical": [_of(trace).vertical_m for trace in scored],
     }
     times = [data.elapsed_s(_of(trace).t_ns) for trace in scored]
-    panels = (
-        _panel(data, scored, times, turned, "Orientation error", "°"),
-        _panel(data, scored, times, moved, "Position error", "m"),
-    )
+    panels: tuple[Panel, ...] = (_panel(data, scored, times, turned, "Orientation error", "°"),)
+    if _positions_known(data):
+        panels += (_panel(data, scored, times, moved, "Position error", "m"),)
     return Picture("errors", "Errors over time", f"Integrated from the true start, {alignment_text(data)}.", panels)
 
 
@@ -60,11 +59,14 @@ def drift_curves(data: RunData) -> Picture | None:
         curves = [_largest(drift, *rows) for drift, rows in zip(drifts, curves, strict=True)]
         caption += " Each stretch shows its largest drift."
     times, turned, moved = (list(rows) for rows in zip(*curves, strict=True))
-    panels = (
-        _panel(data, scored, times, {"total": turned}, "Orientation drift", "°"),
-        _panel(data, scored, times, {"total": moved}, "Position drift", "m"),
-    )
+    panels: tuple[Panel, ...] = (_panel(data, scored, times, {"total": turned}, "Orientation drift", "°"),)
+    if _positions_known(data):
+        panels += (_panel(data, scored, times, {"total": moved}, "Position drift", "m"),)
     return Picture("drift", "Drift since the last reset", caption, panels)
+
+
+def _positions_known(data: RunData) -> bool:
+    return data.truth is None or data.truth.has_positions
 
 
 def _resets(drift: Drift) -> Int64[np.ndarray, " k"]:

@@ -32,8 +32,13 @@ def color_of(data: RunData, trace: Trace) -> str:
     return BEFORE if trace.is_raw else MODELS[data.models().index(trace) % len(MODELS)]
 
 
-def paths(data: RunData) -> Picture:
-    """Truth and runs from above and from the side, with paths that leave the picture named."""
+def paths(data: RunData) -> Picture | None:
+    """Truth and runs from above and from the side; None for a truth without positions.
+
+    Paths that leave the picture are named.
+    """
+    if data.truth is not None and not data.truth.has_positions:
+        return None
     shown, far = _near(data)
     views = [((0, 1), "From above", shown), ((_long_side(_box(data, shown)), 2), "From the side", shown)]
     if models := [trace for trace in far if not trace.is_raw]:
@@ -57,7 +62,7 @@ def paths(data: RunData) -> Picture:
 def error_map(data: RunData) -> Picture | None:
     """Path of the best run, coloured by its position and orientation error; None without truth."""
     trace = best_run(data)
-    if trace is None or trace.errors is None or data.truth is None:
+    if trace is None or trace.errors is None or data.truth is None or not data.truth.has_positions:
         return None
     fits = trace in _near(data)[0]
     points = trace.path.p_wb if fits else data.truth.at(trace.path.t_ns)[0].p_wb

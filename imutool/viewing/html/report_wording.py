@@ -112,9 +112,11 @@ def start_text(trace: Trace) -> str:
 
 
 def comparison(chosen: Trace, before: Trace) -> str:
-    """Comparison of a model with raw: orientation first, then position."""
+    """Comparison of a model with raw: orientation first, then position, if the truth has it."""
     parts: list[tuple[str, str]] = []
     for figure, what, unit in (("aoe_deg", "orientation", "°"), ("ape_m", "position", "m")):
+        if before.figures[figure] is None or chosen.figures[figure] is None:
+            continue
         old, new = float(before.figures[figure]), float(chosen.figures[figure])
         span = f"the {what} error from {format_quantity(old, unit)} to {format_quantity(new, unit)}"
         if abs(new - old) <= SAME_WITHIN * max(old, new):
@@ -125,8 +127,9 @@ def comparison(chosen: Trace, before: Trace) -> str:
             parts.append(("cuts", f"{span} ({ratio_text(old, new)})"))
         else:
             parts.append(("raises", f"{span} ({ratio_text(new, old)})"))
-    (does, first), (also, second) = parts
-    return f"{run_name(chosen)} {does} {first} and {second if also == does else f'{also} {second}'}"
+    (does, first), *others = parts
+    rest = "".join(f" and {second if also == does else f'{also} {second}'}" for also, second in others)
+    return f"{run_name(chosen)} {does} {first}{rest}"
 
 
 def ratio_text(large: float, small: float) -> str:
@@ -158,7 +161,8 @@ def key_numbers(data: RunData) -> list[tuple[str, str]]:
     chosen, before = best_run(data), raw_run(data)
     for trace in dict.fromkeys(trace for trace in (before, chosen) if trace is not None and trace.figures):
         numbers.append((format_quantity(float(trace.figures["aoe_deg"]), "°"), f"orientation error, {run_name(trace)}"))
-        numbers.append((format_quantity(float(trace.figures["ape_m"]), "m"), f"position error, {run_name(trace)}"))
+        if trace.figures["ape_m"] is not None:
+            numbers.append((format_quantity(float(trace.figures["ape_m"]), "m"), f"position error, {run_name(trace)}"))
     if chosen is not None and (window := _window(chosen, 10.0)) is not None:
         numbers.append((format_quantity(window, "°"), f"drift in 10 s, {run_name(chosen)}"))
     if (count := sum(event.kind != "worst" for event in data.events)) > 0:
@@ -189,7 +193,8 @@ def _window(trace: Trace, length_s: float) -> float | None:
 
 
 def _errors(trace: Trace) -> str:
-    return f"{format_quantity(float(trace.figures['aoe_deg']), '°')} and {format_quantity(float(trace.figures['ape_m']), 'm')}"
+    sizes = [(trace.figures[name], unit) for name, unit in (("aoe_deg", "°"), ("ape_m", "m"))]
+    return " and ".join(format_quantity(float(size), unit) for size, unit in sizes if size is not None)
 
 
 def _without_truth(data: RunData) -> str:

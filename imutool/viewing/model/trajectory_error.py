@@ -35,7 +35,7 @@ def alignment(name: str) -> Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Errors of an estimate at its own stamps; NaN where the truth is unknown."""
+    """Errors of an estimate at its own stamps; NaN where the truth does not know them."""
 
     t_ns: Times
     orientation_deg: Float64[np.ndarray, "n 3"]  # Log(R_true^T R_estimated), in the true body frame
@@ -93,7 +93,10 @@ def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Erro
     hole = np.where(valid, 0.0, np.nan)[:, None]
     turned = np.rad2deg(quaternion.log(quaternion.multiply(back, q)))
     roll_pitch_yaw = np.rad2deg(quaternion.roll_pitch_yaw(quaternion.multiply(q, back)))
-    return Errors(estimate.t_ns, turned + hole, roll_pitch_yaw + hole, estimate.p_wb - truth.p_wb + hole)
+    apart = estimate.p_wb - truth.p_wb + hole
+    return Errors(
+        estimate.t_ns, turned + hole, roll_pitch_yaw + hole, apart if truth.has_positions else np.full_like(apart, np.nan)
+    )
 
 
 class RigidMotion(NamedTuple):
@@ -163,6 +166,8 @@ def drift_since_reset(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], 
     since_s[known] = (path.t_ns[known] - path.t_ns[last_reset]) * 1e-9
     for column, values in zip(errors, drifted._replace(orientation_rad=np.rad2deg(drifted.orientation_rad)), strict=True):
         column[known] = values
+    if not truth.has_positions:
+        errors[1:] = [np.full(len(path), np.nan)] * 2
     return Drift(reset_s, path.t_ns, since_s, *errors)
 
 
@@ -172,8 +177,9 @@ def windows(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> tuple[W
     for length_s in WINDOWS_S:
         ends = drift(path, truth, valid, length_s)
         if count := len(ends.position_m):
-            turned_deg = float(np.rad2deg(_rms(ends.orientation_rad)))
-            rows.append(Window(length_s, count, turned_deg, _rms(ends.velocity_m_s), _rms(ends.position_m)))
+            turned_deg, known = float(np.rad2deg(_rms(ends.orientation_rad))), truth.has_positions
+            moved = [_rms(values) if known else np.nan for values in (ends.velocity_m_s, ends.position_m)]
+            rows.append(Window(length_s, count, turned_deg, *moved))
     return tuple(rows)
 
 

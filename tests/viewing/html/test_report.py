@@ -69,6 +69,15 @@ def page(seen: RunData) -> str:
     return report.page([seen])
 
 
+def test_a_truth_of_orientations_alone_is_compared_in_orientation_alone(flown: Recording) -> None:
+    turned = {topic: Poses(p.t_ns, np.zeros_like(p.p_wb), p.q_wb_wxyz) for topic, p in flown.truths.items()}
+    data = build(replace(flown, truths=turned), [Run.raw(flown.imu), subtract(flown, "half", np.full(6, 1e-3))])
+    written = report.page([data])
+    assert "Orientation error" in written
+    for words in ("Position error", "position error", "Position after", "Velocity after", "Position drift", 'id="log1-paths"'):
+        assert words not in written
+
+
 def panel(data: RunData, make: Callable[[RunData], drawing.Picture | None], which: int = 0) -> str:
     """One drawing of a picture that there is."""
     picture = make(data)
