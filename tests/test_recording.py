@@ -451,3 +451,5 @@ def test_positions_that_are_zero_while_the_body_turns_are_none() -> None:
     assert Poses(t_ns, np.ones((5, 3)), q).has_positions
     assert Poses(t_ns, np.zeros((5, 3)), q, np.ones((5, 3))).has_positions
     assert Poses(t_ns, np.zeros((5, 3)), still).has_positions, "it rests at the origin"
+    begins = np.array([[np.cos(half), np.sin(half), 0.0, 0.0] for half in np.linspace(0.0, 0.04, 5)])
+    assert Poses(t_ns, np.zeros((5, 3)), begins).has_positions, "it is about to leave the origin"

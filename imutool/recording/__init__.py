@@ -21,6 +21,7 @@ from imutool.recording.columns import Columns, clock_jumps
 
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
+TURNED = 0.1  # change of a quaternion's component: a body that turns so far moves as well
 GAP_FACTOR = 4.0  # length of a gap in the truth, in median periods
 MIN_GAP_S = 0.08  # least length of a gap: a 20 Hz truth, and the 70 ms jitter of FETCH, have no gap
 LEAST_PERIOD_S = 20e-6  # an IMU has at most 32 kHz; stamps in microseconds taken for nanoseconds are closer from 50 Hz on
@@ -87,7 +88,7 @@ class Poses(Columns):
     @property
     def has_positions(self) -> bool:
         """Whether positions are known; of orientations alone all are zero while the body turns."""
-        turns = len(self) > 0 and bool(np.ptp(self.q_wb_wxyz, axis=0).any())
+        turns = len(self) > 0 and bool((np.ptp(self.q_wb_wxyz, axis=0) > TURNED).any())
         return not turns or bool(self.p_wb.any() or (self.v_w is not None and self.v_w.any()))
 
     def at(self, t_ns: Times, max_gap_s: float | None = None) -> tuple[Poses, Bool[np.ndarray, " n"]]:
