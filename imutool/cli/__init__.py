@@ -64,10 +64,10 @@ def main() -> None:
 
 
 def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:
-    """Repeat a Ctrl-C that came where nothing can be raised, as while an object is removed."""
-    if unraisable.exc_type is KeyboardInterrupt:
+    """Repeat a Ctrl-C or a SIGTERM that came where nothing can be raised, as while an object is removed."""
+    if number := {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}.get(unraisable.exc_type):
         from threading import Timer
 
-        Timer(REPEAT_S, signal.raise_signal, [signal.SIGINT]).start()
+        Timer(REPEAT_S, signal.raise_signal, [number]).start()
     elif getattr(unraisable.object, "__qualname__", "") != HALF_MADE:
         sys.__unraisablehook__(unraisable)

@@ -120,7 +120,9 @@ class Command(TyperCommand):
             self._check(ctx.params)
             return super().invoke(ctx)
         except ImutoolError as error:
-            raise error_with_flags(error, flag_of) from error
+            values = ctx.params.values()
+            typed = {str(word) for value in values for word in (value if isinstance(value, (list, tuple)) else (value,))}
+            raise error_with_flags(error, flag_of, typed) from error
         except KeyboardInterrupt as interrupt:
             raise KeyboardInterrupt(with_flags(str(interrupt), flag_of)) from interrupt
 

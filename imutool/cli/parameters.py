@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
@@ -100,10 +100,10 @@ def _shown(name: str, value: str | None, flag_of: Mapping[str, str]) -> str | No
     return flag if flag is None or value in {None, "True"} else f"{flag} {str(value).strip(chr(34))}"
 
 
-def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str]) -> ImutoolError:
-    """Error with flags for parameters."""
+def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Collection[str] = ()) -> ImutoolError:
+    """Error with flags for parameters; a path that was typed stays, also if it reads like one."""
     where = error.where
-    if where is not None:
+    if where is not None and where not in typed:
         parts = [PLACE.fullmatch(part) for part in where.split(", ")]
         shown = [None if part is None else _shown(part[1], part[2], flag_of) for part in parts]
         if None not in shown:

@@ -56,7 +56,8 @@ def align_all(
         if covered < settings.reference.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
             remarks.append(
-                f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s; the rest was not looked at"
+                f"{recording.name}: {what} {covered:.0f} of {recording.imu.duration_s:.0f} s "
+                f"in stretches of {settings.alignment.least_s:g} s or more without a hole; the rest was not looked at"
             )
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]

@@ -99,7 +99,7 @@ def summarize(
         bias=selection.whole.bias,
         not_identifiable=_not_identifiable(selection, idle, hidden),
         unexplained=unexplained,
-        remarks=(*_remarks(pairs), *_resting(pairs, hidden), *remarks(all_findings, sim_findings)),
+        remarks=(*dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *remarks(all_findings, sim_findings)),
         closer=gains(logs, before, after),
         traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
         start_ns=pairs[0].log_start_ns + round(1e9 * pairs[0].aligned_s),

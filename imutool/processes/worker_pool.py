@@ -34,6 +34,7 @@ from imutool.errors import ConfigError
 from imutool.mcap_io.storage.system import KILLED, inherited, opened
 
 POLL_S = 0.5
+REPEAT_S = 0.01  # after which an end that was swallowed is tried again
 GRACE_S = 1.2  # for a worker to remove what it has half written
 STARTS = 3  # deaths of workers one after the other before they are ready
 TERMINATED = 143
@@ -280,4 +281,14 @@ def _listen(connection: Connection, items: queue.SimpleQueue[Any]) -> None:
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     """End this process once; what it has half written is removed on the way."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.unraisablehook = _end_again
     sys.exit(TERMINATED)
+
+
+def _end_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Repeat an end that came where nothing can be raised, as while an object is removed."""
+    if unraisable.exc_type is SystemExit:
+        signal.signal(signal.SIGTERM, _end)
+        threading.Timer(REPEAT_S, signal.raise_signal, [signal.SIGTERM]).start()
+    else:
+        sys.__unraisablehook__(unraisable)

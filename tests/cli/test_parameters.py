@@ -117,6 +117,12 @@ def test_a_place_is_a_parameter_only_if_the_command_has_it(where: str, shown: st
     assert error_with_flags(ConfigError("x", where=where), flags(COMMANDS["debias"])).where == shown
 
 
+@pytest.mark.parametrize(("verb", "name"), [("debias", "init"), ("evaluate", "html"), ("info", "json")])
+def test_a_file_that_is_called_like_a_parameter_stays_a_file(verb: str, name: str, imutool: Run, tmp_path: Path) -> None:
+    line = [verb, name, *(["out.mcap"] if verb == "debias" else [])]
+    assert imutool(*line, cwd=tmp_path).stderr.lstrip().startswith(f"error: {name}: cannot be opened")
+
+
 def test_an_error_names_the_parameter_in_python_and_the_flag_on_the_command_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

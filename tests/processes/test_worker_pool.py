@@ -67,6 +67,14 @@ def test_a_crash_is_charged_to_its_own_item(tmp_path: Path) -> None:
     assert [len(tries(tmp_path, name)) for name in ("0 crash", "1 crash once", "2 well")] == [2, 2, 1]
 
 
+def test_an_end_that_a_destructor_swallows_comes_again(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What is raised in a destructor is printed and forgotten, and the worker would go on for ever."""
+    done = outcomes(tmp_path, ["ended in a destructor", "well"])
+    assert str(done["0 ended in a destructor"].error) == "exit code 143"
+    assert done["1 well"].error is None
+    assert capfd.readouterr().err == ""
+
+
 def test_workers_that_do_not_start_are_an_error_not_a_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool_functions.no_worker, "__qualname__", "nowhere")
     monkeypatch.setattr(pool_functions, "nowhere", pool_functions.no_worker, raising=False)

@@ -33,13 +33,19 @@ BLOCK_S = 0.5  # one independent value each: the misfit of a motion lasts about 
 GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 
 
+def compared_signals(traces: Sequence[Traces]) -> dict[str, slice]:
+    """Columns of compared signals; without positions the accelerometer is not one."""
+    positions = any(trace.truth is None or trace.truth.has_positions for trace in traces)
+    return SIGNALS if positions else {"gyro": SIGNALS["gyro"]}
+
+
 def misfit_strip(d: Diagnosis, trace: Traces) -> str:
     """Local misfit of each axis along one log, with located intervals and unseen time."""
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        names = [f"{signal} {axis}" for signal in SIGNALS for axis in AXES]
-        edges = np.linspace(trace.t_s[0], trace.t_s[-1], min(STRIP_BINS, len(trace.t_s)) + 1)
+        names = [f"{signal} {axis}" for signal in compared_signals([trace]) for axis in AXES]
+        lines, edges = len(names), np.linspace(trace.t_s[0], trace.t_s[-1], min(STRIP_BINS, len(trace.t_s)) + 1)
         heights = _local_rms(trace, edges)
         for row, name in enumerate(names):
             signal, axis = name.split()
@@ -52,9 +58,9 @@ def misfit_strip(d: Diagnosis, trace: Traces) -> str:
                     for first, last in intervals_in_log(trace, located):
                         axes.fill_between([first, last], -row, -row + 0.94, color=MARK, alpha=0.3, lw=0)
         for first, last in true_intervals(trace.t_s, trace.held_out):
-            axes.fill_between([first, last], -6.0, -5.3, color=HELD, alpha=0.5, lw=0)
-        axes.set_yticks([0.45 - row for row in range(7)], [*names, "unseen"])
-        axes.set(xlim=(trace.t_s[0], trace.t_s[-1]), ylim=(-6.1, 1.0), xlabel="time (s)")
+            axes.fill_between([first, last], -lines, 0.7 - lines, color=HELD, alpha=0.5, lw=0)
+        axes.set_yticks([0.45 - row for row in range(lines + 1)], [*names, "unseen"])
+        axes.set(xlim=(trace.t_s[0], trace.t_s[-1]), ylim=(-lines - 0.1, 1.0), xlabel="time (s)")
         axes.tick_params(axis="y", length=0)
         axes.grid(visible=False)
 
@@ -65,9 +71,10 @@ def residual(trace: Traces, *, found: bool) -> str:
     """Residual of one log over time by axis, before and after; unseen time is shaded."""
 
     def draw(figure: Any) -> None:
-        panels = figure.subplots(3, 2, sharex=True, sharey="col")
-        sides = [(residual_in_band(trace, expected), color) for expected, color in _sides(trace, found)]
-        for column, (signal, part) in enumerate(SIGNALS.items()):
+        compared, both = compared_signals([trace]), [(trace.before, BEFORE), (trace.after, AFTER)][: 1 + found]
+        panels = figure.subplots(3, len(compared), sharex=True, sharey="col", squeeze=False)
+        sides = [(residual_in_band(trace, expected), color) for expected, color in both]
+        for column, (signal, part) in enumerate(compared.items()):
             for row, axes in enumerate(panels[:, column]):
                 for left, color in sides:
                     axes.plot(*decimate_extremes(trace.t_s, left[:, part][:, row], BUCKETS), color=color, lw=0.6)
@@ -101,12 +108,13 @@ def scalar_signal(traces: SignalTraces, *, found: bool) -> str:
 
 def spectrum(d: Diagnosis) -> str | None:
     """Amplitude density of the residual by Welch's method; None if too short."""
-    density = {signal: [_density(d.traces, part, after) for after in (False, True)] for signal, part in SIGNALS.items()}
+    compared = compared_signals(d.traces)
+    density = {signal: [_density(d.traces, part, after) for after in (False, True)] for signal, part in compared.items()}
     if any(found is None for both in density.values() for found in both):
         return None
 
     def draw(figure: Any) -> None:
-        for axes, (signal, both) in zip(figure.subplots(1, 2), density.items(), strict=True):
+        for axes, (signal, both) in zip(figure.subplots(1, len(density), squeeze=False)[0], density.items(), strict=True):
             for found, color in list(zip(both, (BEFORE, AFTER), strict=True))[: 1 + bool(d.findings)]:
                 assert found is not None, "checked above"
                 axes.loglog(found[0], found[1], color=color, lw=1.1)
@@ -196,10 +204,6 @@ def rate_hz(trace: Traces) -> float:
     return 1.0 / float(np.median(np.diff(trace.t_s)))
 
 
-def _sides(trace: Traces, found: bool) -> list[tuple[Float64[np.ndarray, "n 6"], str]]:
-    return [(trace.before, BEFORE), (trace.after, AFTER)][: 1 + found]
-
-
 def _local_rms(trace: Traces, edges: Line) -> Float64[np.ndarray, "bins 6"]:
     """Root mean square of the misfit before between edges; NaN without samples."""
     squares = residual_in_band(trace, trace.before) ** 2
@@ -246,11 +250,13 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
     if not d.traces:
         return None
 
+    compared = compared_signals(d.traces)
+
     def draw(figure: Any) -> None:
-        panels = figure.subplots(2, 3, sharey="row")
+        panels = figure.subplots(len(compared), 3, sharey="row", squeeze=False)
         kinds = ((False, BEFORE), (True, AFTER))[: 1 + bool(d.findings)]
         sides = [([residual_in_band(t, t.after if found else t.before) for t in d.traces], color) for found, color in kinds]
-        for row, (signal, part) in enumerate(SIGNALS.items()):
+        for row, (signal, part) in enumerate(compared.items()):
             for axis, axes in enumerate(panels[row]):
                 x = np.concatenate([variable(trace, signal, axis)[held_out_mask(trace)] for trace in d.traces])
                 blocks = np.concatenate([_blocks(trace, k)[held_out_mask(trace)] for k, trace in enumerate(d.traces)])
@@ -265,7 +271,7 @@ def _binned(d: Diagnosis, variable: Callable[[Traces, str, int], Line], names: d
                 axes.locator_params(axis="x", nbins=6)
             panels[row, 0].set_ylabel(f"mean misfit ({UNITS[signal]})")
 
-    return svg(draw, 4.2, name)
+    return svg(draw, 2.1 * len(compared), name)
 
 
 def means(x: Line, y: Line, blocks: Float64[np.ndarray, " n"]) -> tuple[DecimatedLine, DecimatedLine, DecimatedLine]:

@@ -19,6 +19,7 @@ from support.diagnoses import replace
 from imutool.diagnosis.result import Closer, SignalTraces
 from imutool.diagnosis.wording.conclusion import headline
 from imutool.errors import ConfigError
+from imutool.recording import Poses
 from imutool.viewing.html import diagnosis_figures as figures
 from imutool.viewing.html import diagnosis_paths, drawing
 from imutool.viewing.html.diagnosis_page import html, write
@@ -200,6 +201,23 @@ def test_every_figure_has_labels_with_units() -> None:
         for word in words:
             assert word in axes_labels(svg), word
         assert "mathdefault" not in svg
+
+
+def test_without_positions_the_accelerometer_is_not_drawn() -> None:
+    (trace,) = diagnoses.LATE.traces
+    poses = trace.truth
+    still = Poses(poses.t_ns, np.zeros_like(poses.p_wb), poses.q_wb_wxyz)
+    d = replace(diagnoses.LATE, traces=(replace(trace, truth=still),))
+    for drawn in (
+        figures.misfit_strip(d, d.traces[0]),
+        figures.residual(d.traces[0], found=True),
+        figures.spectrum(d),
+        figures.residual_against_rate(d),
+        figures.residual_against_attitude(d),
+    ):
+        assert drawn is not None
+        assert "rad/s" in axes_labels(drawn) or "gyro x" in axes_labels(drawn)
+        assert not {"m/s²", "accel"} & set(re.findall(r"m/s²|accel", axes_labels(drawn)))
 
 
 def changed(d: SimpleNamespace, unseen: bool) -> SimpleNamespace:

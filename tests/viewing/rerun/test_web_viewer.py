@@ -52,11 +52,12 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def exported(logs: Path, imutool: Callable[..., subprocess.CompletedProcess[str]]) -> Path:
-    """The folder of `--export-web`."""
-    done = imutool("view", logs / "flight_1.mcap", "--export-web", "web", "--at", AT_S, cwd=logs)
+def exported(logs: Path, imutool: Callable[..., subprocess.CompletedProcess[str]], tmp_path_factory: Any) -> Path:
+    """The folder of `--export-web`; of this worker, for the logs are shared."""
+    folder: Path = tmp_path_factory.mktemp("exported") / "web"
+    done = imutool("view", logs / "flight_1.mcap", "--export-web", folder, "--at", AT_S, cwd=logs)
     assert done.returncode == 0, done.stderr
-    return logs / "web"
+    return folder
 
 
 class Visit:
