@@ -15,7 +15,7 @@ from imutool.diagnosis.compare_findings import is_of_digits, remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.timestamps import late_stamps
@@ -191,10 +191,9 @@ def finding_of(
 ) -> Finding:
     """Finding of an effect, with its gain on held-out time over the fit without it."""
     pairs, effect, chosen = [log.pair for log in logs], selected.effect, selection.fitted.chosen
-    without: Chosen = tuple(entry for entry in chosen if entry[0].key != effect.key)
-    complete, left_out, no_effects = (
-        [with_effects(pair, these) for pair in pairs] for these in (chosen, without, chosen[: selection.always])
-    )
+    place, always = selection.fitted.keys.index(effect.key), selection.always
+    without, nothing = (without_effects(selection.fitted, out, always) for out in ([place], range(always, len(chosen))))
+    complete, left_out, no_effects = ([with_effects(pair, these) for pair in pairs] for these in (chosen, without, nothing))
     shares, named = [], list[str](effect.sensors) or list(pairs[0].signals)
     for signal in known_signals(logs):
         if signal in named:

@@ -8,7 +8,7 @@ instead of becoming a large number, and its standard deviation says so. Positive
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -97,9 +97,8 @@ class Fit:
         out, all_ = {}, np.sqrt(np.diag(self.covariance))
         for effect, theta in self.chosen:
             std = all_[self.place(effect.key)] * (self.settings.between_samples if effect.jumps else 1.0)
-            out[effect.key] = np.array(
-                [s * t if n.positive else s for s, t, n in zip(std, theta, effect.parameters, strict=True)]
-            )
+            each = zip(std, theta, effect.parameters, strict=True)
+            out[effect.key] = np.array([s * t if parameter.positive else s for s, t, parameter in each])
         return out
 
 
@@ -122,9 +121,14 @@ def fit(
     now = _descended(problem, problem.state(begun, near), iterations, near, give_up_above)
     if iterations and any(effect.jumps for effect, _ in begun):
         now = _descended(problem, _polished(problem, now), iterations, None, np.inf)
-    numbers = sum(log.count(part) for log in logs)
-    passes, residuals = tuple(now.passes), tuple(now.residuals)
+    passes, residuals, numbers = tuple(now.passes), tuple(now.residuals), sum(log.count(part) for log in logs)
     return Fit(now.chosen, now.bias, now.objective, numbers, tuple(logs), part, passes, residuals, problem.std)
+
+
+def without_effects(found: Fit, left_out: Collection[int], always: int) -> Chosen:
+    """Effects of a fit without some of them; where some are always fitted, these take over what they can."""
+    others = tuple(one for k, one in enumerate(found.chosen) if k not in left_out)
+    return fit(found.logs, others, part=found.part, near=found).chosen if always else others
 
 
 class _State(NamedTuple):
@@ -164,10 +168,7 @@ class _Problem:
         return _State(chosen, passes, residuals, bias, total)
 
     def step(self, jacobians: Jacobians, now: _State) -> tuple[Theta, float]:
-        """Gauss-Newton step of the free parameters, and the squares that the whole step should gain.
-
-        No positive parameter changes by more than a factor of e; onsets stay.
-        """
+        """Gauss-Newton step of free parameters, and the gain of the whole step; onsets stay."""
         N, g = _normal(self, jacobians, now.residuals, now.bias)
         x, parameters = free_of(now.chosen), parameters_of(now.chosen)
         N[: len(x), : len(x)] += np.diag(1.0 / self.std**2)
@@ -177,7 +178,7 @@ class _Problem:
         delta = np.zeros(len(g))
         delta[moves] = np.linalg.solve(N[np.ix_(moves, moves)], g[moves])
         gain, delta = float(g @ delta), delta[: len(begins)]
-        positive = np.array([parameter.positive for parameter in parameters])
+        positive = np.array([parameter.positive for parameter in parameters])  # none changes by more than a factor of e
         return delta / max(1.0, float(np.abs(delta[positive]).max(initial=0.0))), gain
 
     def as_predicted(self, jacobians: Jacobians, before: _State, after: _State, step: Theta) -> bool:
@@ -194,9 +195,8 @@ class _Problem:
 
 def _descended(problem: _Problem, now: _State, iterations: int, near: Fit | None, give_up_above: float) -> _State:
     """State after Gauss-Newton steps, each shortened until the objective falls."""
-    settings = problem.settings
-    steps, kept = 0, None if near is None or not len(problem.mean) or not iterations else near.jacobians
-    whiteners = [log.whiten for log in problem.logs]
+    settings, whiteners, steps = problem.settings, [log.whiten for log in problem.logs], 0
+    kept = None if near is None or not len(problem.mean) or not iterations else near.jacobians
     hopeless = np.inf if near is None else _hopeless(now.chosen, near, give_up_above)
     while len(problem.mean) and steps < iterations:
         before = now.objective
@@ -230,8 +230,8 @@ def _hopeless(begun: Chosen, near: Fit, give_up_above: float) -> float:
     known = {id(effect) for effect, _ in near.chosen}
     if any(effect.jumps or id(effect) not in known for effect, _ in begun):
         return np.inf
-    begins = any(parameter.begins for parameter in parameters_of(begun))
-    return near.objective + (give_up_above - near.objective) * (ONSET_TAKES if begins else 1.0)
+    takes = ONSET_TAKES if any(parameter.begins for parameter in parameters_of(begun)) else 1.0
+    return near.objective + (give_up_above - near.objective) * takes
 
 
 def _polished(problem: _Problem, now: _State) -> _State:

@@ -21,7 +21,7 @@ from scipy.stats import norm, wilcoxon
 from scipy.stats import t as student
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, parameters_of, priors, with_value
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
@@ -79,8 +79,8 @@ def first_refuted(fitted: Fit, first: int) -> int:
     nameless = [k for k, (effect, _) in enumerate(fitted.chosen) if effect.kind != "catalogue" and not exact]
 
     def p_value(left_out: Sequence[int]) -> float:
-        both = ((fitted, other), (other, fitted))
-        blocks = np.concatenate([held_out_gains(one, left_out, unseen.part) for one, unseen in both])
+        both = [(one, without_effects(one, left_out, first), unseen) for one, unseen in ((fitted, other), (other, fitted))]
+        blocks = np.concatenate([held_out_gains(one, others, unseen.part) for one, others, unseen in both])
         return min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if exact else 1.0)
 
     for k in range(first, len(fitted.chosen)):
@@ -108,10 +108,9 @@ def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
     return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
 
 
-def held_out_gains(fitted: Fit, left_out: Sequence[int], part: str) -> Float64[np.ndarray, "b 2"]:
-    """Gain in squares by some effects, and squares of their prediction, on held-out blocks."""
-    others, out = tuple(one for k, one in enumerate(fitted.chosen) if k not in left_out), []
-    block_s = fitted.logs[0].pair.settings.search.held_out_block_s
+def held_out_gains(fitted: Fit, others: Chosen, part: str) -> Float64[np.ndarray, "b 2"]:
+    """Gain in squares over other effects, and squares of the prediction, on held-out blocks."""
+    out, block_s = [], fitted.logs[0].pair.settings.search.held_out_block_s
     for log, forward, residual in zip(fitted.logs, fitted.passes, fitted.residuals, strict=True):
         other = log.residual(ForwardPass(log.pair, others, forward).blocks, (forward.blocks, residual))
         with_, without = (_white(log, one, part) for one in (residual, other))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from support import planted
 
 from imutool.diagnosis.estimation import significance
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.significance import Scatter, first_refuted, log_p_value, scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
@@ -86,8 +86,8 @@ def test_beside_poses_effects_without_a_name_must_not_cancel_each_other(monkeypa
     )
     exact = replace(beside, chosen=chosen, logs=(planted.weighed(pair),))
 
-    def gains(now: Fit, left_out: Sequence[int], part: str) -> np.ndarray:
-        sign = -1.0 if len(left_out) > 1 else 1.0
+    def gains(now: Fit, others: Chosen, part: str) -> np.ndarray:
+        sign = -1.0 if len(now.chosen) - len(others) > 1 else 1.0
         return np.stack([sign * np.arange(9.0, 13.0), np.ones(4)], axis=1)
 
     monkeypatch.setattr(significance, "held_out_gains", gains)
@@ -95,6 +95,19 @@ def test_beside_poses_effects_without_a_name_must_not_cancel_each_other(monkeypa
     assert first_refuted(replace(beside, chosen=chosen), 0) == 1
     assert first_refuted(replace(beside, chosen=chosen[:2]), 0) == 2, "one alone cancels nothing"
     assert first_refuted(exact, 0) == 3
+
+
+@pytest.mark.parametrize(("effects", "refuted"), [({}, True), ({"clock_jump": (12.0, 0.004)}, False)])
+def test_a_jump_is_judged_over_a_clock_that_is_fitted_without_it(
+    effects: dict[str, tuple[float, float]], refuted: bool
+) -> None:
+    """Clocks without a common epoch: an offset and a jump at the start that takes it back again gain much over either alone."""
+    log = planted.weighed(planted.pair(FELT, effects, seed=1))
+    begins_s, step_s = effects.get("clock_jump", (0.2, 0.004))
+    start = planted.acting({"clock_offset": [0.0 if effects else -step_s], "clock_jump": [begins_s, step_s]})
+    found = fit([log], start, iterations=0)
+    assert (first_refuted(found, 1) == 1) == refuted
+    assert effects or first_refuted(found, 0) == 2, "with each held at its value both seem needed"
 
 
 def test_a_gain_is_as_likely_as_it_comes_where_noise_lasts() -> None:
