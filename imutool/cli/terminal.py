@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 LONGEST = 2000  # letters of an error message
 LONGEST_ROW = 10_000  # letters of a table's row where nobody looks at a terminal
 NUMBER = re.compile(r"[-+]?[0-9.]+|[–?]")
+MISSING = "–"  # in the place of a figure
 
 logger = logging.getLogger("imutool")
 
@@ -188,13 +189,13 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
 
 
 def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None:
-    """Print evaluation results as tables: over the whole path, and by distance.
+    """Print evaluation results as tables: over the whole path, and by distance if any is long enough.
 
     With `aligned` also the attitude after an alignment of the positions.
     """
 
     def number(value: float | None) -> str:
-        return "–" if value is None else format(value, ".2f")
+        return MISSING if value is None else format(value, ".2f")
 
     distances = list(results[0]["roe_deg"])
     columns = {"aoe_deg": "AOE\n°", "aoe_aligned_deg": "aligned\n°", "ape_m": "APE\nm", "ape_aligned_m": "aligned\nm"}
@@ -208,4 +209,5 @@ def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None
         roe.append((result["log"], result["model"], *(number(result["roe_deg"][d]) for d in distances)))
         rpe.append((result["log"], result["model"], *(number(result["rpe_m"][d]) for d in distances)))
     for rows in (whole, roe, rpe):
-        table(rows, keys=2)
+        if any(entry != MISSING for row in rows[1:] for entry in row[2:]):  # a path without positions has no distances
+            table(rows, keys=2)

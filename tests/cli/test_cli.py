@@ -254,6 +254,17 @@ def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
     assert f"{'x' * 70}  {'y' * 70}" in capsys.readouterr().out
 
 
+def test_a_table_without_a_figure_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
+    turned = dict.fromkeys(names) | {"log": "flight", "model": "raw", "aoe_deg": 2.5}
+    terminal.figures([turned | {"roe_deg": {"5": None}, "rpe_m": {"5": None}}])
+    assert "2.50" in (shown := capsys.readouterr().out)
+    assert "ROE" not in shown
+    terminal.figures([turned | {"roe_deg": {"5": 0.25}, "rpe_m": {"5": None}}])
+    assert "ROE" in (shown := capsys.readouterr().out)
+    assert "RPE" not in shown
+
+
 def test_progress_tells_loss_held_out_error_and_time_left() -> None:
     epoch = Epoch("gyro", step=40, steps=120, loss=0.25, held_out=0.0174533, before=0.00872665, left_s=83.2)
     assert epoch_line(epoch) == (40, 120, "gyro 40/120: loss 0.250, held out 1.000° (closed form 0.500), 1:23 left")
