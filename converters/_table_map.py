@@ -74,7 +74,7 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     position: list[str] = []
     position_unit: str = "m"
     quaternion_wxyz: list[str] = []
-    rotation_matrix: str = ""
+    rotation_matrix: str | list[str] = ""  # an array, or nine columns, row by row
     pose_kind: str = "truth"
 
 
@@ -100,6 +100,10 @@ def read_map(path: Path) -> TableMap:
             raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
     if table.pose_kind not in KINDS:
         raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
+    if isinstance(table.rotation_matrix, list) and len(table.rotation_matrix) != 9:
+        raise ConfigError(
+            f"rotation_matrix names {len(table.rotation_matrix)} columns", where=path, expected="nine, row by row"
+        )
     for name in ("gyro", "accel") if table.gyro or table.accel else ():
         if len(getattr(table, name)) != 3:
             raise ConfigError(f"{name} names {len(getattr(table, name))} columns", where=path, expected="three: x, y, z")
@@ -143,8 +147,8 @@ class Proposal(msgspec.Struct):
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
         )
         lines.append(
-            '# poses: truth_time, position = [x, y, z], quaternion_wxyz = [w, x, y, z] (m), pose_kind = "truth" or "estimate";'
-            " truth_file if they are in another table"
+            "# poses: truth_time, position = [x, y, z] (m), quaternion_wxyz = [w, x, y, z] or rotation_matrix = [nine columns,"
+            ' row by row], pose_kind = "truth" or "estimate"; truth_file if they are in another table'
         )
         return "\n".join(lines)
 

@@ -1,4 +1,4 @@
-"""Order of a quaternion's columns and unit of a gyro, by how both turn."""
+"""Rotations of a table: from matrices, the order of their columns, the unit of a gyro."""
 
 from __future__ import annotations
 
@@ -15,6 +15,16 @@ LEAST_SPANS = 100
 SURE, CLEARLY = 0.9, 0.25  # correlation of turns that are the same; share of what the other order leaves that the right one may
 MOST_OFF = 1.2  # ratio of the turns of the poses to those of a gyro in its unit
 ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
+
+
+def of_matrices(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of rotation matrices; zeros of one that is missing."""
+    from scipy.spatial.transform import Rotation
+
+    known = np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))
+    q_wxyz = np.zeros((len(matrices), 4))
+    q_wxyz[known] = quaternion.unit(Rotation.from_matrix(matrices[known]).as_quat()[:, [3, 0, 1, 2]])
+    return q_wxyz
 
 
 def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> list[str]:

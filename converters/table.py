@@ -15,7 +15,6 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError
-from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
@@ -37,7 +36,7 @@ from ._table_map import (
     propose,
     read_map,
 )
-from ._table_rotations import unit_by_poses
+from ._table_rotations import of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 
@@ -236,10 +235,12 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     t_ns = _times(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
     if table.quaternion_wxyz:
         q_wxyz = _vectors(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+    elif isinstance(table.rotation_matrix, list):
+        q_wxyz = of_matrices(_vectors(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3))
     elif table.rotation_matrix in columns.matrices:
-        q_wxyz = _quaternions(columns.matrices[table.rotation_matrix])
+        q_wxyz = of_matrices(columns.matrices[table.rotation_matrix])
     else:
-        expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices"
+        expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices, or nine columns"
         raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
     p = (
         _vectors(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
@@ -257,13 +258,6 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         return {}
     topic = "/ground_truth/pose" if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
-
-
-def _quaternions(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions of rotation matrices."""
-    from scipy.spatial.transform import Rotation
-
-    return quaternion.unit(Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]])
 
 
 def _further(columns: Columns, table: TableMap, used: set[str], where: Path) -> tuple[dict[str, Scalars], dict[str, str]]:

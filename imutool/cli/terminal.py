@@ -189,7 +189,7 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
 
 
 def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None:
-    """Print evaluation results as tables: over the whole path, and by distance if any is long enough.
+    """Print evaluation results as tables: over the whole path, and by distances that it reaches.
 
     With `aligned` also the attitude after an alignment of the positions.
     """

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imutool.converters import table
 from imutool.mcap_io.read import read
+from imutool.sensor.made_up_flight import flight
 
 RNG = np.random.default_rng(5)
 COUNT = 600
@@ -325,6 +327,29 @@ def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
     recording = read(tmp_path / "out.mcap")
     assert len(recording.imu) == 5645
     assert list(recording.truths) == ["/ground_truth/pose"]
+
+
+def test_nine_columns_of_a_motion_capture_are_its_rotations_row_by_row(convert, tmp_path):
+    """As Qualisys writes them: column by column, and zeros where the body was not seen."""
+    poses = flight(3, duration_s=4.0).truth
+    turned = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix()
+    rows = np.column_stack([poses.t_ns * 1e-9, 1e3 * poses.p_wb, turned.transpose(0, 2, 1).reshape(-1, 9)])
+    rows[7, 1:] = 0.0
+    names = "\t".join(["Time", "X", "Y", "Z", *(f"Rot[{k}]" for k in range(9))])
+    np.savetxt(tmp_path / "gt.tsv", rows, "%.9f", "\t", header=names, comments="")
+    write_csv(tmp_path / "imu.csv", CERTAIN, arrays(t=poses.t_ns[0] + 5_000_000 * np.arange(COUNT)))
+    nine = [f"Rot[{k}]" for k in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
+    (tmp_path / "map.toml").write_text(
+        f'time = "{CERTAIN[0]}"\ntime_unit = "ns"\ngyro = {CERTAIN[1:4]}\ngyro_unit = "rad/s"\n'
+        f'accel = {CERTAIN[4:]}\naccel_unit = "m/s^2"\n'
+        'truth_file = "gt.tsv"\ntruth_time = "Time"\ntruth_time_unit = "s"\nposition = ["X", "Y", "Z"]\nposition_unit = "mm"\n'
+        f"rotation_matrix = {nine}\n"
+    )
+    assert convert(tmp_path / "imu.csv", tmp_path / "out.mcap", "--map", tmp_path / "map.toml").returncode == 0
+    kept, truth = np.delete(np.arange(len(poses)), 7), read(tmp_path / "out.mcap").truth
+    assert len(truth) == len(kept)
+    np.testing.assert_allclose(np.abs((truth.q_wb_wxyz * poses.q_wb_wxyz[kept]).sum(axis=1)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(truth.p_wb, poses.p_wb[kept], atol=1e-9)
 
 
 def test_structures_of_mat_with_their_own_times_come_in_on_these(convert, tmp_path):

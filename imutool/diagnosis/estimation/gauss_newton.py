@@ -126,7 +126,7 @@ def fit(
 
 
 def without_effects(found: Fit, left_out: Collection[int], always: int) -> Chosen:
-    """Effects of a fit without some of them; where some are always fitted, these take over what they can."""
+    """Effects of a fit without some; those that are always fitted take over what they can."""
     others = tuple(one for k, one in enumerate(found.chosen) if k not in left_out)
     return fit(found.logs, others, part=found.part, near=found).chosen if always else others
 
