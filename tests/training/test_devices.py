@@ -209,7 +209,13 @@ def any_ode_helps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imutool.training.run.helps", lambda before, after: True)
 
 
-@pytest.mark.parametrize("name", METHODS)
+def _assert_written(out: Path, on_the_cpu: bytes, method: str) -> None:
+    assert out.read_bytes() == on_the_cpu
+    assert {one.dtype for one in load_file(out).values()} == {torch.float32}
+    assert io.load(out).method == method
+
+
+@pytest.mark.parametrize("name", ["linear", "hybrid", "hybrid that chooses its effects"])
 def test_a_training_on_a_gpu_is_the_one_on_the_cpu(
     logs: list[Path], on_the_cpu: Callable[[str], bytes], tmp_path: Path, name: str
 ) -> None:
@@ -218,15 +224,14 @@ def test_a_training_on_a_gpu_is_the_one_on_the_cpu(
     out = tmp_path / "m.safetensors"
     with simulated_gpu():
         train(logs, out, method=method, settings=settings(method, model), device="cuda")
-    assert out.read_bytes() == on_the_cpu(name)
-    assert {one.dtype for one in load_file(out).values()} == {torch.float32}
-    assert io.load(out).method == method
+    _assert_written(out, on_the_cpu(name), method)
 
 
 @pytest.mark.parametrize("name", ["neural_ode", "conv"])
 def test_a_training_is_put_down_on_a_gpu_and_taken_up_there(
     logs: list[Path], on_the_cpu: Callable[[str], bytes], tmp_path: Path, name: str
 ) -> None:
+    """It ends as the one on the CPU that nothing interrupted."""
     method, model = METHODS[name]
     out, chosen = tmp_path / "m.safetensors", settings(method, model)
 
@@ -239,7 +244,7 @@ def test_a_training_is_put_down_on_a_gpu_and_taken_up_there(
             train(logs, out, method=method, settings=chosen, device="cuda", progress=stop)
         assert checkpoint_path(out).exists()
         train(logs, out, method=method, settings=chosen, device="cuda", resume=True)
-    assert out.read_bytes() == on_the_cpu(name)
+    _assert_written(out, on_the_cpu(name), method)
 
 
 @pytest.mark.parametrize(("solver", "adjoint"), [("rk4", False), ("rk4", True), ("dopri5", False), ("dopri5", True)])
