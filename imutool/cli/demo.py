@@ -28,7 +28,7 @@ FOLDER = Written(files=("*",), keeps=True)
 
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5
-STEPS = 30  # of each stage: as good as 60 on flights of one minute
+STEPS = 10  # of each stage: as good as 30 on flights of one minute
 IMU_HEADER = "#timestamp [ns]," + ",".join(
     [f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz"] + [f"a_RS_S_{axis} [m s^-2]" for axis in "xyz"]
 )
@@ -106,6 +106,7 @@ def run(
     Raises:
         ConfigError: the folder holds an earlier demo, or the extras view and report are not installed.
     """
+    _check(out, overwrite)  # before the packages of the work are loaded
     from imutool.conversion.run import convert
     from imutool.debiasing import debias
     from imutool.evaluation import evaluate
@@ -115,7 +116,6 @@ def run(
     from imutool.viewing.model.load_view import load
     from imutool.viewing.rerun import scene
 
-    _check(out, overwrite)
     raw, logs = out / "raw", out / "logs"
     names = [f"flight_{number}" for number in (*TRAINING_SEEDS, seed)]
     log, model, debiased = logs / f"{names[-1]}.mcap", out / "model.safetensors", out / "debiased.mcap"

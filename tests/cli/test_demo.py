@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +82,9 @@ def test_the_numbers_are_those_of_the_files_and_change_with_the_flight(
     assert other["model"]["aoe_deg"] < other["static"]["aoe_deg"]
 
 
-def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any]]) -> None:
+def test_an_earlier_demo_stays_without_overwrite(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     before = sorted(made[0].rglob("*"))
+    monkeypatch.setitem(sys.modules, "imutool.training.run", None)  # nothing is loaded for work that is refused
     with pytest.raises(ConfigError, match="overwrite"):
         demo.run(made[0] / "demo-out", lambda _: None)
     assert sorted(made[0].rglob("*")) == before
