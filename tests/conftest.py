@@ -47,7 +47,7 @@ gc.set_threshold(100_000, 20)
 
 sys.path.insert(0, str(Path(__file__).parent))  # for tests/support
 
-from support.shapes import begin_test, check_shapes  # noqa: E402  (before anything imports the package)
+from support.shapes import check_shapes  # noqa: E402  (before anything imports the package)
 
 check_shapes("imutool")
 
@@ -81,11 +81,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Leaves what is collected and imported out of every later collection of garbage."""
     gc.freeze()
-
-
-def pytest_runtest_setup() -> None:
-    """Checks the annotations of the first calls in every test."""
-    begin_test()
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,7 @@
 """Shapes and types in annotations, checked once for each combination of shapes and types that a function meets.
 
 jaxtyping and beartype check every call, at 0.1 to 0.3 ms each: two thirds of the time of the tests of `diagnose`.
-What they check depends on types, dtypes and shapes alone, so a combination that has passed passes again. To look at the
-arguments still took a quarter of the time: of a function that one test calls very often, the first calls are looked at and
-then one in several.
+What they check depends on types, dtypes and shapes alone, so a combination that has passed passes again.
 """
 
 from __future__ import annotations
@@ -19,22 +17,11 @@ from typing import Any
 import jaxtyping
 import numpy as np
 
-ALL, ONE_IN = 100, 16
-"""Calls of a function in one test that are all looked at, and how many later ones go by for one that is."""
 LONGEST = 16
 """Longest tuple or list whose elements are all looked at; of a longer one its length and first elements."""
 _CHECK_EACH_CALL: Any = jaxtyping.jaxtyped
 _passed: dict[types.CodeType, dict[Hashable, set[Hashable]]] = {}
 """By code and arguments: the results that have passed. A function made inside a function shares its code."""
-
-
-_test = [0]
-"""Number of the test that runs."""
-
-
-def begin_test() -> None:
-    """Look at all first calls of every function again."""
-    _test[0] += 1
 
 
 def check_shapes(package: str) -> None:
@@ -59,18 +46,11 @@ def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[
     passed = _passed.setdefault(function.__code__, {})
     check = functools.cache(functools.partial(_CHECK_EACH_CALL, typechecker=typechecker))
     results: list[Any] = []
-    test = calls = 0
     give_result = _with_signature(lambda *_, **__: results.pop(), function)
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        nonlocal test, calls
-        if test != _test[0]:
-            test, calls = _test[0], 0
-        calls += 1
-        if calls > ALL and calls % ONE_IN:
-            return function(*args, **kwargs)
         called: Hashable = _combinations(args)
         if kwargs:
             called = called, *kwargs, _combinations(kwargs.values())

@@ -209,13 +209,7 @@ def any_ode_helps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imutool.training.run.helps", lambda before, after: True)
 
 
-def _assert_written(out: Path, on_the_cpu: bytes, method: str) -> None:
-    assert out.read_bytes() == on_the_cpu
-    assert {one.dtype for one in load_file(out).values()} == {torch.float32}
-    assert io.load(out).method == method
-
-
-@pytest.mark.parametrize("name", ["linear", "hybrid", "hybrid that chooses its effects"])
+@pytest.mark.parametrize("name", METHODS)
 def test_a_training_on_a_gpu_is_the_one_on_the_cpu(
     logs: list[Path], on_the_cpu: Callable[[str], bytes], tmp_path: Path, name: str
 ) -> None:
@@ -224,14 +218,15 @@ def test_a_training_on_a_gpu_is_the_one_on_the_cpu(
     out = tmp_path / "m.safetensors"
     with simulated_gpu():
         train(logs, out, method=method, settings=settings(method, model), device="cuda")
-    _assert_written(out, on_the_cpu(name), method)
+    assert out.read_bytes() == on_the_cpu(name)
+    assert {one.dtype for one in load_file(out).values()} == {torch.float32}
+    assert io.load(out).method == method
 
 
 @pytest.mark.parametrize("name", ["neural_ode", "conv"])
 def test_a_training_is_put_down_on_a_gpu_and_taken_up_there(
     logs: list[Path], on_the_cpu: Callable[[str], bytes], tmp_path: Path, name: str
 ) -> None:
-    """It ends as the one on the CPU that nothing interrupted."""
     method, model = METHODS[name]
     out, chosen = tmp_path / "m.safetensors", settings(method, model)
 
@@ -244,7 +239,7 @@ def test_a_training_is_put_down_on_a_gpu_and_taken_up_there(
             train(logs, out, method=method, settings=chosen, device="cuda", progress=stop)
         assert checkpoint_path(out).exists()
         train(logs, out, method=method, settings=chosen, device="cuda", resume=True)
-    _assert_written(out, on_the_cpu(name), method)
+    assert out.read_bytes() == on_the_cpu(name)
 
 
 @pytest.mark.parametrize(("solver", "adjoint"), [("rk4", False), ("rk4", True), ("dopri5", False), ("dopri5", True)])
