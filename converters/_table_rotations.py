@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.errors import DataError
 from imutool.geometry import quaternion
 
 from ._table_map import GYRO_SI, TIME_NS, Entries
@@ -14,16 +17,30 @@ SPAN_S, LONGEST_SPAN_S = 0.1, 0.5  # over which turns are compared; a longer one
 LEAST_SPANS = 100
 SURE, CLEARLY = 0.9, 0.25  # correlation of turns that are the same; share of what the other order leaves that the right one may
 MOST_OFF = 1.2  # ratio of the turns of the poses to those of a gyro in its unit
+ORTHOGONAL = 0.02  # what two printed decimals leave of R R^T = 1
 ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
 
 
-def of_matrices(matrices: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of rotation matrices; zeros of one that is missing."""
+def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of rotation matrices; zeros of one that is missing.
+
+    Raises:
+        DataError: a matrix that does not rotate.
+    """
     from scipy.spatial.transform import Rotation
 
-    known = np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2))
+    known = np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2)) & matrices.any(axis=(1, 2)))
+    R = matrices[known]
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    if len(wrong := known[(off > ORTHOGONAL) | (np.linalg.det(R) < 0.0)]):
+        raise DataError(
+            f"matrix {wrong[0] + 1} of rotation_matrix is no rotation: {(matrices[wrong[0]].round(3) + 0.0).tolist()}",
+            where=where,
+            expected="three right-handed, orthogonal rows of length 1",
+            fix="Check the columns and their order",
+        )
     q_wxyz = np.zeros((len(matrices), 4))
-    q_wxyz[known] = quaternion.unit(Rotation.from_matrix(matrices[known]).as_quat()[:, [3, 0, 1, 2]])
+    q_wxyz[known] = quaternion.unit(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])
     return q_wxyz
 
 

@@ -236,9 +236,9 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     if table.quaternion_wxyz:
         q_wxyz = _vectors(columns, table.quaternion_wxyz, 1.0, 0.0, where)
     elif isinstance(table.rotation_matrix, list):
-        q_wxyz = of_matrices(_vectors(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3))
+        q_wxyz = of_matrices(_vectors(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3), where)
     elif table.rotation_matrix in columns.matrices:
-        q_wxyz = of_matrices(columns.matrices[table.rotation_matrix])
+        q_wxyz = of_matrices(columns.matrices[table.rotation_matrix], where)
     else:
         expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices, or nine columns"
         raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)

@@ -18,7 +18,6 @@ from imutool.cli.overview import COMMANDS, MODULES, show
 if TYPE_CHECKING:
     from imutool.cli.app import App
 
-REPEAT_S = 0.01
 COMPLETION = "_IMUTOOL_COMPLETE"  # a shell asks for words; any command may be meant
 HALF_MADE = "RecordingStream.__del__"  # of Rerun: it fails where a Ctrl-C ended the stream's __init__
 WRONG_USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # what a shell reports of a program that SIGTERM ended
@@ -64,10 +63,7 @@ def main() -> None:
 
 
 def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:
-    """Repeat a Ctrl-C or a SIGTERM that came where nothing can be raised, as while an object is removed."""
-    if number := {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}.get(unraisable.exc_type):
-        from threading import Timer
+    from imutool.mcap_io.storage.system import repeat_swallowed  # every command would pay for it at its start
 
-        Timer(REPEAT_S, signal.raise_signal, [number]).start()
-    elif getattr(unraisable.object, "__qualname__", "") != HALF_MADE:
+    if not repeat_swallowed(unraisable) and getattr(unraisable.object, "__qualname__", "") != HALF_MADE:
         sys.__unraisablehook__(unraisable)

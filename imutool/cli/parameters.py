@@ -101,7 +101,7 @@ def _shown(name: str, value: str | None, flag_of: Mapping[str, str]) -> str | No
 
 
 def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Collection[str] = ()) -> ImutoolError:
-    """Error with flags for parameters; a path that was typed stays, also if it reads like one."""
+    """Error with flags for parameters; what was typed stays, also if it reads like a parameter."""
     where = error.where
     if where is not None and where not in typed:
         parts = [PLACE.fullmatch(part) for part in where.split(", ")]

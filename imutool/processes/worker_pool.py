@@ -31,10 +31,9 @@ from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
 from imutool.errors import ConfigError
-from imutool.mcap_io.storage.system import KILLED, inherited, opened
+from imutool.mcap_io.storage.system import KILLED, inherited, opened, repeat_swallowed
 
 POLL_S = 0.5
-REPEAT_S = 0.01  # after which an end that was swallowed is tried again
 GRACE_S = 1.2  # for a worker to remove what it has half written
 STARTS = 3  # deaths of workers one after the other before they are ready
 TERMINATED = 143
@@ -286,9 +285,7 @@ def _end(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _end_again(unraisable: sys.UnraisableHookArgs) -> None:
-    """Repeat an end that came where nothing can be raised, as while an object is removed."""
-    if unraisable.exc_type is SystemExit:
+    if repeat_swallowed(unraisable):
         signal.signal(signal.SIGTERM, _end)
-        threading.Timer(REPEAT_S, signal.raise_signal, [signal.SIGTERM]).start()
     else:
         sys.__unraisablehook__(unraisable)

@@ -466,3 +466,30 @@ def test_a_long_name_can_be_written(tmp_path: Path) -> None:
     with Target(tmp_path / name) as target:
         target.write(b"whole")
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+REMOVED = """
+import os, sys, time
+from imutool import cli
+
+class Removed:
+    def __del__(self):
+        os.kill(os.getpid(), NUMBER)
+        time.sleep(0.05)  # for the signal to arrive here
+
+def show():
+    Removed()
+    time.sleep(WAIT_S)
+    print("went on")
+
+cli.show, sys.argv = show, ["imutool"]
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, TERMINATED)])
+def test_an_end_that_a_destructor_swallows_comes_again(number: signal.Signals, code: int) -> None:
+    source = REMOVED.replace("NUMBER", str(int(number))).replace("WAIT_S", str(WAIT_S))
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=0.5 * WAIT_S, check=False)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert "Traceback" not in done.stderr

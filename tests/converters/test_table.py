@@ -350,6 +350,13 @@ def test_nine_columns_of_a_motion_capture_are_its_rotations_row_by_row(convert, 
     assert len(truth) == len(kept)
     np.testing.assert_allclose(np.abs((truth.q_wb_wxyz * poses.q_wb_wxyz[kept]).sum(axis=1)), 1.0, atol=1e-9)
     np.testing.assert_allclose(truth.p_wb, poses.p_wb[kept], atol=1e-9)
+    text = (tmp_path / "map.toml").read_text()
+    for other in ("'X'", "'Rot[5]'"):  # a column that is none of it, and one twice
+        (tmp_path / "map.toml").write_text(text.replace("'Rot[0]'", other))
+        done = convert(tmp_path / "imu.csv", tmp_path / "wrong.mcap", "--map", tmp_path / "map.toml")
+        assert done.returncode == 4
+        assert "matrix 1 of rotation_matrix is no rotation" in done.stderr
+        assert not (tmp_path / "wrong.mcap").exists()
 
 
 def test_structures_of_mat_with_their_own_times_come_in_on_these(convert, tmp_path):

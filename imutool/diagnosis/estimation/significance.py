@@ -109,7 +109,7 @@ def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
 
 
 def held_out_gains(fitted: Fit, others: Chosen, part: str) -> Float64[np.ndarray, "b 2"]:
-    """Gain in squares over other effects, and squares of the prediction, on held-out blocks."""
+    """Squares that a fit gains over fewer effects, and those of its prediction, by block."""
     out, block_s = [], fitted.logs[0].pair.settings.search.held_out_block_s
     for log, forward, residual in zip(fitted.logs, fitted.passes, fitted.residuals, strict=True):
         other = log.residual(ForwardPass(log.pair, others, forward).blocks, (forward.blocks, residual))

@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 END_WITH_PARENT = 1  # of Linux: PR_SET_PDEATHSIG
 KILLED = (-signal.SIGKILL, -signal.SIGTERM) if sys.platform != "win32" else (1, 1)  # exit codes of a process that was killed
+REPEAT_S = 0.01
 LOCKED_AT = 1 << 62  # byte that Windows locks, behind all content: locked bytes could not be read
 
 
@@ -175,3 +177,19 @@ def _tried(call: Callable[[int], int], at: int) -> int:
         return call(at)
     except (AttributeError, OSError):
         return 0
+
+
+def repeat_swallowed(unraisable: sys.UnraisableHookArgs) -> bool:
+    """Repeat a Ctrl-C or a SIGTERM that came while an object was removed; False of others.
+
+    Python prints and forgets what is raised there. The main thread gets it, also where it waits.
+    """
+    number = {KeyboardInterrupt: signal.SIGINT, SystemExit: signal.SIGTERM}.get(unraisable.exc_type)
+    if number is None:
+        return False
+    if sys.platform == "win32":
+        timer = threading.Timer(REPEAT_S, signal.raise_signal, [number])
+    else:
+        timer = threading.Timer(REPEAT_S, signal.pthread_kill, [threading.main_thread().ident, number])
+    timer.start()
+    return True

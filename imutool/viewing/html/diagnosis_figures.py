@@ -34,7 +34,7 @@ GAP_PERIODS = 1.5  # sample periods without a sample that end a stretch
 
 
 def compared_signals(traces: Sequence[Traces]) -> dict[str, slice]:
-    """Columns of compared signals; without positions the accelerometer is not one."""
+    """Columns of the signals that were compared: of the gyro alone if no position is known."""
     positions = any(trace.truth is None or trace.truth.has_positions for trace in traces)
     return SIGNALS if positions else {"gyro": SIGNALS["gyro"]}
 
