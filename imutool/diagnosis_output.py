@@ -57,7 +57,7 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
     existing = [name for name in FILES if (folder / name).exists()]
     if existing and not overwrite:
         raise ConfigError(
-            f"holds a diagnosis already ({', '.join(existing)})", where=folder, fix="Choose another folder, or add --overwrite"
+            f"holds a diagnosis already ({', '.join(existing)})", where=folder, fix="Choose another folder, or give `overwrite`"
         )
     above = next(parent for parent in folder.absolute().parents if parent.is_dir())
     with _told(folder), TemporaryDirectory(dir=above, prefix=".imutool-"):

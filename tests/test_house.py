@@ -300,6 +300,25 @@ def test_no_private_language_in_docstrings() -> None:
     assert found == []
 
 
+FLAG = re.compile(r"(?<![\w-])--[a-z]")
+COMMAND = re.compile(r"`\w+ [^`]*`|imutool .*")  # with its flags
+
+
+def flags_in_errors(tree: ast.Module) -> Iterator[str]:
+    """Texts of errors that name a flag, but for those that spell out a whole command."""
+    for node in nodes(tree):
+        name = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+        if name.rpartition(".")[2].endswith("Error"):
+            texts = [part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)]
+            yield from (text for text in texts if FLAG.search(COMMAND.sub("", text)))
+
+
+def test_errors_of_the_library_name_parameters_and_no_flags() -> None:
+    library = {name: tree for name, tree in everything().items() if room(name) != "cli"}
+    assert {name: found for name, tree in library.items() if (found := [*flags_in_errors(tree)])} == {}
+    assert [*flags_in_errors(ast.parse('ConfigError("is there", fix="Add --overwrite")'))] == ["Add --overwrite"]
+
+
 # ── the project's own files ──
 
 

@@ -102,6 +102,7 @@ class AlignmentSettings(Settings, frozen=True):
     align_hz: Positive = 100.0  # of the clock on which angular rates are correlated
     farthest_s: Positive = 5.0  # by which clocks of one epoch may differ
     least_correlation: Share = 0.6  # of the angular rates, below which two motions differ
+    alike_sigma: tuple[float, float] = (3.0, 6.0)  # over chance, with a shared epoch and at any lag; 210 unrelated pairs: 5.3
     noise_band: Share = 0.8  # of Nyquist: above, a simulated motion has nothing but noise
     short_time_s: Positive = 2.5  # of a Wiener filter's gain: a body moves and rests (0.6 to 2.5 s tried, shorter is worse)
     short_time_parts: Count = 7  # frequencies, and times a quarter of that apart, whose mean power makes a gain

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.signal import correlate, correlation_lags, periodogram
+from scipy.signal import periodogram
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
@@ -21,6 +21,7 @@ from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
+from imutool.inertial.correlation import cross_correlation
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
 from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
@@ -45,7 +46,7 @@ def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings 
             "the simulation turns otherwise than the recording",
             where=real.name,
             expected="one motion, or true poses in both logs",
-            fix="Leave --sim out to compare the recording with its own true poses",
+            fix="Leave `sim` out to compare the recording with its own true poses",
         )
     start_ns = int(real.imu.t_ns[0])
     stamp_s = seconds(real.imu.t_ns, start_ns)
@@ -248,10 +249,16 @@ def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
     shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
     if _rests(real) and _rests(sim):
         return 0.0 if shared else None
-    lag_s, alike = _lag(real, sim, settings)
-    if shared and abs(lag_s) < settings.farthest_s:
+    turns, hz = [_turning(imu, settings.align_hz) for imu in (real, sim)], settings.align_hz
+    shortest = min(len(turn) for turn in turns)
+    found = cross_correlation(turns[0], turns[1], round(min(settings.least_s * hz, 0.8 * shortest)))
+    lag_s = (int(sim.t_ns[0]) - int(real.t_ns[0])) * 1e-9 + found.lag / hz
+    (_, _, near), (lag, alike, sigma) = found.best(np.abs(lag_s) < settings.farthest_s), found.best(np.full(len(lag_s), True))
+    if shared and near > settings.alike_sigma[0]:
         return 0.0
-    return _refined(real, sim, lag_s, settings) if alike >= settings.least_correlation else None
+    if sigma < settings.alike_sigma[1] or alike < settings.least_correlation:
+        return None
+    return _refined(real, sim, float(lag_s[found.lag == lag][0]), settings)
 
 
 def _rests(imu: Imu) -> bool:
@@ -277,22 +284,7 @@ def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> 
     return lag_s + off_s
 
 
-def _lag(real: Imu, sim: Imu, settings: AlignmentSettings) -> tuple[float, float]:
-    """Lag (s) at which the angular rates correlate best, and that correlation."""
-    rows = [np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1) for imu in (real, sim)]
-    start = [int(imu.t_ns[0]) for imu in (real, sim)]
-    grids = [np.arange(0.0, imu.duration_s, 1.0 / settings.align_hz) for imu in (real, sim)]
-    a, b = (
-        np.interp(grid, seconds(imu.t_ns, first), row)
-        for grid, imu, first, row in zip(grids, (real, sim), start, rows, strict=True)
-    )
-    a, b = a - a.mean(), b - b.mean()
-    lags = correlation_lags(len(b), len(a))
-    # b[i + lag] beside a[i]: only what both cover counts, or a short piece would be unlike the whole it comes from
-    first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)
-    energy_a, energy_b = (np.concatenate([[0.0], np.cumsum(x * x)]) for x in (a, b))
-    shared = np.sqrt((energy_a[last] - energy_a[first]) * (energy_b[last + lags] - energy_b[first + lags]))
-    enough = last - first >= min(settings.least_s * settings.align_hz, 0.8 * min(len(a), len(b)))
-    both = np.where(enough, correlate(b, a, mode="full") / np.maximum(shared, 1e-12), -1.0)
-    best = int(np.argmax(both))
-    return (start[1] - start[0]) * 1e-9 + float(lags[best]) / settings.align_hz, float(both[best])
+def _turning(imu: Imu, rate_hz: float) -> Float64[np.ndarray, " m"]:
+    """Size of the angular rate on an even clock."""
+    size = np.linalg.norm(imu.gyro - np.median(imu.gyro, axis=0), axis=1)
+    return np.asarray(np.interp(np.arange(0.0, imu.duration_s, 1.0 / rate_hz), seconds(imu.t_ns, int(imu.t_ns[0])), size))

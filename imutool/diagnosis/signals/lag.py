@@ -10,8 +10,8 @@ from scipy.signal import correlate, correlation_lags
 from imutool.array_types import Float64
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.errors import DataError
+from imutool.inertial.correlation import dependent_samples
 
-LEAST_ALIKE = 0.25  # of the size of two autocorrelations, that their product sums to: it scatters where both are lines
 Column = Float64[np.ndarray, "_"]
 
 
@@ -57,13 +57,9 @@ def lag_at_first_sight(
 
 
 def _chance(a: Float64[np.ndarray, "k n"], b: Float64[np.ndarray, "k m"]) -> float:
-    """Deviation of the correlation of two independent signals with these spectra (Bartlett, JRSS Suppl. 8, 1946)."""
-    n, variances = min(a.shape[1], b.shape[1]), list[float]()
-    for pair in zip(a, b, strict=True):
-        x, y = (correlate(v, v, mode="full")[v.size :][: n // 2] / max(float(v @ v), 1e-300) for v in pair)
-        x, y = x[: len(y)], y[: len(x)]
-        alike = max(float((x * y).sum()), LEAST_ALIKE * float(np.linalg.norm(x) * np.linalg.norm(y)))
-        variances.append((1.0 + 2.0 * alike) / n)
+    """Deviation of the correlation of two independent signals with these spectra."""
+    n = min(a.shape[1], b.shape[1])
+    variances = [dependent_samples(x, y) / n for x, y in zip(a, b, strict=True)]
     return float(np.sqrt(np.mean(variances) / len(variances)))
 
 

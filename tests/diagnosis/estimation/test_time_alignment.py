@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +12,11 @@ from scipy.signal import periodogram
 from scipy.spatial.transform import Rotation
 from support import planted
 
+from imutool.converters import fetch
 from imutool.diagnosis.estimation.aligned_log import Pair, split
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.noise_estimate import wiener_filter
-from imutool.diagnosis.estimation.time_alignment import with_simulation, with_truth
+from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
 from imutool.errors import DataError
 from imutool.recording import Recording, Scalars
 
@@ -191,6 +194,25 @@ def test_another_motion_is_refused(away_ns: int) -> None:
     _, sim = logs(seed=5, sim_start_ns=planted.START_NS + away_ns)
     with pytest.raises(DataError, match="turns otherwise"):
         with_simulation(real, sim)
+
+
+def test_a_long_recording_has_no_piece_that_is_like_another_motion() -> None:
+    """Of ten thousand lags some piece is alike by chance, the shorter the better."""
+    long = [planted.moving(seed, 90.0) for seed in range(6)]
+    t_s = planted.clock(90.0)
+    at = [planted.START_NS + k * YEAR_NS + np.round(t_s * 1e9).astype(np.int64) for k in range(2)]
+    for first, second in combinations(long, 2):
+        real, sim = (
+            replace(path.imu(path.start_ns + t_ns - t_ns[0]), t_ns=t_ns) for path, t_ns in zip((first, second), at, strict=True)
+        )
+        assert not same_motion(real, sim)
+
+
+@pytest.mark.parametrize("name", ["01_square", "06_right_turn", "07_left_turn"])
+def test_real_recordings_of_one_robot_are_not_one_motion(data: Path, name: str) -> None:
+    """Drives of one kind: a norm of the rates alone correlated up to 0.8 in some piece of them."""
+    (one,), (other,) = (fetch.read(data / "fetch" / folder) for folder in (name, "03_um"))
+    assert not same_motion(one.imu, other.imu)
 
 
 def test_too_little_shared_time_is_refused_with_how_much_there_is() -> None:
