@@ -1,9 +1,10 @@
-"""Comparison of findings: a recording and a simulation of different motions.
+"""Comparison of findings: of several recordings, of a recording and a simulation of different motions.
 
-Each is diagnosed against its own truth, then the findings are compared.
+Several recordings share their findings. One that asks for other numbers is named: it is of another unit, or mounted otherwise.
 
-An effect that both have, alike to within what the two are sure of, is no difference. One that both have in different sizes is
-told with the recording's numbers; one that only the simulation has is told as a remark, since no recording shows it.
+A recording and a simulation are each diagnosed against their own truth, then the findings are compared. An effect that both
+have, alike to within what the two are sure of, is no difference. One that both have in different sizes is told with the
+recording's numbers; one that only the simulation has is told as a remark, since no recording shows it.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped
 
 ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
+CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"
 
@@ -54,6 +59,45 @@ def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Ite
     for twin in sim_findings:
         if twin not in matched:
             yield f"{_words(twin)}: the simulation has it ({_numbers(twin)}), the recording does not show it"
+
+
+def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterator[str]:
+    """Remarks on recordings that ask for other numbers of the findings than all recordings together."""
+    whole, always = selection.whole, selection.always
+    names = dict.fromkeys(log.pair.name for log in logs)
+    if len(names) < 2 or len(whole.chosen) == always:
+        return
+    for name in names:
+        of_log = [k for k, log in enumerate(logs) if log.pair.name == name]
+        own, without = (fit([logs[k] for k in of_log], these, whole.part) for these in (whole.chosen, whole.chosen[:always]))
+        missed = sum(_squares(whole, k) for k in of_log) - sum(_squares(own, k) for k in range(len(of_log)))
+        if missed > CONTRADICTS * max(own.objective, without.objective - own.objective):
+            yield f"{name} contradicts the other logs: {_differing(own, whole)}. Diagnose another unit or mount separately"
+
+
+def _squares(found: Fit, log: int) -> float:
+    """Squares that a fit leaves of one log."""
+    white = found.logs[log]
+    rows = white.rows(found.part)
+    return float(((found.residuals[log][rows] - white.constants[rows] * found.bias[log]) ** 2).sum())
+
+
+def _differing(own: Fit, whole: Fit) -> str:
+    """The effect whose numbers differ most from those of all logs, and both numbers."""
+    std = own.stds()
+    apart = {
+        effect.key: float((np.abs(mine - ours) / np.maximum(std[effect.key], 1e-300)).max(initial=0.0))
+        for (effect, mine), (_, ours) in zip(own.chosen, whole.chosen, strict=True)
+    }
+    key = max(apart, key=lambda name: apart[name])
+    mine, ours = (_numbers_of(found, key) for found in (own, whole))
+    return f"its {key.replace('_', ' ')} is {mine} by itself, {ours} with all"
+
+
+def _numbers_of(found: Fit, key: str) -> str:
+    effect, theta = found.chosen[found.keys.index(key)]
+    each = zip(effect.parameters, theta, found.stds()[key], strict=True)
+    return _listed({p.name: Estimate(float(value), float(std), p.unit) for p, value, std in each})
 
 
 def _twin(finding: Finding, sim_findings: Sequence[Finding]) -> Finding | None:
@@ -107,5 +151,9 @@ def _words(finding: Finding) -> str:
 
 
 def _numbers(finding: Finding) -> str:
-    texts = [quantity.labelled for quantity in grouped(finding.parameters)]
+    return _listed(finding.parameters)
+
+
+def _listed(parameters: Mapping[str, Estimate]) -> str:
+    texts = [quantity.labelled for quantity in grouped(parameters)]
     return ", ".join(texts) if texts else "a curve of its own"
