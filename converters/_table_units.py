@@ -1,4 +1,4 @@
-"""Units of a table's columns, in SI; and whether an IMU in these units measures what a sensor can."""
+"""Units of a table's columns, and doubts about stated ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
 
 
 def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
-    """Doubts about stated units: an acceleration far from gravity, a rate beyond the range of gyros."""
+    """Doubts about stated units: accelerations far from gravity, rates beyond the gyros' range."""
     if not len(imu):
         return []
     doubts = []
