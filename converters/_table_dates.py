@@ -18,7 +18,9 @@ DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset;
     r" ?(?P<half>[AP]M)? ?(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
-CLOCK = re.compile(r"(?:(\d\d?):)?(\d\d?):(\d\d)(?:[.,](\d{1,9})\d*)?")  # of one day or, as Excel shows times, of one hour
+CLOCK = re.compile(  # of one day or, as Excel shows times, of one hour; 15:04:05:123 ends with milliseconds
+    r"(?:(\d\d?):)?(\d\d?):(\d\d)(?:(?:[.,]|(?<=:\d\d:\d\d):(?=\d{3}$))(\d{1,9})\d*)?"
+)
 
 
 def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 
-from ._table_map import POSITION_SI, TIME_NS, USUAL_TIME_NS, Entries, Proposal
+from ._table_map import Entries, Proposal
 from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name
 from ._table_rotations import order_by_motion
 from ._table_text import Columns
 from ._table_times import rises
+from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"

@@ -23,27 +23,13 @@ from imutool.recording.message_log import KINDS
 from ._table_names import ROS_WORDS, TIME_WORDS, XSENS_TIME, name_and_unit, split_name, triples
 from ._table_text import Columns
 from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
+from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, UNITS_OF, USUAL_TIME_NS
 
 IMU_TOPIC = "/imu0"
-USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
-GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
-STANDARD_GRAVITY = 9.80665
-ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01}
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 MOST_SHOWN = 12  # triples of columns in a message
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
-
-POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-UNITS_OF: dict[str, dict[str, float]] = {
-    "time_unit": TIME_NS,
-    "gyro_unit": GYRO_SI,
-    "accel_unit": ACCEL_SI,
-    "truth_time_unit": TIME_NS,
-    "position_unit": POSITION_SI,
-}
-
 
 Entries = dict[str, str | list[str]]  # of a map
 
@@ -197,6 +183,10 @@ def _propose_sensor(
     stated = {names[column][1] for column in chosen} - {""}
     if len(stated) == 1 and stated <= units.keys():
         proposal.entries[f"{sensor}_unit"] = stated.pop()
+    elif len(stated) > 1:
+        proposal.open += [sensor, f"{sensor}_unit"]
+        listed = ", ".join(chosen)
+        proposal.reasons.append(f"{listed} state different units: {sensor}_scale = [x, y, z] in a map brings them to one")
     elif re.search(ROS_WORDS, names[chosen[0]][0]):
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
@@ -243,7 +233,8 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     """Column of the time and its unit, from its name or from a plausible rate."""
     length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
     found = [c for c, (name, _) in names.items() if re.fullmatch(rf"(.*_)?{TIME_WORDS}", name or names[c][1])]
-    found = [c for c in found if length in (None, len(columns.values[c])) and goes_on(columns.values[c])]
+    found = [c for c in found if length in (None, len(columns.values[c]))]
+    still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
     if "gyro" in proposal.entries:
         group = proposal.entries["gyro"][0].rpartition("/")[0]
         found.sort(key=lambda c: c.rpartition("/")[0] != group)
@@ -255,6 +246,10 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
         found = rising
     if not found:
+        for column in still:
+            values = columns.values[column]
+            counts = f"{len(np.unique(values))} different values in {len(values)} rows"
+            proposal.reasons.append(f"{column!r} is named as a time and does not rise: {counts}")
         _propose_rate(proposal, columns, counter, length)
         return
     column = proposal.entries["time"] = found[0]

@@ -10,8 +10,9 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 
-from ._table_map import GYRO_SI, TIME_NS, Entries
+from ._table_map import Entries
 from ._table_text import Columns
+from ._table_units import GYRO_SI, TIME_NS
 
 SPAN_S, LONGEST_SPAN_S = 0.1, 0.5  # over which turns are compared; a longer one has a gap in it
 LEAST_SPANS = 100

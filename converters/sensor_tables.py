@@ -26,10 +26,10 @@ from imutool.recording.message_log import MessageLog, Remarks
 from . import Sequence
 from ._archive import is_zip, list_members, read_bounded, refusing
 from ._source import find_folders, name
-from ._table_map import STANDARD_GRAVITY
 from ._table_names import split_name
 from ._table_text import Columns, read_csv
 from ._table_times import begun_at_zero
+from ._table_units import STANDARD_GRAVITY
 
 GENERAL = True
 IMU_TOPIC = "/imu0"

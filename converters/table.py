@@ -24,21 +24,11 @@ from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_folder import is_split, load_split
 from ._table_groups import group_entries, known_layout, time_beside
-from ._table_map import (
-    ACCEL_SI,
-    GYRO_SI,
-    IMU_TOPIC,
-    POSITION_SI,
-    TIME_NS,
-    Proposal,
-    TableMap,
-    imus_apart,
-    propose,
-    read_map,
-)
+from ._table_map import IMU_TOPIC, Proposal, TableMap, imus_apart, propose, read_map
 from ._table_rotations import of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times
+from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
@@ -179,7 +169,8 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
         if len(t_ns) != len(values):
             raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
     imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
-    columns.remarks.notes.extend(notes)
+    doubts = [f"{table.topic}: {doubt}" for doubt in unit_doubts(imu, table.gyro_unit, table.accel_unit)]
+    columns.remarks.notes.extend([*notes, *doubts])
     return imu
 
 

@@ -117,7 +117,7 @@ def convert(
         images: Copy camera frames as well.
         overwrite: Replace existing logs.
         sensor: Name of the IMU, where the recording does not state it.
-        kinds: What poses are worth, as `TOPIC=truth|estimate|odometry|unknown`.
+        kinds: Kind of the poses by topic, as `TOPIC=truth|estimate|odometry|unknown`.
         mapping: TOML file that states what the columns of a table mean.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
         correct: `conventions`: units, axes and frames that the motion shows to be wrong; `stamps`: put them on a line.

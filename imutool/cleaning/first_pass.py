@@ -275,7 +275,7 @@ def raw_batches(log: Log, topic: str, end_ns: int | None = None) -> Iterator[Imu
 def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, findings: Sequence[Finding]) -> Iterator[str]:
     """Reasons not to trust the log."""
     if whole.motion.samples < FEWEST:
-        yield f"{whole.motion.samples} of {whole.messages} samples are left"
+        yield f"valid samples: {whole.motion.samples} of {whole.messages}"
         if whole.messages >= FEWEST and not whole.motion.end_ns:
             yield f"the stamps were never set: {RESTAMP}"
         return

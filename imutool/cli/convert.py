@@ -68,14 +68,14 @@ def convert(
     sensor: Annotated[str, typer.Option(metavar="NAME", help="The IMU's name, such as bmi160.")] = "",
     kind: Annotated[
         list[str] | None,
-        typer.Option(metavar="TOPIC=KIND", help="What poses are worth: truth, estimate, odometry or unknown. Repeatable."),
+        typer.Option(metavar="TOPIC=KIND", help="Kind of poses: truth, estimate, odometry or unknown. Repeatable."),
     ] = None,
     imu: Annotated[str, typer.Option(metavar="gyro=T,accel=T", help="Two topics that become one IMU.")] = "",
     map_: Annotated[
         Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
     ] = None,
     fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames shown wrong by the motion.")] = False,
-    restamp: Annotated[bool, typer.Option("--restamp", help="Put the IMU's stamps on the line of its own clock.")] = False,
+    restamp: Annotated[bool, typer.Option("--restamp", help="Put late stamps on the clock of the IMU.")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
     overwrite: Overwrite = False,
     json_to: Json = None,

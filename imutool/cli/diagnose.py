@@ -134,7 +134,7 @@ def audit(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find what a simulator's IMU does wrong by itself.
+    """Find the errors of a simulator's IMU, without a recording.
 
     Gravity, frame, axes, transport term, point, timing, noise, digits and limits, each with its equation and the report of a
     simulator that had it.

@@ -162,7 +162,10 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         if "time" in imu:
             rows.append((imu["topic"], "time of the samples", f"{imu['time']}, not {', '.join(imu['other_times'])}"))
-        rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {len(imu['stationary'])} stretches"))
+        if imu["rate_hz"] is not None:
+            clock = f"{imu['rate_hz']:.2f} Hz, jitter {1e3 * imu['jitter_s']:.3f} ms, longest gap {imu['largest_gap_s']:.3f} s"
+            rows.append((imu["topic"], "clock of stamps", clock))
+        rows.append((imu["topic"], "at rest", f"{imu['stationary_s']:.1f} s in {_counted(len(imu['stationary']), 'stretch')}"))
         rows.append((imu["topic"], "accel at rest", _number(imu["accel_at_rest_m_s2"], ".3f") + " m/s²"))
         alike: dict[str, list[str]] = {}
         for entry in imu.get("conventions", []):
@@ -175,16 +178,21 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
                 density = noise[f"{name}_density"]
                 rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
     for truth in report.truth:
-        value = f"{100 * truth.coverage:.1f} % of the IMU, {truth.gaps} gaps, longest {truth.longest_gap_s:.2f} s"
+        value = f"{100 * truth.coverage:.1f} % of the IMU, {_counted(truth.gaps, 'gap')}, longest {truth.longest_gap_s:.2f} s"
         rows += [(truth.topic, "kind of poses", truth.kind), (truth.topic, "covers", value)]
         if not isinstance(truth.gyro_rms_rad_s, UnsetType) and not isinstance(truth.gyro_explained, UnsetType):
-            value = f"{100 * truth.gyro_explained:.1f} % of the motion, {truth.gyro_rms_rad_s:.4f} rad/s rms left"
+            value = f"{100 * truth.gyro_explained:.1f} % of the motion, {truth.gyro_rms_rad_s:.4f} rad/s rms remain"
             rows.append((truth.topic, "explains gyro", value))
         if not isinstance(truth.body_turned_deg, UnsetType) and not isinstance(truth.body_turned_std_deg, UnsetType):
             both = truth.body_turned_deg, truth.body_turned_std_deg
             turned, std = (", ".join(f"{value:.2f}" for value in values) for values in both)
             rows.append((truth.topic, "body of poses", f"turned by ({turned}) ± ({std})° against the gyro"))
     return rows
+
+
+def _counted(count: int, noun: str) -> str:
+    """Number with its noun: 1 gap, 2 gaps, 2 stretches."""
+    return f"{count} {noun}{'' if count == 1 else 'es' if noun.endswith('ch') else 's'}"
 
 
 def _number(value: float | int | None, form: str, scale: float = 1.0) -> str:

@@ -21,7 +21,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "simulate": ("simulate", "Simulate an IMU along the poses of a log, with a sensor's physics and noise."),
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
-    "audit": ("diagnose", "Find what a simulator's IMU does wrong by itself."),
+    "audit": ("diagnose", "Find the errors of a simulator's IMU, without a recording."),
     "models": ("models", "List the models that ship, their sensor and their card."),
     "schema": ("models", "Print the JSON Schema of a report, or list the reports."),
     "demo": ("demo", "Run a demo without download: convert, train, debias, evaluate, view."),

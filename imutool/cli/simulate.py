@@ -89,7 +89,7 @@ def simulate(
     say(f"{target}: {report.samples} samples at {report.rate_hz:g} Hz over {where}; physics {names}; noise {noise}")
     motion = report.motion
     std = f"{motion.gyro_std_rad_s:.2g} rad/s and {motion.accel_std_m_s2:.2g} m/s²"
-    say(f"uncertainty of the motion {std}; {motion.glitches} glitches dropped, {motion.steps} steps levelled")
+    say(f"uncertainty of the motion {std}; {motion.glitches} outliers and {motion.steps} jumps of the poses removed")
 
 
 @app.command(epilog="Example: [bold]imutool conceal MH_03.mcap case/ --seed 7[/], then [bold]imutool conceal --open case/[/]")

@@ -37,7 +37,7 @@ def train(
         typer.Option(metavar="physics.toml", help="For hybrid: effects to fit; the neural ODE learns the rest."),
     ] = None,
     device: Annotated[str, typer.Option(help="Device: cpu or cuda.")] = "cpu",
-    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the random numbers.")] = None,
     imu: Imu = None,
     truth: Truth = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted training from its checkpoint.")] = False,

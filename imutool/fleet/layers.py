@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.fleet import results
 from imutool.fleet.work import UnitReport
 from imutool.location import to_location
+from imutool.mcap_io.storage.system import processors
 from imutool.processes.worker_pool import WorkerPool
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def build(logs: Sequence[FleetLog], cache: Path, *, workers: int | None = None) 
             yield Layers(log.name, found)
         else:
             waiting.append(log)
-    with WorkerPool(partial(layers, cache=cache), min(workers or os.cpu_count() or 1, max(len(waiting), 1))) as pool:
+    with WorkerPool(partial(layers, cache=cache), min(workers or processors(), max(len(waiting), 1))) as pool:
         for outcome in pool.run(waiting):
             yield Layers(outcome.item.name, {}, str(outcome.error)) if outcome.error is not None else outcome.value
 

@@ -74,12 +74,13 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     yield "gyro against accel", *(by_gravity or (False, f"cannot be judged: {NO_GRAVITY}"))
     yield "gyro against poses", *(_gyro(found.gyro, found.topic) or _unknown(whole, why))
     if found.accel is not None:
-        yield "accel against poses", True, f"{found.accel.names} by {_ratio(found.accel)}"
+        yield "accel against poses", True, f"{found.accel.names}, {_ratio(found.accel)}"
     else:
         yield "accel against poses", *_unknown(whole, "the motion is too slow to tell it from its negative")
     yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, why))
     if found.delay is not None:
-        late = f"{1e3 * found.delay.seconds:+.1f} ms late, standard deviation {1e3 * found.delay.std_s:.1f} ms"
+        side = "late" if found.delay.seconds > 0 else "early"
+        late = f"{abs(1e3 * found.delay.seconds):.1f} ms {side}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
         yield "clock of poses", True, late
     else:
         yield "clock of poses", *_unknown(whole, why)
@@ -92,7 +93,7 @@ def _gyro(reading: Reading | None, against: str) -> tuple[bool, str] | None:
 
 
 def _ratio(reading: Reading) -> str:
-    return f"{reading.certain:.1f} standard errors ahead of the second best"
+    return f"{reading.certain:.1f} standard errors better than the next order of axes"
 
 
 def _unknown(whole: TopicSummary, why: str) -> tuple[bool, str]:

@@ -290,7 +290,7 @@ def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
     usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
     if not usable:
         others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
-        return [f"no true poses: {others}" if others else "no true poses"]
+        return [f"no true poses: {others}; imutool evaluate LOG --truth TOPIC takes one of them" if others else "no true poses"]
     warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
     for truth in usable:
         warnings += body_warnings(truth.topic, truth.body_turned_deg or [])

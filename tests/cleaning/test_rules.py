@@ -374,5 +374,5 @@ def test_an_empty_topic_and_a_single_sample_are_not_trusted(made):
 
 def test_stamps_that_were_never_set_are_told_with_what_to_do(made: ImuBatch) -> None:
     first, second = look(made._replace(stamp_ns=0 * made.stamp_ns)).reasons
-    assert first == f"1 of {len(made.stamp_ns)} samples are left"
+    assert first == f"valid samples: 1 of {len(made.stamp_ns)}"
     assert second == "the stamps were never set: imutool convert LOG OUT --restamp takes the log times"

@@ -229,6 +229,8 @@ def test_dates_of_other_countries_count(text):
 def test_clocks_without_a_date_go_on_after_midnight_and_excels_after_the_hour():
     assert (calendar_times(["23:59:59.5", "00:00:00.5", "00:00:01"])[0] / 1e9).tolist() == [86399.5, 86400.5, 86401.0]
     assert (calendar_times(["59:59.5", "00:00.5"])[0] / 1e9).tolist() == [3599.5, 3600.5]
+    assert (calendar_times(["23:59:59:500", "00:00:00:005"])[0] / 1e9).tolist() == [86399.5, 86400.005]
+    assert calendar_times(["59:59:500"]) is None
     assert calendar_times(["12:30:00", "start"]) is None
     assert calendar_times(["9999-01-01 00:00:00"]) is None
 
@@ -313,3 +315,36 @@ def test_a_map_without_columns_needs_names_that_show_several_imus(tmp_path):
     (tmp_path / "map.toml").write_text('time = "t_ns"\ntime_unit = "ns"\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n')
     with pytest.raises(ConfigError, match="do not show several IMUs"):
         table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("gyro_unit", "accel_unit", "doubts"),
+    [
+        ("deg/s", "g", []),
+        ("rad/s", "g", ["the gyro reaches"]),
+        ("deg/s", "m/s^2", ["the median acceleration is 1 m/s"]),
+        ("rad/s", "m/s^2", ["the median acceleration", "the gyro reaches"]),
+    ],
+)
+def test_a_stated_unit_that_no_sensor_reaches_is_doubted(tmp_path, gyro_unit, accel_unit, doubts):
+    turning = 90.0 * np.sin(np.arange(COUNT) / 20.0)[:, None] * [1.0, 0.5, 0.2]
+    names = ["t_s", *(f"gyro_{a} [{gyro_unit}]" for a in "xyz"), *(f"acc_{a} [{accel_unit}]" for a in "xyz")]
+    path = written(tmp_path / "phone.csv", names, [np.arange(COUNT) / 100.0, *turning.T, *(ACCEL / 9.80665).T])
+    notes = table.read_sequence(table.sequences(path)[0]).remarks.notes
+    doubted = [note for note in notes if "is the unit right" in note]
+    assert len(doubted) == len(doubts)
+    assert all(expected in note for expected, note in zip(doubts, doubted, strict=True))
+
+
+def test_axes_in_different_units_are_not_taken_for_one_unit(tmp_path):
+    names = ["t_s", "gyro_x [rad/s]", "gyro_y [rad/s]", "gyro_z [deg/s]", *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    path = written(tmp_path / "mixed.csv", names, [np.arange(COUNT) / 100.0, *GYRO.T, *ACCEL.T])
+    with pytest.raises(ConfigError, match=r"gyro_z \[deg/s\] state different units"):
+        table.read_sequence(table.sequences(path)[0])
+
+
+def test_a_time_that_a_program_has_rounded_is_named(tmp_path):
+    names = ["timestamp", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    path = written(tmp_path / "excel.csv", names, [np.repeat([1.7e12, 1.70001e12], COUNT // 2), *GYRO.T, *ACCEL.T])
+    with pytest.raises(ConfigError, match=f"'timestamp' is named as a time and does not rise: 2 different values in {COUNT}"):
+        table.read_sequence(table.sequences(path)[0])

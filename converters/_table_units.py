@@ -1,0 +1,44 @@
+"""Units of a table's columns, and doubts about stated ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imutool.recording import GRAVITY_M_S2, Imu
+
+USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
+GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
+STANDARD_GRAVITY = 9.80665
+ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01}
+POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+UNITS_OF: dict[str, dict[str, float]] = {
+    "time_unit": TIME_NS,
+    "gyro_unit": GYRO_SI,
+    "accel_unit": ACCEL_SI,
+    "truth_time_unit": TIME_NS,
+    "position_unit": POSITION_SI,
+}
+MOST_OF_GRAVITY = 2.0  # factor between gravity and the median acceleration of a robot or a person that moves
+FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common gyros
+USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
+
+
+def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
+    """Doubts about stated units: accelerations far from gravity, rates beyond the gyros' range."""
+    if not len(imu):
+        return []
+    doubts = []
+    level = float(np.nanmedian(np.linalg.norm(imu.accel, axis=1)))
+    if not 1.0 / MOST_OF_GRAVITY < level / GRAVITY_M_S2 < MOST_OF_GRAVITY:
+        doubts.append(
+            f"the median acceleration is {level:.3g} m/s^2 with accel_unit {accel_unit!r}, and gravity is {GRAVITY_M_S2}:"
+            " is the unit right, and are these the columns of the accelerometer?"
+        )
+    rate = float(np.nanquantile(np.abs(imu.gyro), USUAL_SHARE))
+    if rate > FULL_SCALE_RAD_S:
+        doubts.append(
+            f"the gyro reaches {rate:.3g} rad/s with gyro_unit {gyro_unit!r}, and common gyros measure up to"
+            f" {FULL_SCALE_RAD_S:g} rad/s: is the unit right?"
+        )
+    return doubts
