@@ -156,7 +156,7 @@ def quantile(values: Shaped[np.ndarray, "n ..."], share: float) -> Any:
 
 
 def median(values: Shaped[np.ndarray, "..."], axis: int = 0) -> Any:
-    """Median along an axis of finite values, as `np.median`, which imports masked arrays (25 ms)."""
+    """Median along an axis of finite values; `np.median` would import masked arrays."""
     below, above = (values.shape[axis] - 1) // 2, values.shape[axis] // 2
     ordered = np.partition(values, (below, above), axis=axis)
     return 0.5 * (ordered.take(below, axis) + ordered.take(above, axis))
