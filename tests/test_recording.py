@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars, nanoseconds, seconds, unit_quaternions
-from imutool.recording.columns import Columns, quantile
+from imutool.recording.columns import Columns, median, quantile
 
 EPOCH_NS = 1_403_638_128_245_096_960  # in EuRoC's MH_04
 SECONDS = 2.0**-52  # relative: one rounding of the difference, one of the product
@@ -426,6 +426,14 @@ def test_a_quantile_is_that_of_numpy(count: int) -> None:
     values = np.random.default_rng(count).normal(size=(count, 3))
     for share in (0.0, 0.25, 0.5, 0.9, 1.0):
         np.testing.assert_allclose(quantile(values, share), np.quantile(values, share, axis=0), rtol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 100])
+def test_a_median_is_that_of_numpy(count: int) -> None:
+    values = np.random.default_rng(1).normal(size=(count, 3))
+    for table in (values, (1e9 * values).astype(np.int64)):
+        np.testing.assert_array_equal(median(table), np.median(table, axis=0))
+        np.testing.assert_array_equal(median(table.T, axis=1), np.median(table, axis=0))
 
 
 @dataclass

@@ -25,7 +25,7 @@ from imutool.cleaning.truth import Truth, force_in_world, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
-from imutool.recording.columns import quantile
+from imutool.recording.columns import median, quantile
 
 SURE = 3.0  # standard errors of the log likelihood ratio
 CLEARLY = 0.5  # of the misfit of a zero reading, or of the log as it is, that of the best reading at most
@@ -132,7 +132,7 @@ def _choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"])
     number, inverse = np.unique(blocks, return_inverse=True)
     if len(number) < FEWEST_BLOCKS:
         return None
-    misfit = np.sqrt(np.median(errors**2, axis=1))
+    misfit = np.sqrt(median(errors**2, axis=1))
     sigma = max(float(misfit.min()), 1e-9)
     likelihood = -0.5 * (STUDENT + 3.0) * np.log1p((errors / sigma) ** 2 / STUDENT)
     sums = np.stack([np.bincount(inverse, row) for row in likelihood])
@@ -178,7 +178,7 @@ def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m
     choice = _choose(_carried(rate, first, last, readings), number)
     if choice is None or choice.certain < SURE or not _excited(rate.reshape(-1, 3)):
         return None
-    nothing = float(np.sqrt(np.median(((last - first) ** 2).sum(axis=1))))
+    nothing = float(np.sqrt(median(((last - first) ** 2).sum(axis=1))))
     return _reading(choice, readings) if choice.misfit[choice.best] < CLEARLY * nothing else None
 
 
@@ -234,16 +234,16 @@ def _gyro_against_poses(
     use, first_s, last_s = usable(first, last, start_ns, step)
     if not len(use):
         return None
-    true = rate[use] - np.median(rate[use], axis=0)
+    true = rate[use] - median(rate[use])
     measured = between(step, mean[:, :3], first_s, last_s)
-    measured -= np.median(measured, axis=0)
-    readings = _rate_readings(float(np.quantile(np.linalg.norm(measured, axis=1), 0.9)))
+    measured -= median(measured)
+    readings = _rate_readings(float(quantile(np.linalg.norm(measured, axis=1), 0.9)))
     if not readings:
         return None
     errors = np.stack([np.linalg.norm(true - measured @ M.T, axis=1) for _, M in readings])
     choice = _choose(errors, (first_s / BLOCKS_S).astype(np.int64))
-    lively = np.linalg.norm(true, axis=1) >= np.median(np.linalg.norm(true, axis=1))
-    if choice is None or np.median(errors[choice.best][lively]) > CLEARLY * np.median(np.linalg.norm(true[lively], axis=1)):
+    lively = np.linalg.norm(true, axis=1) >= median(np.linalg.norm(true, axis=1))
+    if choice is None or median(errors[choice.best][lively]) > CLEARLY * median(np.linalg.norm(true[lively], axis=1)):
         return None
     if choice.certain >= SURE and _excited(measured):
         return _reading(choice, readings)
@@ -289,7 +289,7 @@ def _accel_against_poses(
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
         return None, None
     P, up = readings[choice.best]
-    as_is = float(np.sqrt(np.median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
+    as_is = float(np.sqrt(median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_up = all((up == other).all() for _, other in alike)
     one_axes = all((other == P).all() for other, _ in alike)

@@ -11,6 +11,7 @@ from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.cleaning.unit_evidence import POSES_APART_NS
 from imutool.recording import seconds
+from imutool.recording.columns import median
 
 MOST_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
@@ -36,7 +37,7 @@ def pose_delay(motion: Motion, truth: Truth) -> Delay | None:
     if len(use) < DELAY_PARTS * FEWEST:
         return None
     true = np.linalg.norm(rate[use], axis=1)
-    gyro = mean[:, :3] - np.median(mean[:, :3], axis=0)
+    gyro = mean[:, :3] - median(mean[:, :3])
 
     def correlations(lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:
         rows = []

@@ -10,7 +10,7 @@ import numpy as np
 from imutool.cleaning.samples import Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.recording import GRAVITY_M_S2, seconds
-from imutool.recording.columns import quantile
+from imutool.recording.columns import median, quantile
 
 DEGREES = 180.0 / np.pi
 RATES: Mapping[str, float] = {  # rad/s of one unit
@@ -97,9 +97,9 @@ def rate_ratio(motion: Motion, truth: Truth) -> float | None:
     if not len(step):
         return None
     t_s, steps_s = seconds(first, motion.start_ns or 0) + 0.5 * seconds(last - first, 0), 0.1 * step + 0.05
-    true, measured = (np.linalg.norm(values - np.median(values, axis=0), axis=1) for values in (rate, mean[:, :3]))
+    true, measured = (np.linalg.norm(values - median(values), axis=1) for values in (rate, mean[:, :3]))
     turns = (true > MIN_TURN_RAD_S) & (last - first < POSES_APART_NS)
     turns &= (t_s >= steps_s[0]) & (t_s <= steps_s[-1])
     if turns.sum() < FEWEST_TURNS:
         return None
-    return float(np.median(np.interp(t_s[turns], steps_s, measured)) / np.median(true[turns]))
+    return float(median(np.interp(t_s[turns], steps_s, measured)) / median(true[turns]))

@@ -5,6 +5,7 @@ Results go to stdout; log lines and progress go to stderr.
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import signal
@@ -44,6 +45,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     sys.unraisablehook = _unraisable
     gc.set_threshold(100_000)  # imports make objects that stay: the collector took a twelfth of a command's start
+    atexit.register(gc.freeze)  # and at the end it would look at all of them again, which takes 45 ms of CPU
     words = sys.argv[1:]
     try:
         if words in ([], ["--help"]) and COMPLETION not in os.environ:

@@ -25,7 +25,7 @@ from msgspec import Meta
 from imutool.array_types import Bool, Float64, Int64
 from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
-from imutool.recording.columns import quantile, true_ranges
+from imutool.recording.columns import median, quantile, true_ranges
 
 WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
 TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, a slow turn that changes 11
@@ -144,7 +144,7 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
         & ~np.lib.stride_tricks.sliding_window_view(blocks.late, width).any(axis=-1)
     )
     if rests.any():  # a turn-on bias does not jump: an outlier among the resting windows is a steady turn
-        rests &= np.linalg.norm(gyro_mean - np.median(gyro_mean[rests], axis=0), axis=1) <= settings.gyro_agreement_rad_s
+        rests &= np.linalg.norm(gyro_mean - median(gyro_mean[rests]), axis=1) <= settings.gyro_agreement_rad_s
     resting_blocks = np.zeros(count, bool)
     for shift in range(width):
         resting_blocks[shift : shift + len(rests)] |= rests

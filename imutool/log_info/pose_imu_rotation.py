@@ -13,6 +13,7 @@ from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.recording import Imu, seconds
+from imutool.recording.columns import median
 
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
@@ -48,7 +49,7 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     start_ns, end_ns, rate = turning(poses)
     first, last = int(imu.t_ns[0]), int(imu.t_ns[-1])
     steps = (end_ns - start_ns).astype(float)
-    inside = (start_ns >= first) & (end_ns <= last) & (steps < 4.0 * np.median(steps)) & np.isfinite(rate).all(axis=1)
+    inside = (start_ns >= first) & (end_ns <= last) & (steps < 4.0 * median(steps)) & np.isfinite(rate).all(axis=1)
     if inside.sum() < LEAST_TURNS:
         return None
     t = seconds(imu.t_ns, first)

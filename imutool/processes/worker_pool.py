@@ -12,6 +12,7 @@ a crash of its own, such as a segmentation fault, uses up one of an item's retri
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import pickle
@@ -248,6 +249,7 @@ def serve(descriptor: int) -> None:
     """Apply the function that comes first to all items that follow, until this process is ended."""
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.set_threshold(100_000)  # as in every command: imports make objects that stay
     with contextlib.suppress(OSError):  # when memory runs out a worker ends, not the process that keeps the results
         Path("/proc/self/oom_score_adj").write_text("500")
     connection, items = opened(descriptor), queue.SimpleQueue[Any]()

@@ -155,6 +155,13 @@ def quantile(values: Shaped[np.ndarray, "n ..."], share: float) -> Any:
     return below + (place - int(place)) * (above - below)
 
 
+def median(values: Shaped[np.ndarray, "..."], axis: int = 0) -> Any:
+    """Median along an axis of finite values; `np.median` would import masked arrays."""
+    below, above = (values.shape[axis] - 1) // 2, values.shape[axis] // 2
+    ordered = np.partition(values, (below, above), axis=axis)
+    return 0.5 * (ordered.take(below, axis) + ordered.take(above, axis))
+
+
 def clock_jumps(t_ns: Int64[np.ndarray, " n"]) -> list[tuple[int, float]]:
     """Jumps of a clock: the first stamp behind each, and the step to it (s); stamps may go back."""
     step = np.diff(t_ns)

@@ -10,7 +10,7 @@ from imutool.array_types import Float64, Int64
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
-from imutool.recording.columns import true_ranges
+from imutool.recording.columns import median, true_ranges
 
 PART = 64  # samples whose median period is one row
 CHANGE = 1.2  # times the usual period, or the usual period so many times this one
@@ -37,7 +37,7 @@ class ChangedRate(Rule):
         stamp = np.concatenate([self._waiting, samples.stamp_ns])
         parts = max(len(stamp) - 1, 0) // PART
         if parts:
-            self._rows.append(np.median(np.diff(stamp[: parts * PART + 1]).reshape(parts, PART), axis=1))
+            self._rows.append(median(np.diff(stamp[: parts * PART + 1]).reshape(parts, PART), axis=1))
             edges = stamp[: parts * PART + 1 : PART]
             self._ends.append(np.column_stack([edges[:-1], edges[1:]]))
         self._waiting = stamp[parts * PART :]
@@ -47,7 +47,7 @@ class ChangedRate(Rule):
         if not self._rows:
             return
         period, ends = np.concatenate(self._rows), np.concatenate(self._ends)
-        usual = float(np.median(period))
+        usual = float(median(period))
         other = (period > CHANGE * usual) | (period * CHANGE < usual)
         stretches = [(a, b) for a, b in true_ranges(other) if b - a >= LEAST_PARTS]
         if not stretches:
@@ -57,7 +57,7 @@ class ChangedRate(Rule):
         whole.other_rate_ns = [(int(ends[max(a - 1, 0), 0]), int(ends[min(b, last), 1])) for a, b in stretches]
         count = PART * sum(b - a for a, b in stretches)
         share = count / whole.motion.samples
-        rates = [float(1e9 / np.median(period[a:b])) for a, b in stretches]
+        rates = [float(1e9 / median(period[a:b])) for a, b in stretches]
         distrust = f"the rate changes, {100 * share:.0f} % of the samples have another" if share > DISTRUST else ""
         yield Finding(
             "changed_rate",

@@ -9,6 +9,7 @@ import numpy as np
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
+from imutool.recording.columns import median
 
 PART = 256  # samples whose median delay is one row
 AROUND = 3  # rows on either side of a step, so that a burst that comes late is none
@@ -46,13 +47,13 @@ class ClockJumps(Rule):
         delay = table[:, 2] - table[:, 1]
         if self._last is None:
             self._last = int(delay[0]), int(table[0, 1]), int(table[0, 0]) - 1
-        median = float(np.median(delay))
+        usual = float(median(delay))
         changes = np.abs(np.diff(delay, prepend=self._last[0]))
         at = int(np.argmax(changes))
         before_ns, before = self._last[1:] if at == 0 else (int(table[at - 1, 1]), int(table[at - 1, 0]))
-        expected = int(np.median(np.diff(table[:, 1]))) * (int(table[at, 0]) - before)  # what was dropped took its time too
-        scatter = float(np.median(np.abs(delay - median)))
-        self._rows.append((median, scatter, int(changes[at]), int(table[at, 0]), before_ns, int(table[at, 1]), expected))
+        expected = int(median(np.diff(table[:, 1]))) * (int(table[at, 0]) - before)  # what was dropped took its time too
+        scatter = float(median(np.abs(delay - usual)))
+        self._rows.append((usual, scatter, int(changes[at]), int(table[at, 0]), before_ns, int(table[at, 1]), expected))
         self._last = int(delay[-1]), int(table[-1, 1]), int(table[-1, 0])
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
@@ -85,10 +86,10 @@ class ClockJumps(Rule):
         if len(self._rows) < 2:
             return
         level = np.array([row[0] for row in self._rows])
-        least = max(LEAST_S * 1e9, SCATTERS * float(np.median([row[1] for row in self._rows])))
+        least = max(LEAST_S * 1e9, SCATTERS * float(median(np.array([row[1] for row in self._rows]))))
         k = 0
         while k + 1 < len(level):
-            before, after = np.median(level[max(0, k + 1 - AROUND) : k + 1]), np.median(level[k + 1 : k + 1 + AROUND])
+            before, after = median(level[max(0, k + 1 - AROUND) : k + 1]), median(level[k + 1 : k + 1 + AROUND])
             if abs(level[k + 1] - level[k]) > least and abs(after - before) > least:
                 row = max(self._rows[k], self._rows[k + 1], key=lambda row: row[2])
                 yield row, float(after - before) * 1e-9

@@ -12,6 +12,7 @@ from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 from imutool.recording import nanoseconds
+from imutool.recording.columns import median
 
 MISSING = "samples missing"
 MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
@@ -58,7 +59,7 @@ class Gaps(Rule):
         self._last = int(number[-1]), int(stamp[-1])
         steps = np.diff(stamp)
         if len(steps) >= FEWEST_STEPS or (len(steps) and not self._period_ns):
-            self._period_ns = float(np.median(steps))
+            self._period_ns = float(median(steps))
         if not self._period_ns:
             return
         lost = missing(steps, self._period_ns)

@@ -19,6 +19,7 @@ from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
+from imutool.recording.columns import quantile
 
 NEARBY = 10  # samples on either side
 LONGEST = 3  # samples
@@ -73,7 +74,7 @@ def spikes(values: Float64[np.ndarray, "n k"]) -> tuple[Bool[np.ndarray, "n k"],
         return mask, size
     step = np.diff(values, axis=0)
     magnitude = np.abs(step)
-    ordinary = np.array([np.quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in magnitude.T])
+    ordinary = np.array([quantile(column[column > 0], ORDINARY) if column.any() else 0.0 for column in magnitude.T])
     edge = np.zeros((NEARBY, values.shape[1]))
     largest = sliding_window_view(np.concatenate([edge, magnitude, edge]), NEARBY, axis=0).max(axis=-1)  # of steps k-10..k-1
     for width in range(1, LONGEST + 1):

@@ -16,7 +16,7 @@ from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
 from imutool.cleaning.samples import Samples, padded
-from imutool.recording.columns import true_ranges
+from imutool.recording.columns import median, true_ranges
 
 LEAST = 10  # equal samples in a row
 AXIS_LEAST, AXIS_LEAST_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
@@ -139,4 +139,4 @@ def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:
     if len(values) < 4 * LEAST:
         return before
     second, third = np.diff(values, n=2, axis=0), np.diff(values, n=3, axis=0)
-    return bool((np.median(np.abs(third), axis=0) > np.median(np.abs(second), axis=0)).any())
+    return bool((median(np.abs(third)) > median(np.abs(second))).any())

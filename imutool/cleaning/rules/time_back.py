@@ -22,7 +22,7 @@ from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples, padded
 from imutool.recording import nanoseconds
-from imutool.recording.columns import true_ranges
+from imutool.recording.columns import median, true_ranges
 
 AHEAD = 32  # samples asked whether one is ahead of them
 SET_BACK_NS = nanoseconds(1.0)
@@ -131,7 +131,7 @@ class NonMonotonic(Rule):
         back = stamp <= before - SET_BACK_NS
         for row in np.flatnonzero(back | (stamp - before > LONGEST_PAUSE_NS)):
             after = stamp[row : row + AHEAD]
-            if not back[row] or (len(after) > 1 and np.median(after) <= before[row]):
+            if not back[row] or (len(after) > 1 and median(after) <= before[row]):
                 return int(row) if row or self.epochs else len(stamp)
         return len(stamp)
 
