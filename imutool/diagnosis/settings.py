@@ -58,6 +58,11 @@ class NoiseSettings(Settings, frozen=True):
     least_segments: Count = 8  # the median of one or two says too little
     line_bins: Count = 9  # of the running median that takes lines out of a spectrum
     rounds: Count = 2  # alternations of noise and model beside poses
+    walk_mean_s: Positive = 0.5  # of a mean of the residual in which the bias' walk is looked for
+    walk_means: Count = 300  # of a log at most
+    walk_cycles: Positive = 0.1  # of a log in the slowest walk that is looked for: at its corner both noises have one density
+    walk_hz: Positive = 0.5  # corner of the fastest one: the accelerometer of EuRoC's sensor.yaml has 0.25 Hz
+    walk_corners: Count = 14  # tried between these
 
 
 class SignificanceSettings(Settings, frozen=True):

@@ -19,6 +19,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
     WANDER,
@@ -224,15 +225,16 @@ class _Search:
     def tested(self, now: Fit) -> Selection:
         """Selection of the effects that pass on all rows and on held-out blocks."""
         while len(now.chosen) > (first := len(self.always)):
+            now = with_bias_walk(now)
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
             _ = now.jacobians  # which both processes need
             unseen = Forked(partial(first_refuted, now, first))
-            whole = fit(self.logs, now.chosen, part="all", near=now)
+            whole = fit(now.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
-                now = fit(self.logs, reduced)
+                now = fit(now.logs, reduced)
                 unseen.end()
                 continue
-            whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
             verdicts = self._verdicts(whole, first, unseen)
             unseen.end()
             rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
@@ -241,10 +243,11 @@ class _Search:
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
                 selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
                 return Selection(selected, fitted, whole, self.tried, first, partial(self._similar, now))
-            now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
-        return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried, first)
+            now = fit(now.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
+        return Selection((), now, fit(now.logs, now.chosen, part="all"), self.tried, first)
 
-    def _similar(self, now: Fit) -> dict[str, tuple[str, ...]]:
+    def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
+        now = fit(self.logs, tested.chosen, near=tested if tested.logs == tuple(self.logs) else None)  # before any walk
         return {now.keys[k]: tuple(self._rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
@@ -264,7 +267,7 @@ class _Search:
         """Verdicts on effects that pass on unseen time too, up to the first that goes, with no trust in model errors."""
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
-        scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
+        scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
         if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
             return verdicts
         passed = range(first, unseen.result())

@@ -23,6 +23,7 @@ from scipy.stats import t as student
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, parameters_of, priors, with_value
+from imutool.diagnosis.estimation.noise_estimate import squares_of_walk
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 
@@ -62,11 +63,15 @@ def parameter_cost(like: Fit, chosen: Chosen) -> float:
 
 
 def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:
-    """Squares that leaving an effect out costs; after fewer steps of the others, at most."""
+    """Squares that leaving an effect out costs; after fewer steps of the others, at most.
+
+    What a walk of the biases takes up in its place does not count.
+    """
     others = (*whole.chosen[:k], *whole.chosen[k + 1 :])
     without = fit(whole.logs, others, part=whole.part, iterations=iterations, near=whole)
     jumps = any(effect.jumps for effect, _ in others)  # whatever moves the signal a little wins single samples at an edge
-    return (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
+    gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
+    return gain if iterations is not None else gain - max(0.0, squares_of_walk(without, whole) - squares_of_walk(whole, whole))
 
 
 def first_refuted(fitted: Fit, first: int) -> int:
