@@ -18,7 +18,7 @@ Steps = Float64[np.ndarray, " w"]
 
 
 class WalkLikelihood(NamedTuple):
-    """Restricted likelihood of some sizes of a walk: squares left, and the logarithm of the determinants."""
+    """Restricted likelihood of sizes of a walk: squares left, logarithms of determinants."""
 
     squares: Steps
     log_determinant: Steps
@@ -43,9 +43,9 @@ def walk_likelihood(
     block: Int64[np.ndarray, " n"],
     steps: Steps,
 ) -> WalkLikelihood | None:
-    """Likelihood of walks whose steps from block to block have some variances, in units of a sample's white noise.
+    """Likelihood of walks by the variance of their steps from block to block.
 
-    `derivatives` are the residual's by what was fitted, a constant among them. The likelihood is that of what no value of the
+    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant among them. The likelihood is that of what no value of the
     parameters changes (Patterson and Thompson, Biometrika 1971): what they took up is no evidence against a walk. None where
     they leave too few blocks.
     """
@@ -69,7 +69,7 @@ def walk_likelihood(
 
 
 def without_walk(x: Float64[np.ndarray, " n"], steps: float) -> Float64[np.ndarray, " n"]:
-    """White noise from white noise of variance 1 on a walk with steps of some variance.
+    """White noise from white noise of variance 1 on a walk, whose steps have a variance.
 
     The sum is an ARIMA(0, 1, 1) process, (1 - B) x = (1 - theta B) e / sqrt(theta), theta + 1 / theta - 2 = steps (Box and
     Jenkins, Time Series Analysis, sec. 4.3.1). Before the first sample is zero: the walk begins at the constant bias.

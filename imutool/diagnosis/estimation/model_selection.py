@@ -2,9 +2,8 @@
 
 Forward: each candidate is scored beside the effects so far; those of the best score are fitted in full, and the best comes in.
 Then back: an effect that the others have made superfluous goes, and one for which another serves better is exchanged. What
-stays is decided on all rows at once: dropping it must cost more than noise would, corrected for all that was tried, and on
-held-out blocks of time it must help.
-Candidates compare by log p-values of chi-square: twenty squares for one parameter are worth more than twenty-five for nine.
+stays is decided on all rows at once: dropping it must cost more than noise, for all that was tried, and it must help on unseen
+blocks. Candidates compare by log p-values of chi-square: twenty squares for one parameter are worth more than 25 for nine.
 """
 
 from __future__ import annotations
@@ -96,8 +95,8 @@ def select_effects(
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
-    search, settings, waiting, before = replace(first, unnamed=tuple(unnamed)), first.settings, list(later), first.before
-    largest = 0.0  # effect's squares
+    search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
+    before, largest = first.before, 0.0  # squares left, and those of the largest effect
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
@@ -202,9 +201,8 @@ class _Search:
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
         now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
-        return with_common_arm(
-            self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold
-        )
+        log_p, most = self.candidates.log_p, self.threshold
+        return with_common_arm(self.logs, now, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < most)
 
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""
@@ -225,9 +223,8 @@ class _Search:
     def tested(self, now: Fit) -> Selection:
         """Selection of the effects that pass on all rows and on held-out blocks."""
         while len(now.chosen) > (first := len(self.always)):
-            now = with_bias_walk(now)
+            _ = (now := with_bias_walk(now)).jacobians  # which both processes need
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
-            _ = now.jacobians  # which both processes need
             unseen = Forked(partial(first_refuted, now, first))
             whole = fit(now.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
@@ -247,7 +244,7 @@ class _Search:
         return Selection((), now, fit(now.logs, now.chosen, part="all"), self.tried, first)
 
     def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
-        now = fit(self.logs, tested.chosen, near=tested if tested.logs == tuple(self.logs) else None)  # before any walk
+        now = tested if all(log.whiten.walk is None for log in tested.logs) else fit(self.logs, tested.chosen)
         return {now.keys[k]: tuple(self._rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:

@@ -111,7 +111,7 @@ def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"
 
 
 def with_bias_walk(found: Fit) -> Fit:
-    """Fit with the random walk of the biases that its residual shows; the same fit where there is none."""
+    """Fit with the random walk of the biases that its residual shows; itself without one."""
     plain = [replace(log, whiten=replace(log.whiten, walk=None)) for log in found.logs]
     walks = [np.zeros(log.pair.columns) for log in plain]
     for k, (log, forward) in enumerate(zip(plain, found.passes, strict=True)):
@@ -128,9 +128,9 @@ def with_bias_walk(found: Fit) -> Fit:
 
 
 def squares_of_walk(found: Fit, like: Fit) -> float:
-    """Squares that random walks of the biases explain of a fit's residual, where its noise has none: twice the log-likelihood.
+    """Squares that random walks of the biases explain of a fit's residual.
 
-    `like` is the fit whose derivatives serve, with the same effects and perhaps more.
+    They are twice the gain in log-likelihood; none where the noise of the logs has the walk already. `like` is the fit whose derivatives serve, with the same effects and perhaps more.
     """
     gained, noise = 0.0, max(1.0, like.reduced_chi_square)
     kept = np.concatenate([np.arange(*like.place(key).indices(len(like.prior))) for key in found.keys] or [np.zeros(0)])

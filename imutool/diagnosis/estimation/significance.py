@@ -63,15 +63,12 @@ def parameter_cost(like: Fit, chosen: Chosen) -> float:
 
 
 def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:
-    """Squares that leaving an effect out costs; after fewer steps of the others, at most.
-
-    What a walk of the biases takes up in its place does not count.
-    """
+    """Squares that leaving an effect out costs, at most, beyond what a walk of biases takes."""
     others = (*whole.chosen[:k], *whole.chosen[k + 1 :])
     without = fit(whole.logs, others, part=whole.part, iterations=iterations, near=whole)
     jumps = any(effect.jumps for effect, _ in others)  # whatever moves the signal a little wins single samples at an edge
-    gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
-    return gain if iterations is not None else gain - max(0.0, squares_of_walk(without, whole) - squares_of_walk(whole, whole))
+    walk = squares_of_walk(without, whole) - squares_of_walk(whole, whole) if iterations is None else 0.0
+    return (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0) - max(0.0, walk)
 
 
 def first_refuted(fitted: Fit, first: int) -> int:
@@ -256,8 +253,7 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
         J[axis, where] = J_axis - np.outer(J_axis @ constant, constant) / max(float(constant @ constant), 1e-300)
     J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
-    duration_s = float(t_s[-1] - t_s[0])
-    block = np.floor((t_s - t_s[0]) / min(block_s, duration_s / log.pair.settings.significance.least_blocks)).astype(int)
+    block = np.floor((t_s - t_s[0]) / min(block_s, np.ptp(t_s) / log.pair.settings.significance.least_blocks)).astype(int)
     out = []
     for number in np.unique(block):
         inside = block == number

@@ -107,7 +107,8 @@ class Whitener:
         for white, of, row in zip(out, taps, slow, strict=True):  # numpy's loop for few taps takes half the time of lfilter
             white[:] = np.convolve(row, of)[: len(row)]
         if self.walk is not None:
-            out = np.stack([without_walk(row, float(steps)) for row, steps in zip(out, self.walk[axes], strict=True)])
+            for white, steps in zip(out, self.walk[axes].tolist(), strict=True):
+                white[:] = without_walk(white, steps)
         if self.counts is not None and len(out):
             out[~self.counts.T[axes]] = 0.0
         return out

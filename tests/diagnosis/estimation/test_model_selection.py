@@ -59,6 +59,36 @@ def sure(found: Selection, name: str, truth: list[float]) -> bool:
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
 
 
+# ── a bias that walks ──
+
+WALK_S, CORNER_HZ = 60.0, 0.1  # where the walk and the white noise have one density
+
+
+def walking(effects: dict[str, list[float]], seed: int) -> Pair:
+    count = len(planted.clock(WALK_S))
+    steps = 2.0 * np.pi * CORNER_HZ / planted.RATE_HZ * planted.noise(count, seed + 100)
+    return planted.pair(planted.rich(duration_s=WALK_S), effects, seed, added=np.cumsum(steps, axis=0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bias_that_walks_is_no_drift(seed: int) -> None:
+    assert names(asked(walking({}, seed), beyond=False)) == []
+
+
+def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> None:
+    found = asked(walking({"accel_scale": SINGLE["gyro_scale"]}, 1), beyond=False)
+    assert names(found) == ["accel_scale"]
+    assert sure(found, "accel_scale", SINGLE["gyro_scale"])
+
+
+def test_a_drift_is_a_drift_and_no_walk() -> None:
+    drift = [0.01, -0.02, 0.01, 20.0]
+    pair = planted.pair(planted.rich(duration_s=WALK_S), {"gyro_bias_drift": drift})
+    found = asked(pair, beyond=False)
+    assert names(found) == ["gyro_bias_drift"]
+    assert sure(found, "gyro_bias_drift", drift)
+
+
 # ── log_p_value ──
 
 
