@@ -45,9 +45,9 @@ def walk_likelihood(
 ) -> WalkLikelihood | None:
     """Likelihood of walks by the variance of their steps from block to block.
 
-    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant among them. The likelihood is that of what no value of the
-    parameters changes (Patterson and Thompson, Biometrika 1971): what they took up is no evidence against a walk. None where
-    they leave too few blocks.
+    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant among
+    them. The likelihood is that of what no value of the parameters changes (Patterson and Thompson, Biometrika 1971): what
+    they took up is no evidence against a walk. None where they leave too few blocks.
     """
     names, inverse, count = np.unique(block, return_inverse=True, return_counts=True)
     root = np.sqrt(count)

@@ -32,6 +32,7 @@ RIDGE = 1e-8
 MOSTLY = 2.0  # times the white noise: less is noise for the most part
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
+OnAxis = tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q _"]]  # parameters that act on an axis, and their derivatives
 EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the bands in which the poses are checked
 
 
@@ -130,13 +131,14 @@ def with_bias_walk(found: Fit) -> Fit:
 def squares_of_walk(found: Fit, like: Fit) -> float:
     """Squares that random walks of the biases explain of a fit's residual.
 
-    They are twice the gain in log-likelihood; none where the noise of the logs has the walk already. `like` is the fit whose derivatives serve, with the same effects and perhaps more.
+    They are twice the gain in log-likelihood; none where the noise of the logs has the walk already. `like` is the fit whose
+    derivatives serve, with the same effects and perhaps more.
     """
     gained, noise = 0.0, max(1.0, like.reduced_chi_square)
     kept = np.concatenate([np.arange(*like.place(key).indices(len(like.prior))) for key in found.keys] or [np.zeros(0)])
     for k, log in enumerate(found.logs if all(log.whiten.walk is None for log in found.logs) else ()):
 
-        def on_axis(axis: int, rows: Bool[np.ndarray, " n"], k: int = k) -> tuple[Int64[np.ndarray, " q"], Axes]:
+        def on_axis(axis: int, rows: Bool[np.ndarray, " n"], k: int = k) -> OnAxis:
             where, J = like.jacobians.on_axis(k, axis, rows)
             return where[np.isin(where, kept)], J[np.isin(where, kept)]
 
@@ -149,7 +151,7 @@ def squares_of_walk(found: Fit, like: Fit) -> float:
 def _walks(
     log: WhitenedLog,
     residual: Float64[np.ndarray, "n k"],
-    on_axis: Callable[[int, Bool[np.ndarray, " n"]], tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q n"]]],
+    on_axis: Callable[[int, Bool[np.ndarray, " n"]], OnAxis],
 ) -> Iterator[tuple[Int64[np.ndarray, " a"], Float64[np.ndarray, " w"], list[WalkLikelihood]]]:
     """Axes of each sensor of an IMU, which walk alike, steps of a walk from row to row, and their likelihood by axis."""
     if not isinstance(log, WhitenedImu):
