@@ -277,14 +277,14 @@ class _Search:
         left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
 
         def hidden(iterations: int | None) -> frozenset[str]:
-            more = {key: gain_of(whole, k, iterations) for key, k in left.items()} if FOLLOWING & gains.keys() else {}
+            more = {key: gain_of(whole, k, iterations)[0] for key, k in left.items()} if FOLLOWING & gains.keys() else {}
             denoised = any(log.pair.denoised for log in self.logs)
             return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
 
         below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
-    def _verdict(self, k: int, gain: float, whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
+    def _verdict(self, k: int, gain: tuple[float, float], whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
         """Verdict on one effect by all rows; none if chance explains it or it is no answer."""
         effect, theta = whole.chosen[k]
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
@@ -292,9 +292,9 @@ class _Search:
         no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or shrinks_motion(effect, theta, self.logs)
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
-        log_p = self.candidates.log_p(effect, gain)
+        log_p = self.candidates.log_p(effect, gain[1])
         if scattered is not None:
-            log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
+            log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
-        return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain) if rate < 1.0 else None
+        vague = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
+        return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None

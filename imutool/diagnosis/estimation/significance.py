@@ -62,13 +62,13 @@ def parameter_cost(like: Fit, chosen: Chosen) -> float:
     return len(parameters_of(chosen)) * float(np.log(like.numbers)) + search.unnamed_penalty * unnamed
 
 
-def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:
-    """Squares that leaving an effect out costs, at most, beyond what a walk of biases takes."""
-    others = (*whole.chosen[:k], *whole.chosen[k + 1 :])
-    without = fit(whole.logs, others, part=whole.part, iterations=iterations, near=whole)
-    jumps = any(effect.jumps for effect, _ in others)  # whatever moves the signal a little wins single samples at an edge
+def gain_of(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
+    """Squares that leaving an effect out costs, at most, and those that no walk of a bias saves."""
+    without = fit(whole.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part=whole.part, iterations=iterations, near=whole)
+    jumps = any(effect.jumps for effect, _ in without.chosen)  # what moves a signal a little wins single samples at an edge
+    gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
     walk = squares_of_walk(without, whole) - squares_of_walk(whole, whole) if iterations is None else 0.0
-    return (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0) - max(0.0, walk)
+    return gain, gain - max(0.0, walk)
 
 
 def first_refuted(fitted: Fit, first: int) -> int:
