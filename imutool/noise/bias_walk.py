@@ -26,11 +26,11 @@ class WalkLikelihood(NamedTuple):
 
     def white(self) -> Steps:
         """Variance of the white noise for each size of the walk."""
-        return self.squares / self.free
+        return np.asarray(self.squares / self.free)
 
     def of_any_noise(self) -> Steps:
         """Log-likelihood with the best variance of the white noise."""
-        return -0.5 * (self.free * np.log(self.white()) + self.log_determinant)
+        return np.asarray(-0.5 * (self.free * np.log(self.white()) + self.log_determinant))
 
     def of_noise(self, variance: float) -> Steps:
         """Log-likelihood with a known variance of the white noise."""

@@ -135,7 +135,7 @@ def squares_of_walk(found: Fit, like: Fit) -> float:
     derivatives serve, with the same effects and perhaps more.
     """
     gained, noise = 0.0, max(1.0, like.reduced_chi_square)
-    kept = np.concatenate([np.arange(*like.place(key).indices(len(like.prior))) for key in found.keys] or [np.zeros(0)])
+    kept = [j for key in found.keys for j in range(*like.place(key).indices(len(like.prior)))]
     for k, log in enumerate(found.logs if all(log.whiten.walk is None for log in found.logs) else ()):
 
         def on_axis(axis: int, rows: Bool[np.ndarray, " n"], k: int = k) -> OnAxis:
@@ -161,10 +161,10 @@ def _walks(
     block_s = max(own.walk_mean_s, float(t_s[-1]) / own.walk_means)
     corners_hz = np.geomspace(min(own.walk_cycles / t_s[-1], own.walk_hz), own.walk_hz, own.walk_corners)
     steps = np.append(0.0, (2.0 * np.pi * corners_hz * row_s) ** 2)  # at the corner both noises have one density
-    known = pair.axes if pair.known is None else pair.known.all(axis=0)
+    known = pair.axes if pair.known is None else np.asarray(pair.known.all(axis=0))
     for part in pair.signals.values():
         found = dict[int, WalkLikelihood]()
-        for axis in (part.start + np.flatnonzero(known[part])).tolist():
+        for axis in [k for k in range(*part.indices(len(known))) if known[k]]:
             rows = settled(pair.usable[::every, axis], log.whiten.order)
             derivatives = np.concatenate([log.constants[rows, axis][None], on_axis(axis, rows)[1]])
             block = (t_s[rows] / block_s).astype(int)
