@@ -34,7 +34,7 @@ class WalkLikelihood(NamedTuple):
 
     def of_noise(self, variance: float) -> Steps:
         """Log-likelihood with a known variance of the white noise."""
-        return -0.5 * (self.squares / variance + self.log_determinant)
+        return np.asarray(-0.5 * (self.squares / variance + self.log_determinant))
 
 
 def walk_likelihood(

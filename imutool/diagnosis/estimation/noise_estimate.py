@@ -119,7 +119,7 @@ def with_bias_walk(found: Fit) -> Fit:
         jacobians = Jacobians([log.whiten], [forward], found.chosen)
         for axes, steps, each in _walks(log, log.residual(forward.blocks), partial(jacobians.on_axis, 0)):
             likely = sum((one.of_any_noise() for one in each), start=np.zeros(len(steps)))
-            best = int(np.argmax(likely))
+            best = _likeliest(likely)
             if 2.0 * (likely[best] - likely[0]) > log.pair.settings.search.clearly_better:
                 walks[k][axes] = steps[best] * np.array([one.white()[best] for one in each])
     if not any(walk.any() for walk in walks) and all(log.whiten.walk is None for log in found.logs):
@@ -144,8 +144,14 @@ def squares_of_walk(found: Fit, like: Fit) -> float:
 
         for _, steps, each in _walks(log, found.residuals[k], on_axis):
             likely = sum((one.of_noise(noise) for one in each), start=np.zeros(len(steps)))
-            gained += 2.0 * noise * float(likely.max() - likely[0])
+            gained += 2.0 * noise * float(likely[_likeliest(likely)] - likely[0])
     return gained
+
+
+def _likeliest(likely: Axes) -> int:
+    """Index of the likeliest walk; none where that is the fastest, for what is faster is a motion's misfit."""
+    best = int(np.argmax(likely))
+    return best if best < len(likely) - 1 else 0
 
 
 def _walks(

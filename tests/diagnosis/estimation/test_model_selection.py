@@ -18,6 +18,7 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
+from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
@@ -79,6 +80,12 @@ def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> N
     found = asked(walking({"accel_scale": SINGLE["gyro_scale"]}, 1), beyond=False)
     assert names(found) == ["accel_scale"]
     assert sure(found, "accel_scale", SINGLE["gyro_scale"])
+
+
+def test_a_misfit_that_follows_the_motion_is_no_walk() -> None:
+    pair = planted.pair(planted.rich(duration_s=WALK_S), {"accel_scale": [0.05, -0.05, 0.05]})
+    without = fit([planted.weighed(pair)], ())
+    assert with_bias_walk(without) is without
 
 
 def test_a_drift_is_a_drift_and_no_walk() -> None:
