@@ -83,7 +83,7 @@ def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> N
 
 
 def test_a_misfit_that_follows_the_motion_is_no_walk() -> None:
-    pair = planted.pair(planted.rich(duration_s=WALK_S), {"accel_scale": [0.05, -0.05, 0.05]})
+    pair = planted.pair(planted.shaken(), {"gyro_scale": [0.05, -0.05, 0.05]})
     without = fit([planted.weighed(pair)], ())
     assert with_bias_walk(without) is without
 
