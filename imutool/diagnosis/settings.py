@@ -58,6 +58,11 @@ class NoiseSettings(Settings, frozen=True):
     least_segments: Count = 8  # the median of one or two says too little
     line_bins: Count = 9  # of the running median that takes lines out of a spectrum
     rounds: Count = 2  # alternations of noise and model beside poses
+    walk_mean_s: Positive = 0.5  # of a mean of the residual in which the bias' walk is looked for
+    walk_means: Count = 300  # of a log at most
+    walk_cycles: Positive = 0.1  # of a log in the slowest walk that is looked for: at its corner both noises have one density
+    walk_hz: Positive = 0.5  # corner of the fastest one: the accelerometer of EuRoC's sensor.yaml has 0.25 Hz
+    walk_corners: Count = 14  # tried between these
 
 
 class SignificanceSettings(Settings, frozen=True):
@@ -165,7 +170,9 @@ class SearchSettings(Settings, frozen=True):
     slowest_hz: Positive = 0.5  # of a filter or a mount; a slower one is motion that the poses have lost
     ringing_segment_s: Positive = 8.0  # of the spectra in which a mount beyond the band has to ring
     ringing_power: Positive = 4.0  # of the readings that it may have there; right ones had at most 1.3
-    beyond_sim_noise: Positive = 2.0  # of a simulation's sample: a narrower dead band takes what a filter left of it
+    beyond_sim_noise: Positive = (
+        4.5  # of a simulation's sample, the largest of 25 000: a narrower dead band takes what is left of it
+    )
     white_chi_square: Positive = 1.15  # reduced: up to it the noise beside a simulation is taken as measured
     exchanged_effects: Count = 3  # up to which each is compared with replacements
     give_up_factor: Positive = 4.0  # over the needed squares: a fit as far off after a few steps gets no nearer

@@ -96,7 +96,7 @@ def summarize(
         sim=sim,
         located=tuple(msgspec.structs.replace(at, log=reals[at.log]) if at.log else at for at in located),
         findings=tuple(findings),
-        bias=selection.whole.bias,
+        bias=_biases(selection.whole),
         not_identifiable=_not_identifiable(selection, idle, hidden),
         unexplained=unexplained,
         remarks=(*dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *remarks(all_findings, sim_findings)),
@@ -153,6 +153,14 @@ def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d:
     )
 
 
+def _biases(whole: Fit) -> Float64[np.ndarray, "logs 6"]:
+    """Constant bias of each log: the mean of one that walks, whose fit knows where it began."""
+    if all(log.whiten.walk is None for log in whole.logs):
+        return whole.bias
+    pairs = [log.pair for log in whole.logs]
+    return np.array([with_effects(pair, whole.chosen)[0] - expected(pair, whole.chosen)[0] for pair in pairs])
+
+
 def _worthwhile(
     logs: Sequence[WhitenedImu], selection: Selection, noise: Float64[np.ndarray, "6"], digits: Sequence[Finding]
 ) -> tuple[Selection, list[Finding], list[str]]:
@@ -163,7 +171,7 @@ def _worthwhile(
         idle += [named[least].effect] if named[least].share <= 0.0 else []
         name = selection.selected[least].effect.key
         fitted, whole = (
-            fit(logs, tuple(entry for entry in before.chosen if entry[0].key != name), part=before.part, near=before)
+            fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key != name), part=before.part, near=before)
             for before in (selection.fitted, selection.whole)
         )
         theta = {effect.key: value for effect, value in whole.chosen}

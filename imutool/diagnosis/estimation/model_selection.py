@@ -2,9 +2,8 @@
 
 Forward: each candidate is scored beside the effects so far; those of the best score are fitted in full, and the best comes in.
 Then back: an effect that the others have made superfluous goes, and one for which another serves better is exchanged. What
-stays is decided on all rows at once: dropping it must cost more than noise would, corrected for all that was tried, and on
-held-out blocks of time it must help.
-Candidates compare by log p-values of chi-square: twenty squares for one parameter are worth more than twenty-five for nine.
+stays is decided on all rows at once: dropping it must cost more than noise, for all that was tried, and it must help on unseen
+blocks. Candidates compare by log p-values of chi-square: twenty squares for one parameter are worth more than 25 for nine.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
     WANDER,
@@ -95,8 +95,8 @@ def select_effects(
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
-    search, settings, waiting, before = replace(first, unnamed=tuple(unnamed)), first.settings, list(later), first.before
-    largest = 0.0  # effect's squares
+    search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
+    before, largest = first.before, 0.0  # squares left, and those of the largest effect
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
@@ -201,9 +201,8 @@ class _Search:
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
         now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
-        return with_common_arm(
-            self.logs, now, self.named, self.settings, lambda effect, gain: self.candidates.log_p(effect, gain) < self.threshold
-        )
+        log_p, most = self.candidates.log_p, self.threshold
+        return with_common_arm(self.logs, now, self.named, self.settings, lambda effect, gain: log_p(effect, gain) < most)
 
     def pruned(self, now: Fit) -> Fit:
         """The fit without effects that the others have made superfluous."""
@@ -224,15 +223,15 @@ class _Search:
     def tested(self, now: Fit) -> Selection:
         """Selection of the effects that pass on all rows and on held-out blocks."""
         while len(now.chosen) > (first := len(self.always)):
+            _ = (now := with_bias_walk(now)).jacobians  # which both processes need
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
-            _ = now.jacobians  # which both processes need
             unseen = Forked(partial(first_refuted, now, first))
-            whole = fit(self.logs, now.chosen, part="all", near=now)
+            whole = fit(now.logs, now.chosen, part="all", near=now)
             if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
-                now = fit(self.logs, reduced)
+                now = fit(now.logs, reduced)
                 unseen.end()
                 continue
-            whole, self.onset_std = estimate_onsets(self.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
             verdicts = self._verdicts(whole, first, unseen)
             unseen.end()
             rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
@@ -241,10 +240,11 @@ class _Search:
                 fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
                 selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
                 return Selection(selected, fitted, whole, self.tried, first, partial(self._similar, now))
-            now = fit(self.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
-        return Selection((), now, fit(self.logs, now.chosen, part="all"), self.tried, first)
+            now = fit(now.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
+        return Selection((), now, fit(now.logs, now.chosen, part="all"), self.tried, first)
 
-    def _similar(self, now: Fit) -> dict[str, tuple[str, ...]]:
+    def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
+        now = tested if all(log.whiten.walk is None for log in tested.logs) else fit(self.logs, tested.chosen)
         return {now.keys[k]: tuple(self._rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
@@ -264,7 +264,7 @@ class _Search:
         """Verdicts on effects that pass on unseen time too, up to the first that goes, with no trust in model errors."""
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
-        scattered = None if white else scatter(self.logs, whole, whole.part, self.settings.robust_block_s)
+        scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
         if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
             return verdicts
         passed = range(first, unseen.result())
@@ -277,14 +277,14 @@ class _Search:
         left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
 
         def hidden(iterations: int | None) -> frozenset[str]:
-            more = {key: gain_of(whole, k, iterations) for key, k in left.items()} if FOLLOWING & gains.keys() else {}
+            more = {key: gain_of(whole, k, iterations)[0] for key, k in left.items()} if FOLLOWING & gains.keys() else {}
             denoised = any(log.pair.denoised for log in self.logs)
             return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
 
         below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
-    def _verdict(self, k: int, gain: float, whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
+    def _verdict(self, k: int, gain: tuple[float, float], whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
         """Verdict on one effect by all rows; none if chance explains it or it is no answer."""
         effect, theta = whole.chosen[k]
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
@@ -292,9 +292,9 @@ class _Search:
         no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or shrinks_motion(effect, theta, self.logs)
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
-        log_p = self.candidates.log_p(effect, gain)
+        log_p = self.candidates.log_p(effect, gain[1])
         if scattered is not None:
-            log_p = max(log_p, scattered.log_p_value(effect.key, gain, len(theta)) + self.candidates.log_choices[effect.key])
+            log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        unseen = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
-        return SelectedEffect(effect, theta, std, unseen, float(np.exp(max(log_p, -700.0))), rate, gain) if rate < 1.0 else None
+        vague = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
+        return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None

@@ -23,6 +23,7 @@ from scipy.stats import t as student
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, parameters_of, priors, with_value
+from imutool.diagnosis.estimation.noise_estimate import squares_of_walk
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 
@@ -61,12 +62,13 @@ def parameter_cost(like: Fit, chosen: Chosen) -> float:
     return len(parameters_of(chosen)) * float(np.log(like.numbers)) + search.unnamed_penalty * unnamed
 
 
-def gain_of(whole: Fit, k: int, iterations: int | None = None) -> float:
-    """Squares that leaving an effect out costs; after fewer steps of the others, at most."""
-    others = (*whole.chosen[:k], *whole.chosen[k + 1 :])
-    without = fit(whole.logs, others, part=whole.part, iterations=iterations, near=whole)
-    jumps = any(effect.jumps for effect, _ in others)  # whatever moves the signal a little wins single samples at an edge
-    return (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
+def gain_of(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
+    """Squares that leaving an effect out costs, at most, and those that no walk of a bias saves."""
+    without = fit(whole.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part=whole.part, iterations=iterations, near=whole)
+    jumps = any(effect.jumps for effect, _ in without.chosen)  # what moves a signal a little wins single samples at an edge
+    gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
+    walk = squares_of_walk(without, whole) - squares_of_walk(whole, whole) if iterations is None else 0.0
+    return gain, gain - max(0.0, walk)
 
 
 def first_refuted(fitted: Fit, first: int) -> int:
@@ -251,8 +253,7 @@ def _blocks(log: WhitenedLog, found: Fit, k: int, part: str, block_s: float) -> 
         J[axis, where] = J_axis - np.outer(J_axis @ constant, constant) / max(float(constant @ constant), 1e-300)
     J[:, begins] = 0.0
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
-    duration_s = float(t_s[-1] - t_s[0])
-    block = np.floor((t_s - t_s[0]) / min(block_s, duration_s / log.pair.settings.significance.least_blocks)).astype(int)
+    block = np.floor((t_s - t_s[0]) / min(block_s, np.ptp(t_s) / log.pair.settings.significance.least_blocks)).astype(int)
     out = []
     for number in np.unique(block):
         inside = block == number

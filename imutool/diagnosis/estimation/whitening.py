@@ -19,11 +19,13 @@ from scipy.signal import firwin, lfilter, periodogram
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Blocks, Pair
 from imutool.diagnosis.settings import NoiseSettings
+from imutool.noise.bias_walk import without_walk
 
 Rows = Sequence[Float64[np.ndarray, " n"]] | Float64[np.ndarray, "r n"]
 MAD_TO_STD = 1.4826
 LEAST_STD = 1e-12
 AT_ONCE = 8  # values of a band in one product of matrices
+FORGOTTEN = 1e-12  # of the noise: its square would underflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +80,15 @@ class Band:
 class Whitener:
     """Whitening filter for each axis, with the standard deviation of its output.
 
-    `counts` are the values that come out and tell anything (none: all); the others come out as zero, whatever goes in.
+    `counts` are the values that come out and tell anything (none: all); the others come out as zero, whatever goes in. `walk`
+    are the variances of the steps of a bias that walks, from row to row and in units of `std` (none: the bias is constant).
     """
 
     filters: Float64[np.ndarray, "k order"]
     std: Float64[np.ndarray, " k"]
     band: Band | None = None
     counts: Bool[np.ndarray, "m k"] | None = None
+    walk: Float64[np.ndarray, " k"] | None = None
 
     def __call__(self, x: Float64[np.ndarray, "n k *p"]) -> Float64[np.ndarray, "m k *p"]:
         """White rows from coloured ones (fewer in a band); columns of zeros stay zeros."""
@@ -102,6 +106,9 @@ class Whitener:
         out = np.empty((len(slow), len(slow[0]) if len(slow) else 0))
         for white, of, row in zip(out, taps, slow, strict=True):  # numpy's loop for few taps takes half the time of lfilter
             white[:] = np.convolve(row, of)[: len(row)]
+        if self.walk is not None:
+            for white, steps in zip(out, self.walk[axes].tolist(), strict=True):
+                white[:] = without_walk(white, steps)
         if self.counts is not None and len(out):
             out[~self.counts.T[axes]] = 0.0
         return out
@@ -147,8 +154,9 @@ class WhitenedLog:
 
     @cached_property
     def constants(self) -> Float64[np.ndarray, "n k"]:
-        """A constant on each axis, whitened."""
-        return self.whiten(np.ones_like(self.pair.real))
+        """A constant on each axis, whitened; a bias that walks forgets it."""
+        white = self.whiten(np.ones_like(self.pair.real))
+        return np.where(np.abs(white) > FORGOTTEN, white, 0.0)
 
     def residual(
         self, blocks: Blocks, known: tuple[Blocks, Float64[np.ndarray, "m k"]] | None = None

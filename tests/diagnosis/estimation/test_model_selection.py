@@ -18,6 +18,7 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
+from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
@@ -57,6 +58,42 @@ def names(found: Selection) -> list[str]:
 def sure(found: Selection, name: str, truth: list[float]) -> bool:
     one = next(one for one in found.selected if one.effect.key == name)
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
+
+
+# ── a bias that walks ──
+
+WALK_S, CORNER_HZ = 60.0, 0.1  # where the walk and the white noise have one density
+
+
+def walking(effects: dict[str, list[float]], seed: int) -> Pair:
+    count = len(planted.clock(WALK_S))
+    steps = 2.0 * np.pi * CORNER_HZ / planted.RATE_HZ * planted.noise(count, seed + 100)
+    return planted.pair(planted.rich(duration_s=WALK_S), effects, seed, added=np.cumsum(steps, axis=0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bias_that_walks_is_no_drift(seed: int) -> None:
+    assert names(asked(walking({}, seed), beyond=False)) == []
+
+
+def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> None:
+    found = asked(walking({"accel_scale": SINGLE["gyro_scale"]}, 1), beyond=False)
+    assert names(found) == ["accel_scale"]
+    assert sure(found, "accel_scale", SINGLE["gyro_scale"])
+
+
+def test_a_misfit_that_follows_the_motion_is_no_walk() -> None:
+    pair = planted.pair(planted.shaken(), {"gyro_scale": [0.05, -0.05, 0.05]})
+    without = fit([planted.weighed(pair)], ())
+    assert with_bias_walk(without) is without
+
+
+def test_a_drift_is_a_drift_and_no_walk() -> None:
+    drift = [0.01, -0.02, 0.01, 20.0]
+    pair = planted.pair(planted.rich(duration_s=WALK_S), {"gyro_bias_drift": drift})
+    found = asked(pair, beyond=False)
+    assert names(found) == ["gyro_bias_drift"]
+    assert sure(found, "gyro_bias_drift", drift)
 
 
 # ── log_p_value ──
@@ -173,7 +210,7 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
         list[tuple[int, int | None]](),
     )
 
-    def recorded(whole: Fit, k: int, iterations: int | None = None) -> float:
+    def recorded(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
         asked_of.append((k, iterations))
         return gain_of(whole, k, iterations)
 
@@ -183,7 +220,7 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
     offset, *_ = search._verdicts(now, 0, Forked(lambda: 1))
     assert (offset.false_discovery_rate == 1.0) == (model_error == 0.5)
     assert asked_of == [(0, 1), (0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
-    assert all(gain_of(now, k) <= gain_of(now, k, 0) for k in range(3))
+    assert all(gain_of(now, k)[0] <= gain_of(now, k, 0)[0] for k in range(3))
 
 
 def test_unseen_time_is_not_waited_for_where_chance_explains_the_first_effect() -> None:

@@ -1,0 +1,80 @@
+"""Random walk of a bias beside white noise: its likelihood from means of a residual.
+
+Every gyro and accelerometer walks (rate random walk: IEEE 952, 1293). The walk is slow, and so is a drift, or what follows a
+temperature: an effect that is weighed against white noise alone explains the walk.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from imutool.array_types import Float64, Int64
+
+INDEPENDENT = 1e-3  # of the largest singular value, below which a derivative is a combination of others
+Steps = Float64[np.ndarray, " w"]
+
+
+class WalkLikelihood(NamedTuple):
+    """Restricted likelihood of sizes of a walk: squares left, logarithms of determinants."""
+
+    squares: Steps
+    log_determinant: Steps
+    free: int
+
+    def white(self) -> Steps:
+        """Variance of the white noise for each size of the walk."""
+        return np.asarray(self.squares / self.free)
+
+    def of_any_noise(self) -> Steps:
+        """Log-likelihood with the best variance of the white noise."""
+        return np.asarray(-0.5 * (self.free * np.log(self.white()) + self.log_determinant))
+
+    def of_noise(self, variance: float) -> Steps:
+        """Log-likelihood with a known variance of the white noise."""
+        return np.asarray(-0.5 * (self.squares / variance + self.log_determinant))
+
+
+def walk_likelihood(
+    residual: Float64[np.ndarray, " n"],
+    derivatives: Float64[np.ndarray, "q n"],
+    block: Int64[np.ndarray, " n"],
+    steps: Steps,
+) -> WalkLikelihood | None:
+    """Likelihood of walks by the variance of their steps from block to block.
+
+    The variances are in units of a sample's white noise. `derivatives` are the residual's by what was fitted, a constant among
+    them. The likelihood is that of what no value of the parameters changes (Patterson and Thompson, Biometrika 1971): what
+    they took up is no evidence against a walk. None where they leave too few blocks.
+    """
+    names, inverse, count = np.unique(block, return_inverse=True, return_counts=True)
+    root = np.sqrt(count)
+    means = np.array([np.bincount(inverse, weights=row) for row in (residual, *derivatives)]) / root  # as noisy as a sample
+    since = (names - names[0]).astype(float)
+    power, vector = np.linalg.eigh(np.minimum.outer(since, since) * np.outer(root, root))
+    y, fitted = means[0] @ vector, means[1:] @ vector
+    _, singular, X = np.linalg.svd(fitted / np.maximum(np.linalg.norm(fitted, axis=1), 1e-300)[:, None], full_matrices=False)
+    X = X[singular > INDEPENDENT * singular[0]]
+    free = len(y) - len(X)
+    if free <= len(X):
+        return None
+    squares, log_determinant = np.zeros(len(steps)), np.zeros(len(steps))
+    for k, variance in enumerate(1.0 + steps[:, None] * np.maximum(power, 0.0)):
+        N, g = X / variance @ X.T, X / variance @ y
+        squares[k] = y / variance @ y - g @ np.linalg.solve(N, g)
+        log_determinant[k] = np.log(variance).sum() + np.linalg.slogdet(N)[1]
+    return WalkLikelihood(squares, log_determinant, free)
+
+
+def without_walk(x: Float64[np.ndarray, " n"], steps: float) -> Float64[np.ndarray, " n"]:
+    """White noise from white noise of variance 1 on a walk, whose steps have a variance.
+
+    The sum is an ARIMA(0, 1, 1) process, (1 - B) x = (1 - theta B) e / sqrt(theta), theta + 1 / theta - 2 = steps (Box and
+    Jenkins, Time Series Analysis, sec. 4.3.1). Before the first sample is zero: the walk begins at the constant bias.
+    """
+    if not steps:
+        return x
+    theta = 1.0 + 0.5 * steps - np.sqrt(steps + 0.25 * steps**2)
+    return np.asarray(np.sqrt(theta) * lfilter([1.0, -1.0], [1.0, -theta], x))

@@ -1,0 +1,53 @@
+"""A random walk of a bias: found beside white noise, not found in white noise, and taken out of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imutool.noise.bias_walk import walk_likelihood, without_walk
+
+SAMPLES, EACH = 12_000, 50
+STEPS = np.append(0.0, np.geomspace(1e-7, 1e-2, 14))  # of a sample, by its white noise
+
+
+def residual(step: float, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=SAMPLES) + np.cumsum(np.sqrt(step) * rng.normal(size=SAMPLES))
+
+
+def gains(x: np.ndarray, *fitted: np.ndarray) -> np.ndarray:
+    """Log-likelihood of each step over none, after a constant and other columns were fitted."""
+    A = np.stack([np.ones(SAMPLES), *fitted])
+    left = x - np.linalg.lstsq(A.T, x)[0] @ A
+    likely = walk_likelihood(left, A, np.arange(SAMPLES) // EACH, STEPS * EACH)
+    assert likely is not None
+    return likely.of_any_noise() - likely.of_any_noise()[0]
+
+
+@pytest.mark.parametrize("step", [1e-5, 1e-4, 1e-3])
+def test_a_walk_is_found_with_its_size(step: float) -> None:
+    gained = gains(residual(step))
+    assert gained.max() > 20.0
+    assert 0.2 < STEPS[np.argmax(gained)] / step < 5.0
+
+
+def test_white_noise_shows_no_walk() -> None:
+    assert max(float(gains(residual(0.0, seed)).max()) for seed in range(10)) < 5.0
+
+
+def test_a_walk_is_found_though_slow_effects_took_it_up() -> None:
+    t = np.linspace(0.0, 1.0, SAMPLES)
+    gained = gains(residual(1e-4), *(t**k for k in range(1, 6)))
+    assert 0.2 < STEPS[np.argmax(gained)] / 1e-4 < 5.0
+
+
+def test_too_few_blocks_say_nothing_of_a_walk() -> None:
+    assert walk_likelihood(np.ones(100), np.ones((1, 100)), np.arange(100) // 50, STEPS) is None
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-4, 1e-2, 1.0])
+def test_noise_on_a_walk_becomes_white(step: float) -> None:
+    white = without_walk(residual(step), step)[SAMPLES // 10 :]
+    assert white.var() == pytest.approx(1.0, rel=0.06)
+    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.04
