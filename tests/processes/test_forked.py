@@ -36,15 +36,18 @@ def two(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.usefixtures("two")
 def test_a_function_runs_beside_this_process_and_its_result_comes_back() -> None:
-    large = b"x" * 10_000_000
+    large, (waiting, release) = b"x" * 10_000_000, os.pipe()
     with forking():
-        first, second = Forked(lambda: (os.getpid(), large)), Forked(os.getpid)
+        first, second = Forked(lambda: (os.getpid(), os.read(waiting, 1) * len(large))), Forked(os.getpid)
         assert second.result() == os.getpid()  # the other processor is taken
+        os.write(release, b"x")
         process, content = first.result()
         assert process != os.getpid()
         assert content == large
         assert first.result() == (process, large)
         assert Forked(os.getpid).result() != os.getpid()
+    os.close(waiting)
+    os.close(release)
 
 
 @pytest.mark.usefixtures("two")
