@@ -22,7 +22,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
     "audit": ("diagnose", "Find the errors of a simulator's IMU, without a recording."),
-    "models": ("models", "List the models that ship, their sensor and their card."),
+    "models": ("models", "List the models that come with imutool: method, sensor, data set and rate."),
     "schema": ("models", "Print the JSON Schema of a report, or list the reports."),
     "demo": ("demo", "Run a demo without download: convert, train, debias, evaluate, view."),
     "fleet": ("fleet_view", "Process many logs on all cores of this machine, or on a Ray cluster."),

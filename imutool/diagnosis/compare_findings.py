@@ -1,4 +1,4 @@
-"""Comparison of findings: of several recordings, of a recording and a simulation of different motions.
+"""Comparison of findings: between recordings, and with a simulation of another motion.
 
 Several recordings share their findings. One that asks for other numbers is named: it is of another unit, or mounted otherwise.
 
@@ -15,14 +15,17 @@ import numpy as np
 
 from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.observability import exclude_each_other, plausible_part, values_of
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped
+from imutool.sensor import catalogue
 
 ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
 CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
+OF_UNIT = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "mount_rotation")  # its own, or its mount's
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"
 
 
@@ -62,17 +65,41 @@ def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Ite
 
 
 def contradictions(logs: Sequence[WhitenedLog], selection: Selection) -> Iterator[str]:
-    """Remarks on recordings that ask for other numbers of the findings than all recordings together."""
-    whole, always = selection.whole, selection.always
-    names = dict.fromkeys(log.pair.name for log in logs)
-    if len(names) < 2 or len(whole.chosen) == always:
-        return
-    for name in names:
-        of_log = [k for k, log in enumerate(logs) if log.pair.name == name]
-        own, without = (fit([logs[k] for k in of_log], these, whole.part) for these in (whole.chosen, whole.chosen[:always]))
-        missed = sum(_squares(whole, k) for k in of_log) - sum(_squares(own, k) for k in range(len(of_log)))
-        if missed > CONTRADICTS * max(own.objective, without.objective - own.objective):
-            yield f"{name} contradicts the other logs: {_differing(own, whole)}. Diagnose another unit or mount separately"
+    """Remarks on recordings whose own numbers of the findings are not those of the others.
+
+    Numbers in which units and mounts differ are fitted beside the findings: what only some recordings have is not among these.
+    """
+    found, always = selection.whole, selection.always
+    free = [
+        effect for effect in catalogue.diagnosed(OF_UNIT) if not any(exclude_each_other(effect, one) for one, _ in found.chosen)
+    ]
+    chosen = (*found.chosen, *((effect, effect.null_value.astype(float)) for effect in free))
+    whole = fit(logs, chosen, found.part)
+    while len({log.pair.name for log in whole.logs}) > 1:
+        missed = {own: _missed(own, whole, always) for own in _by_log(whole)}
+        own = max(missed, key=lambda one: missed[one])
+        if missed[own] <= CONTRADICTS:
+            return
+        name = own.logs[0].pair.name
+        whole = fit([log for log in whole.logs if log.pair.name != name], chosen, found.part)
+        yield f"{name} contradicts the other logs: {_differing(own, whole)}. Diagnose it separately"
+
+
+def _by_log(whole: Fit) -> Iterator[Fit]:
+    """The effects fitted to each recording by itself, less numbers that are implausible: its motion does not show them."""
+    factor = whole.logs[0].pair.settings.search.implausible_factor
+    for name in dict.fromkeys(log.pair.name for log in whole.logs):
+        own = fit([log for log in whole.logs if log.pair.name == name], whole.chosen, whole.part)
+        while (reduced := plausible_part(own.chosen, factor)) is not None:
+            own = fit(own.logs, reduced, own.part)
+        yield own
+
+
+def _missed(own: Fit, whole: Fit, always: int) -> float:
+    """Squares that a recording loses by the numbers of all, over those that its own leave, or explain."""
+    without = fit(own.logs, own.chosen[:always], own.part)
+    left = sum(_squares(whole, whole.logs.index(log)) for log in own.logs) - sum(_squares(own, k) for k in range(len(own.logs)))
+    return left / max(own.objective, without.objective - own.objective)
 
 
 def _squares(found: Fit, log: int) -> float:
@@ -82,16 +109,15 @@ def _squares(found: Fit, log: int) -> float:
     return float(((found.residuals[log][rows] - white.constants[rows] * found.bias[log]) ** 2).sum())
 
 
-def _differing(own: Fit, whole: Fit) -> str:
-    """The effect whose numbers differ most from those of all logs, and both numbers."""
-    std = own.stds()
-    apart = {
-        effect.key: float((np.abs(mine - ours) / np.maximum(std[effect.key], 1e-300)).max(initial=0.0))
-        for (effect, mine), (_, ours) in zip(own.chosen, whole.chosen, strict=True)
-    }
+def _differing(own: Fit, others: Fit) -> str:
+    """The effect whose numbers differ most from those of the other recordings, and both numbers."""
+    std, theta = own.stds(), dict(zip(others.keys, others.chosen, strict=True))
+    apart = {}
+    for effect, mine in own.chosen:
+        theirs = values_of(theta[effect.key][0], effect, theta[effect.key][1])
+        apart[effect.key] = float((np.abs(mine - theirs) / np.maximum(std[effect.key], 1e-300)).max(initial=0.0))
     key = max(apart, key=lambda name: apart[name])
-    mine, ours = (_numbers_of(found, key) for found in (own, whole))
-    return f"its {key.replace('_', ' ')} is {mine} by itself, {ours} with all"
+    return f"its {key.replace('_', ' ')} is {_numbers_of(own, key)}, theirs {_numbers_of(others, key)}"
 
 
 def _numbers_of(found: Fit, key: str) -> str:

@@ -48,7 +48,7 @@ from imutool.diagnosis.signals import with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
 from imutool.errors import ConfigError, ImutoolError
 from imutool.location import Location
-from imutool.log_info.conventions import warn_of_recordings
+from imutool.log_info.conventions import check_one_sensor, warn_of_recordings
 from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -84,7 +84,7 @@ def diagnose(
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic; signals without a simulation, or of several logs.
-        DataError: no truth and no simulation, too little shared time, another motion, no usable axis.
+        DataError: no truth and no simulation, too little shared time, another motion, no usable axis, different sensors.
     """
     report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     report(0, 4, "reading")
@@ -95,6 +95,7 @@ def diagnose(
     first = imu or (topics[0] if len(topics) > 1 and len(reals) == 1 else None)
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
+    check_one_sensor(recordings)
     warn_of_recordings(recordings)
     others = [topic for topic in topics if topic != first] if len(reals) == 1 and first in topics else []
     if others and sim is None and not recordings[0].truths:

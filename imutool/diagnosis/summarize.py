@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.compare_findings import is_of_digits, remarks, shared
+from imutool.diagnosis.compare_findings import contradictions, is_of_digits, remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
@@ -74,6 +74,7 @@ def summarize(
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
     findings = [finding for finding in all_findings if not shared(finding, sim_findings)]
+    both_have = remarks(all_findings, sim_findings)
     both = zip(selection.selected, named, strict=True)
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
     chosen = selection.fitted.chosen
@@ -99,7 +100,7 @@ def summarize(
         bias=_biases(selection.whole),
         not_identifiable=_not_identifiable(selection, idle, hidden),
         unexplained=unexplained,
-        remarks=(*dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *remarks(all_findings, sim_findings)),
+        remarks=(*contradictions(logs, selection), *dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *both_have),
         closer=gains(logs, before, after),
         traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
         start_ns=pairs[0].log_start_ns + round(1e9 * pairs[0].aligned_s),

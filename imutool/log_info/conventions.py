@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
-from imutool.errors import LogError
+from imutool.errors import DataError, LogError
 from imutool.log_info.pose_imu_rotation import agreement, body_warnings
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
@@ -51,6 +51,20 @@ def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
         warnings = body_warnings(truth.topic, found.turned.deg.tolist())
     for warning in warnings:
         logger.warning("%s: %s", where, warning)
+
+
+def check_one_sensor(recordings: Sequence[Recording]) -> None:
+    """Refuse logs that state different sensors.
+
+    Raises:
+        DataError: two of them state a sensor, and not the same one.
+    """
+    stated = {r.name: str(r.metadata.get("imutool", {}).get("sensor", "")) for r in recordings}
+    if len({sensor for sensor in stated.values() if sensor}) > 1:
+        listed = ", ".join(f"{name}: {sensor or 'not stated'}" for name, sensor in stated.items())
+        raise DataError(
+            f"logs of different sensors ({listed})", expected="logs of one sensor", fix="Take each sensor by itself"
+        )
 
 
 def warn_of_recordings(recordings: Iterable[Recording]) -> None:

@@ -23,6 +23,7 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.windows import rotation_residual
+from imutool.log_info.conventions import check_one_sensor
 from imutool.recording import Recording, seconds
 from imutool.training.settings import PoseFloors
 from imutool.units import SENSORS, Sensor
@@ -244,7 +245,7 @@ def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
     Raises:
         DataError: different sensors, too short, standing still, or a truth that does not follow the samples.
     """
-    _one_sensor(recordings)
+    check_one_sensor(recordings)
     n = pool.samples(WINDOW_S)
     first = pool.starts(n, "all", hop=n)
     if len(first) * WINDOW_S < LEAST_S:
@@ -263,14 +264,6 @@ def check_trainable(recordings: Sequence[Recording], pool: Pool) -> None:
             fix="Add logs in which it turns; for a sensor at rest, imutool debias needs no model",
         )
     _truths_follow(pool, first, n)
-
-
-def _one_sensor(recordings: Sequence[Recording]) -> None:
-    said = {r.name: str(r.metadata.get("imutool", {}).get("sensor", "")) for r in recordings}
-    named = {sensor for sensor in said.values() if sensor}
-    if len(named) > 1:
-        listed = ", ".join(f"{name}: {sensor or 'not said'}" for name, sensor in said.items())
-        raise DataError(f"training logs of different sensors ({listed})", expected="logs of one sensor")
 
 
 def _truths_follow(pool: Pool, first: Tensor, n: int) -> None:

@@ -12,7 +12,7 @@ from support.diagnoses import replace
 
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION, is_of_digits, remarks, shared
 from imutool.diagnosis.diagnose import diagnose
-from imutool.diagnosis.result import Curve, Estimate, Finding, HeldOut
+from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.errors import DataError
 from imutool.mcap_io.write import write
 
@@ -117,3 +117,26 @@ def test_a_simulation_of_the_motion_of_some_recordings_only_is_refused(tmp_path:
     reals = [log(tmp_path, "one", 3, {}), log(tmp_path, "two", 7, {})]
     with pytest.raises(DataError, match="some recordings only"):
         diagnose(reals, log(tmp_path, "sim", 7, {}))
+
+
+def test_a_recording_that_contradicts_the_others_is_named(tmp_path: Path) -> None:
+    of_one_unit = [log(tmp_path, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
+    of_another = log(tmp_path, "stranger", 11, {"gyro_scale": [-0.02, 0.01, 0.03]})
+    assert contradicting(diagnose(of_one_unit)) == []
+    (remark,) = contradicting(diagnose([*of_one_unit, of_another]))
+    assert remark.startswith("stranger contradicts the other logs: its gyro scale is ")
+    assert remark == diagnose([*of_one_unit, of_another]).remarks[0]
+
+
+def test_logs_that_state_different_sensors_are_refused(tmp_path: Path) -> None:
+    felt = planted.rich(3)
+    paths = [tmp_path / f"{sensor}.mcap" for sensor in ("bmi160", "adis16448")]
+    for path in paths:
+        one = planted.recording(path.stem, felt.t_s, planted.ideal(felt, ()), poses=planted.poses(planted.moving(3), felt.t_s))
+        write(replace(one, metadata={"imutool": {"sensor": path.stem}}), path)
+    with pytest.raises(DataError, match=r"different sensors \(bmi160: bmi160, adis16448: adis16448\)"):
+        diagnose(paths)
+
+
+def contradicting(found: Diagnosis) -> list[str]:
+    return [remark for remark in found.remarks if "contradicts the other logs" in remark]
