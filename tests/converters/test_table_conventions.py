@@ -297,6 +297,48 @@ def test_several_imus_of_one_table_are_several_imus_of_one_log(tmp_path, written
     assert log.metadata["imutool/map/right/imu"]["topic"] == "/right/imu"
 
 
+@pytest.mark.parametrize("form", ["{s}{a}{n}", "{s}_{a}_{n}", "{s}{n}_{a}"])
+def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
+    named = [
+        form.format(s=s, a=a, n=n) + f" [{u}]" for n in (1, 2) for s, u in (("gyr", "rad/s"), ("acc", "m/s^2")) for a in "xyz"
+    ]
+    path = written(tmp_path / "two.csv", ["t_ns", *named], [T_NS, *GYRO.T, *ACCEL.T, *GYRO[::-1].T, *ACCEL[::-1].T])
+    imus = table.read_sequence(table.sequences(path)[0]).imus
+    assert [*imus] == ["/imu1/imu", "/imu2/imu"]
+    np.testing.assert_allclose(imus["/imu1/imu"].accel, ACCEL)
+    np.testing.assert_allclose(imus["/imu2/imu"].gyro, GYRO[::-1])
+
+
+@pytest.mark.parametrize("without", ["lin_acc", "user_acceleration", "LinearAcceleration"])
+def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path, without):
+    names = [
+        "t_ns",
+        *(f"{without}_{a} [m/s^2]" for a in "xyz"),
+        *(f"{s}_{a} [{u}]" for s, u in (("acc", "m/s^2"), ("gyr", "rad/s")) for a in "xyz"),
+    ]
+    path = written(tmp_path / "phone.csv", names, [T_NS, *(ACCEL - [0.0, 0.0, 9.81]).T, *ACCEL.T, *GYRO.T])
+    log = table.read_sequence(table.sequences(path)[0])
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
+    assert any("named as an acceleration without gravity" in note for note in log.remarks.notes)
+
+
+def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_rest(tmp_path):
+    s, late_s = (T_NS - START_NS) / 1e9 + 98_765.0, 0.001
+    names = [
+        "loggingTime(txt)", "accelerometerTimestamp_sinceReboot(s)", *(f"accelerometerAcceleration{a}(G)" for a in "XYZ"),
+        "gyroTimestamp_sinceReboot(s)", *(f"gyroRotation{a}(rad/s)" for a in "XYZ"),
+        *(f"motionRotationRate{a}(rad/s)" for a in "XYZ"), *(f"motionUserAcceleration{a}(G)" for a in "XYZ"),
+    ]  # fmt: skip
+    user = ACCEL - [0.0, 0.0, 9.81]
+    columns = [T_NS, s, *(-ACCEL / 9.80665).T, s + late_s, *GYRO.T, *(GYRO + 1.0).T, *(-user / 9.80665).T]
+    log = table.read_sequence(table.sequences(written(tmp_path / "sensorlog.csv", names, columns))[0])
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro[0], GYRO[0])
+    assert imu.t_ns[0] == 98_765_001_000_000
+    np.testing.assert_allclose(np.median(imu.accel, axis=0), [0.0, 0.0, 9.81], atol=0.05)
+    assert log.metadata["imutool/map"]["accel_time"] == "accelerometerTimestamp_sinceReboot(s)"
+
+
 def test_one_map_holds_for_several_imus_whose_unit_is_open(tmp_path):
     names = ["t_ns", *(f"{of}_{s}" for of in ("left", "right") for s, _ in SIX)]
     path = written(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *(2.0 * GYRO).T, *ACCEL.T])
