@@ -22,14 +22,13 @@ from imutool.recording.message_log import KINDS
 from ._table_names import CORE_MOTION, ROS_WORDS, TIME_WORDS, WITHOUT_GRAVITY, XSENS_TIME, name_and_unit, spaced_name, triples
 from ._table_text import Columns
 from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
-from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, UNITS_OF, USUAL_TIME_NS
+from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, UNITS_OF, USUAL_TIME_NS, gravity_units
 
 IMU_TOPIC = "/imu0"
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 MOST_SHOWN = 12  # triples of columns in a message
 OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
-GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 
 Entries = dict[str, str | list[str]]  # of a map
 
@@ -164,12 +163,9 @@ def _propose_sensor(
     plain = {column: name for column, (name, _) in names.items()}
     spaced = {column: spaced_name(column) for column in names}
     found = [*triples(sensor, plain, spaced).values()]
-    whole = [triple for triple in found if sensor == "gyro" or not re.search(WITHOUT_GRAVITY, spaced[triple["x"]])]
-    if not whole or len(whole) == len(found):
-        whole = found
-    else:
-        others = ", ".join(f"{triple['x']}/y/z" for triple in found if triple not in whole)
-        proposal.reasons.append(f"{others} is named as an acceleration without gravity")
+    whole = _with_gravity(found, spaced, columns) if sensor == "accel" else found
+    if len(whole) < len(found):
+        proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
         shown = "".join(f"{': ' if n == 0 else ', '}{triple['x']}/y/z" for n, triple in enumerate(whole[:MOST_SHOWN]))
@@ -188,12 +184,19 @@ def _propose_sensor(
     elif re.search(ROS_WORDS, names[chosen[0]][0]):
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
-        _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
+        _propose_unit(proposal, sensor, columns)
     if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
-        level = float(np.nanmedian(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0)))
+        level, _ = gravity_units(columns, chosen)
         if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
             proposal.open.append("accel")
             proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
+
+
+def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:
+    """The one of several accelerations that has gravity, by its name or by its size; all where none stands out."""
+    named = [triple for triple in found if not re.search(WITHOUT_GRAVITY, spaced[triple["x"]])]
+    sized = [triple for triple in named if gravity_units(columns, list(triple.values()))[1]]
+    return next((each for each in (named, sized) if len(each) == 1), found)
 
 
 def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
@@ -213,11 +216,10 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
         )
 
 
-def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
+def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
     """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
-        level = float(np.nanmedian(np.linalg.norm(values, axis=1)))
-        near = [unit for unit, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND]
+        level, near = gravity_units(columns, proposal.entries[sensor])
         if near:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
         if len(near) == 1:
@@ -259,12 +261,13 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     if (unit := names[column][1]) in TIME_NS:
         proposal.entries["time_unit"] = unit
         return
-    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
-        proposal.entries["time_unit"] = "100us"
-        proposal.reasons.append(f"{column!r} counts 100 us, as an Xsens sensor does")
-        return
     values = columns.values[column].astype(float)
     step = float(np.median(np.diff(values)))
+    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
+        counts = "100us" if step * TIME_NS["100us"] <= 1e9 / PLAUSIBLE_HZ[0] else "us"
+        proposal.entries["time_unit"] = counts
+        proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")
+        return
     plausible = [u for u, size in USUAL_TIME_NS.items() if PLAUSIBLE_HZ[0] <= 1e9 / (step * size) <= PLAUSIBLE_HZ[1]]
     epochs = [u for u in plausible if 1e18 < values[0] * TIME_NS[u] < 4e18]  # 2001 to 2096
     certain = epochs or plausible

@@ -95,7 +95,7 @@ def split_name(column: str) -> tuple[str, str]:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
-        end := re.search(r"_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
+        end := re.search(r"(?:_in)?_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]

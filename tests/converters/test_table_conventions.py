@@ -33,16 +33,18 @@ def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
     return path
 
 
-def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds(tmp_path):
+@pytest.mark.parametrize(("counts", "step"), [("100 us", 50), ("us", 5_000)])
+def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds_or_microseconds(tmp_path, counts, step):
     names = ["PacketCounter", "SampleTimeFine", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
-    columns = [np.arange(COUNT), 12_345 + 50 * np.arange(COUNT), *ACCEL.T, *GYRO.T]
+    columns = [np.arange(COUNT), 12_345 + step * np.arange(COUNT), *ACCEL.T, *GYRO.T]
     log = table.read_sequence(table.sequences(written(tmp_path / "xsens.csv", names, columns))[0])
     assert np.array_equal(np.diff(log.imus["/imu0"].t_ns), np.full(COUNT - 1, 5_000_000))
-    assert "'SampleTimeFine' counts 100 us, as an Xsens sensor does" in log.remarks.notes
+    assert f"'SampleTimeFine' counts {counts}, as an Xsens sensor does" in log.remarks.notes
 
 
-def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path):
-    names = ["TimeStartup", *(f"UncompAccel_{k}" for k in range(3)), *(f"UncompGyro_{k} [mdps]" for k in range(3))]
+@pytest.mark.parametrize("time", ["TimeStartup", "Time since start in ns"])
+def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path, time):
+    names = [time, *(f"UncompAccel_{k}" for k in range(3)), *(f"UncompGyro_{k} [mdps]" for k in range(3))]
     columns = [T_NS - START_NS + 5_000_000_000, *ACCEL.T, *np.rad2deg(GYRO * 1e3).T]
     imu = table.read_sequence(table.sequences(written(tmp_path / "vn.csv", names, columns))[0]).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, GYRO, rtol=1e-12)
@@ -309,7 +311,7 @@ def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
     np.testing.assert_allclose(imus["/imu2/imu"].gyro, GYRO[::-1])
 
 
-@pytest.mark.parametrize("without", ["lin_acc", "user_acceleration", "LinearAcceleration"])
+@pytest.mark.parametrize("without", ["lin_acc", "user_acceleration", "LinearAcceleration", "ac"])
 def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path, without):
     names = [
         "t_ns",
@@ -319,7 +321,7 @@ def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path
     path = written(tmp_path / "phone.csv", names, [T_NS, *(ACCEL - [0.0, 0.0, 9.81]).T, *ACCEL.T, *GYRO.T])
     log = table.read_sequence(table.sequences(path)[0])
     np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
-    assert any("named as an acceleration without gravity" in note for note in log.remarks.notes)
+    assert any("acc_x [m/s^2]/y/z is the one with gravity" in note for note in log.remarks.notes)
 
 
 def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_rest(tmp_path):
