@@ -26,7 +26,7 @@ from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
-from imutool.location import Location, local
+from imutool.file_location import Location, local
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.noise import datasheet

@@ -15,8 +15,8 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.config import build
 from imutool.errors import DataError
+from imutool.file_location import Location
 from imutool.inertial.stationary import rest_stretches, white_noise
-from imutool.location import Location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.noise import allan

@@ -15,9 +15,9 @@ ROOT = Path(__file__).parents[1]
 # docs/architecture.md, Rooms: lower never imports higher. A room is a module of imutool or a folder of them.
 TIERS = (
     ("array_types", "errors"),
-    ("config", "location", "registry", "report", "units", "geometry", "recording"),
+    ("config", "file_location", "registry", "report", "units", "geometry", "processes", "recording"),
     ("inertial", "mcap_io", "bag"),
-    ("noise", "cleaning", "processes"),
+    ("noise", "cleaning"),
     ("sensor", "log_info", "exporting"),
     ("bias",),
     ("bias_start",),
@@ -216,7 +216,7 @@ POSIX_NAMES = {
     },
     "signal": {"SIGKILL", "SIGALRM", "SIGHUP", "SIGPIPE", "SIGUSR1", "SIGCHLD", "setitimer", "alarm", "pause", "pthread_kill"},
 }
-SYSTEM = "imutool.mcap_io.storage.system"
+SYSTEM = "imutool.processes.system"
 
 
 def of_posix_alone(tree: ast.Module) -> Iterator[str]:

@@ -11,7 +11,7 @@ from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen
 from imutool.errors import ConfigError, LogError
-from imutool.location import LogPath, location
+from imutool.file_location import LogPath, location
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport

@@ -10,7 +10,7 @@ from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
 from imutool.errors import ConfigError, did_you_mean
 from imutool.exporting import ExportReport, euroc, rosbag2, simulators
-from imutool.location import LogPath, local, location
+from imutool.file_location import LogPath, local, location
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.log import Log

@@ -10,7 +10,7 @@ import msgspec
 from imutool import diagnosis_output
 from imutool.api import NamedProgress
 from imutool.diagnosis.result import Diagnosis
-from imutool.location import LogPath, local, location
+from imutool.file_location import LogPath, local, location
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Recording

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from imutool import evaluation
 from imutool.bias.model import BiasModel
 from imutool.config import build
-from imutool.location import LogPath, local, locals_of
+from imutool.file_location import LogPath, local, locals_of
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.debiasing import DebiasedBlock
-from imutool.location import LogPath, local, location
+from imutool.file_location import LogPath, local, location
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs

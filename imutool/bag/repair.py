@@ -12,7 +12,7 @@ from imutool.bag import records
 from imutool.bag.records import FIRST_RECORD, MAGIC, U32, Chunk, Loss, Op
 from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, LogError
-from imutool.location import Location, same_location
+from imutool.file_location import Location, same_location
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from imutool.bag import records
 from imutool.bag.records import HEAD_LIMIT, MAGIC, Chunk, ChunkInfo, Connection, Head, Loss, Message, Op
 from imutool.errors import LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.storage.source import Source
 
 SCAN_BYTES = 4096, 1 << 20  # looked through at once, first and at most: what is sought may be near

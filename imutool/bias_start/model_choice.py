@@ -36,8 +36,8 @@ from imutool.cleaning import Survey, cleaned
 from imutool.cleaning.first_pass import raw_batches
 from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
+from imutool.file_location import Location
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
-from imutool.location import Location
 from imutool.log_info.conventions import warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch

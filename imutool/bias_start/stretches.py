@@ -18,7 +18,7 @@ from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.stuck import repeated
 from imutool.errors import ConfigError, LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings

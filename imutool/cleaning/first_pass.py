@@ -19,7 +19,7 @@ from imutool.cleaning.rules.gaps import MISSING
 from imutool.cleaning.samples import Motion, Samples, blocks
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log

@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:
-    from imutool.mcap_io.storage.system import repeat_swallowed  # every command would pay for it at its start
+    from imutool.processes.system import repeat_swallowed  # every command would pay for it at its start
 
     if not repeat_swallowed(unraisable) and getattr(unraisable.object, "__qualname__", "") != HALF_MADE:
         sys.__unraisablehook__(unraisable)

@@ -27,7 +27,7 @@ from imutool.cli.app import (
 )
 from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.location import to_location
+from imutool.file_location import to_location
 from imutool.report import UNSET, Report, UnsetType
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from imutool.bias_start import Fitness
 from imutool.cli.app import HTML, LOG, LOST, RRD, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
 from imutool.cli.terminal import progress, say, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.location import Location, to_location
+from imutool.file_location import Location, to_location
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.viewing import Output
 

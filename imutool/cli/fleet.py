@@ -144,8 +144,8 @@ def diagnose(
     """Compare one kind of sensor on many robots: shared parameters and outliers."""
     from pathlib import Path
 
+    from imutool.file_location import to_location
     from imutool.fleet.robots import robot_pattern
-    from imutool.location import to_location
 
     robot_pattern(robot_from)
     place = None if sim is None else to_location(sim)
@@ -177,9 +177,9 @@ def _run(
     verbose: bool,
     quiet: bool,
 ) -> None:
+    from imutool.file_location import to_location
     from imutool.fleet.engine import ProcessEngine, RayEngine
     from imutool.fleet.run import run
-    from imutool.location import to_location
 
     limits: dict[str, Any] = {"workers": workers, "memory_bytes": memory_bytes(memory), "retries": retries}
     page = None if report is None else to_location(report)

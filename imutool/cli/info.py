@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from imutool.cli.app import LOST, PNG, TOML, Json, MaxChunk, Overwrite, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
 from imutool.errors import ConfigError
-from imutool.location import to_location
+from imutool.file_location import to_location
 from imutool.report import UnsetType, json_values
 
 if TYPE_CHECKING:

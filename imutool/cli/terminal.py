@@ -15,7 +15,7 @@ from rich.console import Console
 
 from imutool.cli.parameters import with_flags
 from imutool.errors import redact
-from imutool.location import to_location
+from imutool.file_location import to_location
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.storage.target import Target
 from imutool.report import Report, json_text

@@ -17,7 +17,7 @@ import imutool
 from imutool.array_types import Shaped, UInt8
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.errors import DataError, not_installed
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected, reflect

@@ -17,8 +17,8 @@ from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
-from imutool.location import compression, local
-from imutool.mcap_io.storage.system import processors
+from imutool.file_location import compression, local
+from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 

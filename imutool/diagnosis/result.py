@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from imutool.array_types import Bool, Float64
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.recording import Poses
 from imutool.report import UNSET, Report, Section, UnsetType
 from imutool.units import ASCII_UNITS

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from imutool.errors import ConfigError, LogError
 from imutool.exporting import ExportReport, Progress
-from imutool.location import identity
+from imutool.file_location import identity
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
 

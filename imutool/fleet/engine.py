@@ -23,7 +23,7 @@ import msgspec
 from imutool.errors import ConfigError, LogError, not_installed, redact
 from imutool.fleet.task import Result, Task
 from imutool.fleet.work import work
-from imutool.mcap_io.storage import system
+from imutool.processes import system
 from imutool.processes.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 
 AHEAD = 2  # tasks in flight for each that can be worked on: the next one is there when one ends

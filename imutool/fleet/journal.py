@@ -25,9 +25,9 @@ import msgspec
 
 from imutool import __version__
 from imutool.errors import ConfigError
+from imutool.file_location import Location, io_errors, reason
 from imutool.fleet.task import Result, Settings
-from imutool.location import Location, io_errors, reason
-from imutool.mcap_io.storage.system import lock
+from imutool.processes.system import lock
 
 NAME = "fleet.journal"
 NOTED_AGAIN = 32  # targets in a second note

@@ -15,10 +15,10 @@ import numpy as np
 
 from imutool import __version__
 from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.file_location import to_location
 from imutool.fleet import results
 from imutool.fleet.work import UnitReport
-from imutool.location import to_location
-from imutool.mcap_io.storage.system import processors
+from imutool.processes.system import processors
 from imutool.processes.worker_pool import WorkerPool
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ import numpy as np
 
 from imutool import __version__
 from imutool.array_types import Float64
+from imutool.file_location import Location
 from imutool.fleet.results import MOST_ROWS, TROUBLE, Statistics
 from imutool.fleet.robots import FEWEST, Comparison, Outlier
 from imutool.fleet.task import Result, Settings
-from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.units import UNITS
 from imutool.viewing.html.drawing import prefix_ids, svg

@@ -12,9 +12,9 @@ import msgspec
 
 from imutool import __version__
 from imutool.errors import not_installed
+from imutool.file_location import Location
 from imutool.fleet.robots import FleetDiagnosis
 from imutool.fleet.task import Result
-from imutool.location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.report import UNSET, Report, Section, UnsetType
 

@@ -24,8 +24,8 @@ from imutool.array_types import Float64
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import value as value_text
 from imutool.errors import ConfigError
+from imutool.file_location import Location
 from imutool.fleet.task import Parameter, Result
-from imutool.location import Location
 from imutool.mcap_io.log import Log
 from imutool.report import Report
 

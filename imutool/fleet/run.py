@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from imutool.errors import ConfigError
+from imutool.file_location import Location, to_location
 from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
 from imutool.fleet.journal import NAME as JOURNAL
@@ -22,7 +23,6 @@ from imutool.fleet.robots import Comparison, compare
 from imutool.fleet.sources import Found, find, partial_files, remove_files
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
 from imutool.fleet.work import page_name, target_name, write_json
-from imutool.location import Location, to_location
 from imutool.report import UNSET
 
 LOST = 3  # something of a log was lost, or a log was quarantined

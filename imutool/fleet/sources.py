@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from imutool.errors import ConfigError, redact
+from imutool.file_location import Location, identity, io_errors, reason, size_and_etag, to_location
 from imutool.fleet.task import Source
-from imutool.location import Location, identity, io_errors, reason, size_and_etag, to_location
 
 logger = logging.getLogger(__name__)
 

@@ -15,14 +15,14 @@ import msgspec
 
 from imutool.cleaning import UntrustedError
 from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
+from imutool.file_location import Location, identity, to_location
 from imutool.fleet.sources import partial_files, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
-from imutool.location import Location, identity, to_location
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.losses import unchecked
 from imutool.mcap_io.storage.source import sha256
-from imutool.mcap_io.storage.system import peak_bytes, user
 from imutool.mcap_io.storage.target import Target
+from imutool.processes.system import peak_bytes, user
 from imutool.report import UNSET, Report, UnsetType, json_text, json_values
 
 LOST = 3  # exit code: something of the log was lost

@@ -19,8 +19,8 @@ from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
+from imutool.file_location import Location
 from imutool.inertial.stationary import rest_stretches
-from imutool.location import Location
 from imutool.log_info.conventions import (
     convention_summary,
     convention_warnings,

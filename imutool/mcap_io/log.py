@@ -13,7 +13,7 @@ from mcap.records import Metadata
 
 from imutool.array_types import Int64
 from imutool.errors import DataError, LogError
-from imutool.location import Location, to_location
+from imutool.file_location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, decode_image

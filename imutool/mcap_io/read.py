@@ -11,7 +11,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64, UInt32
 from imutool.errors import LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log

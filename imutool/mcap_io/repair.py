@@ -22,7 +22,7 @@ from mcap.records import Metadata, MetadataIndex
 
 import imutool
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.location import Location, identity, io_errors, same_location
+from imutool.file_location import Location, identity, io_errors, same_location
 from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, ChunkHead
@@ -32,10 +32,10 @@ from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
-from imutool.mcap_io.storage.system import collector_paused
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.verify import verify, verify_index
 from imutool.mcap_io.writer import LogWriter
+from imutool.processes.system import collector_paused
 
 RECORD = "imutool_repair"  # name of the metadata record
 DAMAGED = "imutool/damaged"  # attachments below this name hold damaged bytes as they were found

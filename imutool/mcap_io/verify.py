@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, DataEnd, MetadataIndex, SummaryOffset
 
 from imutool.errors import ConfigError, LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan, read_message_indexes
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, FOOTER_SIZE, HEAD, MAGIC

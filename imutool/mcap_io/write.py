@@ -18,7 +18,7 @@ import numpy as np
 import imutool
 from imutool.array_types import Int64, Shaped, UInt8
 from imutool.errors import DataError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
 from imutool.mcap_io.topics import UNIT_KEY, VELOCITY_KEY

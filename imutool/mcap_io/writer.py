@@ -28,7 +28,7 @@ from mcap.records import (
 import imutool
 from imutool.array_types import Int64, UInt16
 from imutool.errors import DataError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec import schemas as schema
 from imutool.mcap_io.codec.records import FOOTER_SIZE, MAGIC

@@ -23,7 +23,7 @@ from functools import partial
 from itertools import chain, repeat
 from typing import Any, ClassVar, Generic, NoReturn, TypeVar
 
-from imutool.mcap_io.storage.system import can_fork, fork, kill, processors
+from imutool.processes.system import can_fork, fork, kill, processors
 
 T = TypeVar("T")
 R = TypeVar("R")

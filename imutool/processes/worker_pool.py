@@ -32,7 +32,7 @@ from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
 from imutool.errors import ConfigError
-from imutool.mcap_io.storage.system import KILLED, inherited, opened, repeat_swallowed
+from imutool.processes.system import KILLED, inherited, opened, repeat_swallowed
 
 POLL_S = 0.5
 GRACE_S = 1.2  # for a worker to remove what it has half written

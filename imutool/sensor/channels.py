@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec.schemas import IMU, TF
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log

@@ -23,7 +23,7 @@ from imutool.bag.records import Op
 from imutool.bag.repair import repair_bag
 from imutool.bag.scan import Bag
 from imutool.errors import ConfigError, LogError
-from imutool.location import to_location
+from imutool.file_location import to_location
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
 TEXT = STORE.types["std_msgs/msg/String"]

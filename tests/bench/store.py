@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from imutool import location as places
+from imutool import file_location as places
 from imutool.debiasing import debias
-from imutool.location import to_location
+from imutool.file_location import to_location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.log import Log

@@ -26,15 +26,15 @@ from imutool.cleaning import CleaningSettings
 from imutool.cli import load
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
+from imutool.file_location import to_location
 from imutool.fleet import engine as engines
 from imutool.fleet.engine import Engine, ProcessEngine, RayEngine
 from imutool.fleet.journal import NAME
 from imutool.fleet.run import Progress, run
 from imutool.fleet.task import Result, Settings, Task, with_model_hash
 from imutool.fleet.work import work
-from imutool.location import to_location
-from imutool.mcap_io.storage import system
 from imutool.mcap_io.storage.source import sha256
+from imutool.processes import system
 from imutool.report import json_values
 
 Workers = Callable[[], Engine]

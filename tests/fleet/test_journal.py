@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
+from imutool.file_location import Location, to_location
 from imutool.fleet import journal as journals
 from imutool.fleet.journal import NAME, Journal
 from imutool.fleet.task import Result, Settings, Source
-from imutool.location import Location, to_location
 
 SETTINGS = Settings(command="debias", model="m", model_sha256="1")
 OTHER = msgspec.structs.replace(SETTINGS, init="prior")

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
+from imutool.file_location import identity, to_location
 from imutool.fleet.sources import LONGEST, find, partial_files, relative, remove_files, within
-from imutool.location import identity, to_location
 
 NOWHERE = Path("/nowhere")
 

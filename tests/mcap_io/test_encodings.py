@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from imutool.diagnosis.signals.log_fields import GNSS, JOINTS, read_both
 from imutool.errors import LogError
-from imutool.location import to_location
+from imutool.file_location import to_location
 from imutool.mcap_io.fields import numeric_fields, others, read_field
 from imutool.mcap_io.log import Log
 

@@ -18,7 +18,7 @@ from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences,
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.noise import datasheet
 from imutool.recording import Recording
 from imutool.report import Report

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
 from imutool.bias_start.stretches import longest_stretch, measured_recording
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings

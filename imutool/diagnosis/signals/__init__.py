@@ -14,7 +14,7 @@ from imutool.diagnosis.signals.log_fields import on_one_clock
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.fields import others, read_field
 
 BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal

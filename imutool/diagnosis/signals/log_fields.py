@@ -9,7 +9,7 @@ import numpy as np
 
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, joint_names
 from imutool.errors import LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec.schemas import IMU, ODOMETRY, POSE, PRESSURE, TF, TWIST
 from imutool.mcap_io.fields import Fields, PlainLog, numeric_fields, others
 from imutool.mcap_io.log import Log

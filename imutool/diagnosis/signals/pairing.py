@@ -16,8 +16,8 @@ from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
 from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
 from imutool.diagnosis.signals.quantities import in_one_unit, in_radians, metres, unwrapped
+from imutool.file_location import Location
 from imutool.geometry import quaternion
-from imutool.location import Location
 from imutool.mcap_io.codec.schemas import ODOMETRY, PRESSURE
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.channels import is_quantity

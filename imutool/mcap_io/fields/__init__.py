@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.fields.decoders import decoder_of
 from imutool.mcap_io.fields.reader import Fields, PlainLog, Reader, listed
 from imutool.mcap_io.log import Log

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from types import TracebackType
 
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.blocks import HEAD_BYTES
 from imutool.mcap_io.codec.records import MAGIC
 from imutool.mcap_io.index import LogIndex

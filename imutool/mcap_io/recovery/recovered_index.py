@@ -30,7 +30,7 @@ from imutool.mcap_io.recovery.scan import Scan
 from imutool.mcap_io.recovery.scan_events import Gap, ScannedBlock
 from imutool.mcap_io.recovery.summary import proven_summary
 from imutool.mcap_io.storage.source import Source
-from imutool.mcap_io.storage.system import collector_paused
+from imutool.processes.system import collector_paused
 
 MAX_SEARCHED = 1 << 20  # bytes of a damaged stretch in which definitions are sought
 

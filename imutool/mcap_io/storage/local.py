@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from imutool.mcap_io.storage.source import Source, descriptor
-from imutool.mcap_io.storage.system import copy_by_kernel
+from imutool.processes.system import copy_by_kernel
 
 PARTIAL = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)\.(?P<mark>[0-9a-f]{24})\.partial", re.DOTALL)
 MARK_PART = 6  # hexadecimal digits of each part of a mark

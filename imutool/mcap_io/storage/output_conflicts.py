@@ -16,7 +16,7 @@ from itertools import combinations
 from pathlib import Path
 
 from imutool.errors import ConfigError, ImutoolError, UsageError
-from imutool.location import Location, LogPath, location
+from imutool.file_location import Location, LogPath, location
 from imutool.mcap_io.storage.local import is_stream
 
 JSON, HTML, PNG, TOML = (".json",), (".html", ".htm"), (".png",), (".toml",)

@@ -7,7 +7,7 @@ import threading
 from types import TracebackType
 
 from imutool.errors import ConfigError, ImutoolError, LogError
-from imutool.location import Location, compression, io_errors, open_location, reason
+from imutool.file_location import Location, compression, io_errors, open_location, reason
 from imutool.mcap_io.codec.records import HEAD, crc32
 
 BLOCK_BYTES = 1 << 20

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 
 from imutool.errors import ConfigError
-from imutool.location import Location, io_errors, reason
+from imutool.file_location import Location, io_errors, reason
 from imutool.mcap_io.codec.records import crc32
 from imutool.mcap_io.storage.local import LocalFile, Stream, is_stream, remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import refuse_existing

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from imutool.errors import ConfigError
-from imutool.location import reason
+from imutool.file_location import reason
 from imutool.mcap_io.storage.source import Source
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 
-from imutool.location import Location
+from imutool.file_location import Location
 
 GENERATOR = '<meta name="generator" content="imutool">'
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request leaves the page

@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool import __version__
 from imutool.errors import ConfigError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html import report_errors, report_paths, report_signals
 from imutool.viewing.html.drawing import HALF_INCH, WIDTH_INCH, Panel, Picture, png, prefix_ids, require_matplotlib, svg

@@ -17,10 +17,10 @@ from imutool import __version__
 from imutool.array_types import Bool
 from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
+from imutool.file_location import Location
 from imutool.inertial.aids import Aids, find_aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, stretch_with_truth, with_velocity
-from imutool.location import Location
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log

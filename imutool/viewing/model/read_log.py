@@ -12,7 +12,7 @@ from imutool.cleaning import Cleaner, CleaningSettings, Survey
 from imutool.cleaning.first_pass import examine
 from imutool.cleaning.truth import truth_of
 from imutool.errors import DataError, LogError
-from imutool.location import Location
+from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch, TwistColumns
 from imutool.mcap_io.log import Log

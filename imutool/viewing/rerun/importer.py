@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 if TYPE_CHECKING:
     import rerun as rr
 
-    from imutool.location import Location
+    from imutool.file_location import Location
     from imutool.mcap_io.log import Log
     from imutool.viewing.model.run_data import RunData
 

@@ -20,7 +20,7 @@ from imutool.array_types import Int64
 from imutool.bias.temperature import channel_of
 from imutool.cleaning import raw_batches
 from imutool.errors import ConfigError, LogError, not_installed
-from imutool.location import to_location
+from imutool.file_location import to_location
 from imutool.mcap_io.temperature import temperatures
 from imutool.recording import Scalars
 from imutool.recording.columns import MOST_GAP_S

@@ -11,7 +11,7 @@ import pytest
 
 from imutool.debiasing import Debiaser
 from imutool.errors import LogError
-from imutool.location import identity
+from imutool.file_location import identity
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough import chunk_check, source_digest
 from imutool.mcap_io.passthrough.source_digest import SourceDigest

@@ -19,7 +19,7 @@ from support.in_process import run_command
 
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError, redact
-from imutool.location import BLOCK_BYTES, reason, same_location, to_location
+from imutool.file_location import BLOCK_BYTES, reason, same_location, to_location
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.rewrite import rewrite

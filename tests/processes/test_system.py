@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from imutool.mcap_io.storage.system import lock
+from imutool.processes.system import lock
 
 WITHOUT = """
 import os, pathlib, signal, sys
@@ -18,7 +18,7 @@ for name in ("sysconf", "getuid", "sched_getaffinity", "copy_file_range", "sendf
     delattr(os, name)
 real = pathlib.Path.read_text
 pathlib.Path.read_text = lambda self, *a, **k: real(pathlib.Path("nowhere") if str(self).startswith("/") else self, *a, **k)
-from imutool.mcap_io.storage import system
+from imutool.processes import system
 from imutool.mcap_io.storage.source import Source
 from imutool.mcap_io.storage.target import Target
 assert system.processors() >= 1
@@ -42,7 +42,7 @@ def test_each_function_answers_where_the_system_lacks_what_it_asks_for(tmp_path:
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_a_locked_file_is_refused_to_others_until_it_is_closed(tmp_path: Path, closed: bool) -> None:
-    code = "import sys; from imutool.mcap_io.storage.system import lock; sys.exit(0 if lock(open('file', 'a+b')) else 9)"
+    code = "import sys; from imutool.processes.system import lock; sys.exit(0 if lock(open('file', 'a+b')) else 9)"
     with (tmp_path / "file").open("a+b") as file:
         assert lock(file)
         if closed:
