@@ -311,6 +311,12 @@ def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
     np.testing.assert_allclose(imus["/imu2/imu"].gyro, GYRO[::-1])
 
 
+def test_an_acceleration_without_a_number_does_not_stand_for_one_with_them(tmp_path):
+    names = ["t_ns", *(f"accel_{a} [m/s^2]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz"), *IMU_NAMES[:3]]
+    path = written(tmp_path / "phone.csv", names, [T_NS, *(np.nan * ACCEL).T, *ACCEL.T, *GYRO.T])
+    np.testing.assert_allclose(table.read_sequence(table.sequences(path)[0]).imus["/imu0"].accel, ACCEL)
+
+
 @pytest.mark.parametrize("without", ["lin_acc", "user_acceleration", "LinearAcceleration", "ac"])
 def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path, without):
     names = [
