@@ -24,7 +24,10 @@ ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".mat", ".npz"
 
 
 def is_split(folder: Path) -> bool:
-    """Whether a folder has tables of a gyroscope and an accelerometer, of no phone app, or of one IMU and of true poses."""
+    """Whether the tables in a folder make one recording together.
+
+    They are of a gyroscope and an accelerometer, of no phone app, or of one IMU and of true poses.
+    """
     tables = _tables(folder)
     return bool(_groups(tables)) and not is_phone(folder)
 

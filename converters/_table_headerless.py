@@ -22,7 +22,7 @@ TIME_AND_IMU = 7
 
 
 def name_headerless(columns: Columns) -> None:
-    """Name the columns of an IMU: as ROS echoes it, or a time and six axes of which three show gravity."""
+    """Name the columns of an IMU: as ROS echoes it, or a time and six axes with gravity."""
     width = max((int(name[7:]) for name in columns.values if re.fullmatch(r"column \d{1,4}", name)), default=0)
     numbered = [f"column {number}" for number in range(1, width + 1)]
     if not width or not columns.values.keys() <= {*numbered}:
