@@ -213,7 +213,7 @@ def _spread(statistics: Statistics) -> Iterator[str]:
     for k, (signal, values) in enumerate(statistics.biases.items()):
         if len(values) > 1:
             rows = np.array(values)
-            caption = f"Start bias of the {signal} over {len(rows)} IMUs, by axis"
+            caption = f"Initial bias of the {signal} over {len(rows)} IMUs, by axis"
             yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
     times = [(statistics.seconds, "seconds a log"), (statistics.speeds, "MB/s of one worker")]
     yield _figure(

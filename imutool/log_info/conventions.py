@@ -10,6 +10,7 @@ import numpy as np
 from imutool.array_types import Int64
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
+from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.units import Units
@@ -25,7 +26,10 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
-NO_TURN = "no order of the axes fits clearly: little motion, turns about one axis only, or a turned body"
+NO_TURN = (
+    "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or clocks that differ by "
+    f"more than {LONGEST_DELAY_S:g} s"
+)
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
 
