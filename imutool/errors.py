@@ -41,7 +41,7 @@ class ImutoolError(Exception):
     Secrets in the URLs of a message are replaced by ***.
 
     Args:
-        what: what happened, with the offending value in it.
+        what: what happened, with the wrong value.
         where: the file or URL, optionally with a line (``data.csv:17``), the topic, the setting, or the parameter.
         expected: what would have been right, as the end of "expected ...".
         fix: what the user can do, as a sentence without its full stop.

@@ -38,7 +38,7 @@ def debias(
     source: Annotated[str, typer.Argument(metavar="IN", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
     target: Annotated[
         str | None,
-        typer.Argument(metavar="OUT", help="New log with the debiased IMU beside the raw one.", show_default=False),
+        typer.Argument(metavar="OUT", help="New log with the debiased IMU next to the raw one.", show_default=False),
         LOG,
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
@@ -185,7 +185,7 @@ def _say(report: DebiasReport, summary: DebiasSummary) -> None:
         say(f"{topic}: {imu.model}, initial bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
         say(f"{topic}: {report.fits[topic].sentence('the model')}")
     counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
-    say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
+    say(f"{summary.output}: {summary.copied} messages copied, {counts}")
     verified = summary.verified
     chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
     say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")

@@ -202,7 +202,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 moved_s = 1e-9 * float(np.abs(stamps[topic] - late_stamps).max(initial=0))
                 under = "the log times" if found.unset else "them"
                 line = f"stamps are now on a line under {under}, moved by {moved_s:.6f} s at most"
-                notes[topic].append("; ".join([*found.told, line]))
+                notes[topic].append("; ".join([*found.faults, line]))
                 if found.wraps and not clock:
                     clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
             if CONVENTIONS not in wanted:
@@ -226,8 +226,8 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 whole_ns = log_ns if found.unset else _unwrapped(log_ns, before, **clock)
                 if (whole_ns != before).any():
                     stamps[described.name] = whole_ns
-                    told = "; ".join(found.told) or "stamps start after a wrap"
-                    notes[described.name].append(f"{told}; they {'are the log times' if found.unset else 'run on'} now")
+                    faults = "; ".join(found.faults) or "stamps start after a wrap"
+                    notes[described.name].append(f"{faults}; they {'are the log times' if found.unset else 'run on'} now")
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
     return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, said)
 

@@ -48,7 +48,7 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
-    """Log the warnings about units, axes and frames for whoever uses the samples as they are."""
+    """Log the warnings about units, axes and frames of samples that are used uncorrected."""
     warnings = convention_warnings(convention_summary(imu, truth)) if len(imu) else []
     found = agreement(truth, imu) if truth is not None and not warnings else None
     if truth is not None and found is not None and found.turned is not None:

@@ -418,4 +418,4 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path,
     words = ["train", "a.mcap", "-o", tmp_path / "m.safetensors", "--method", "linear", "--physics", file]
     said = imutool(*words, cwd=tmp_path)
     assert said.returncode == 3
-    assert "linear knows no effects" in said.stderr
+    assert "linear has no effects" in said.stderr
