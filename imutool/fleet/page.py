@@ -155,7 +155,7 @@ def _logs(statistics: Statistics, link: Links) -> Iterator[str]:
     )
     yield f"<table><thead><tr><th>Log</th><th>What its page says</th></tr></thead><tbody>{rows}</tbody></table>"
     if statistics.pages > len(statistics.drawn):
-        yield f'<p class="note">{statistics.pages - len(statistics.drawn):,} more pages lie beside their logs.</p>'
+        yield f'<p class="note">{statistics.pages - len(statistics.drawn):,} more pages are next to their logs.</p>'
 
 
 def _warnings(statistics: Statistics) -> Iterator[str]:

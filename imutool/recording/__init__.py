@@ -227,7 +227,7 @@ class Recording:
             f"{what}: the poses are {listed}",
             where=self.name,
             expected=expected,
-            fix="Take one of them all the same with `truth`",
+            fix="Name one with `truth` to use it anyway",
         )
 
     def with_truth(self, topic: str) -> Recording:

@@ -225,4 +225,4 @@ def _check_contradictions(asked: RequestedOutputs) -> None:
     if asked.port is not None and not asked.web:
         raise ConfigError(f"{asked.port} has no effect without `web`", where="port", fix="Add `web`")
     if asked.at is not None and not asked.has_cursor:
-        raise ConfigError("a file has no cursor", where="at", fix="Leave it out, or add `connect`, `web` or `export`")
+        raise ConfigError("a file has no cursor", where="at", fix="Leave it out, or add `connect`, `web` or `export_web`")

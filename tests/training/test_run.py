@@ -372,7 +372,7 @@ def test_without_a_remainder_no_ode_is_trained(logs: list[Path], tmp_path: Path)
     [
         ({"gyro_effects": ["gyro_scal"]}, r"'gyro_scal' is not known.*Did you mean 'gyro_scale'"),
         ({"gyro_effects": ["lever_arm"]}, "lever_arm does not act on the gyro"),
-        ({"accel_effects": ["accel_scale", "accel_scale"]}, "a name stands there twice"),
+        ({"accel_effects": ["accel_scale", "accel_scale"]}, "a name occurs twice"),
         ({"remainer": False}, r"remainer is not a setting.*Did you mean remainder"),
     ],
 )
