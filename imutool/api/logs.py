@@ -120,8 +120,7 @@ def convert(
         kinds: Kind of the poses by topic, as `TOPIC=truth|estimate|odometry|unknown`.
         mapping: TOML file with the meaning and units of a table's columns.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
-        correct: `conventions` corrects units, axes and frames that the motion shows to be wrong. `stamps` puts late stamps
-            on the IMU's clock.
+        correct: `conventions`: wrong units, axes and frames, as the motion shows; `stamps`: late stamps of the IMU.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 

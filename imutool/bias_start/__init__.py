@@ -1,4 +1,4 @@
-"""Initial bias of a model in a log, its change over time, and the verdict on whether the model fits."""
+"""Initial bias of a model in a log, its change over time, and whether the model fits."""
 
 from __future__ import annotations
 
