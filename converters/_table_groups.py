@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
-from ._table_map import Entries, Proposal
-from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name
+from ._table_map import IMU_TOPIC, Entries, Proposal
+from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name, triples
 from ._table_rotations import order_by_motion
 from ._table_text import Columns
 from ._table_times import rises
@@ -55,6 +56,20 @@ LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set,
 ]
 
 
+def imus_apart(columns: Columns) -> dict[str, Columns]:
+    """Columns without those of other IMUs, by topic; empty unless several pair by name."""
+    names = {column: split_name(column)[0] for column in columns.values}
+    gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
+    if len(gyros) < 2 or gyros.keys() != accels.keys():
+        return {}
+    of = {owner: {*gyros[owner].values(), *accels[owner].values()} for owner in gyros}
+    apart = {}
+    for owner, own in of.items():
+        values = {c: v for c, v in columns.values.items() if c in own or not any(c in other for other in of.values())}
+        apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
+    return apart
+
+
 def known_layout(columns: Columns) -> Proposal | None:
     """Map of the first data set whose arrays are there."""
     for reason, imu, poses in LAYOUTS:
@@ -72,7 +87,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     that of a motion capture.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
-    other = time_beside(columns, entries["accel"][0], time, unit)
+    other = time_beside(columns, entries["accel"][0].removeprefix("-"), time, unit)
     found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():

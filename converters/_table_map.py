@@ -10,7 +10,6 @@ import json
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -20,16 +19,16 @@ from imutool.errors import ConfigError
 from imutool.recording.joined_imu import in_order, unit_by_gravity
 from imutool.recording.message_log import KINDS
 
-from ._table_names import ROS_WORDS, TIME_WORDS, XSENS_TIME, name_and_unit, split_name, triples
+from ._table_names import CORE_MOTION, ROS_WORDS, TIME_WORDS, WITHOUT_GRAVITY, XSENS_TIME, name_and_unit, spaced_name, triples
 from ._table_text import Columns
 from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
-from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, UNITS_OF, USUAL_TIME_NS
+from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, UNITS_OF, USUAL_TIME_NS, gravity_units
 
 IMU_TOPIC = "/imu0"
 NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 MOST_SHOWN = 12  # triples of columns in a message
-GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
+OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
 
 Entries = dict[str, str | list[str]]  # of a map
 
@@ -139,20 +138,6 @@ class Proposal(msgspec.Struct):
         return "\n".join(lines)
 
 
-def imus_apart(columns: Columns) -> dict[str, Columns]:
-    """Columns without those of other IMUs, by topic; empty unless several pair by name."""
-    names = {column: split_name(column)[0] for column in columns.values}
-    gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
-    if len(gyros) < 2 or gyros.keys() != accels.keys():
-        return {}
-    of = {owner: {*gyros[owner].values(), *accels[owner].values()} for owner in gyros}
-    apart = {}
-    for owner, own in of.items():
-        values = {c: v for c, v in columns.values.items() if c in own or not any(c in other for other in of.values())}
-        apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
-    return apart
-
-
 def propose(columns: Columns) -> Proposal:
     """Map that names, units and magnitudes of the columns suggest."""
     proposal = Proposal({}, [], [])
@@ -162,6 +147,12 @@ def propose(columns: Columns) -> Proposal:
     _propose_time(proposal, names, columns)
     if proposal.open == ["gyro_unit"]:
         _propose_gyro_unit(proposal, columns)
+    accel = proposal.entries.get("accel", [""])
+    if re.match(CORE_MOTION, spaced_name(accel[0])):
+        proposal.entries["accel"] = [f"-{column}" for column in accel]
+        proposal.reasons.append(
+            f"{accel[0]}/y/z are of CoreMotion, whose accelerometer reads -1 g along the axis that points up"
+        )
     return proposal
 
 
@@ -170,8 +161,11 @@ def _propose_sensor(
 ) -> None:
     """Columns of the three axes, and their unit."""
     plain = {column: name for column, (name, _) in names.items()}
-    spaced = {c: split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", c))[0] for c in names}  # UncompGyro_0
-    whole = [*triples(sensor, plain, spaced).values()]
+    spaced = {column: spaced_name(column) for column in names}
+    found = [*triples(sensor, plain, spaced).values()]
+    whole = _with_gravity(found, spaced, columns) if sensor == "accel" else found
+    if len(whole) < len(found):
+        proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
         shown = "".join(f"{': ' if n == 0 else ', '}{triple['x']}/y/z" for n, triple in enumerate(whole[:MOST_SHOWN]))
@@ -190,12 +184,19 @@ def _propose_sensor(
     elif re.search(ROS_WORDS, names[chosen[0]][0]):
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
-        _propose_unit(proposal, sensor, np.stack([columns.values[c].astype(float) for c in chosen], axis=1))
+        _propose_unit(proposal, sensor, columns)
     if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
-        level = float(np.nanmedian(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0)))
-        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"(user|free)_?acc", names[chosen[0]][0]):
+        level, _ = gravity_units(columns, chosen)
+        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
             proposal.open.append("accel")
             proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
+
+
+def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:
+    """The one of several accelerations that has gravity, by its name or by its size; all where none stands out."""
+    named = [triple for triple in found if not re.search(WITHOUT_GRAVITY, spaced[triple["x"]])]
+    sized = [triple for triple in named if gravity_units(columns, list(triple.values()))[1]]
+    return next((each for each in (named, sized) if len(each) == 1), found)
 
 
 def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
@@ -215,11 +216,10 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
         )
 
 
-def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
+def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
     """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
-        level = float(np.nanmedian(np.linalg.norm(values, axis=1)))
-        near = [unit for unit, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND]
+        level, near = gravity_units(columns, proposal.entries[sensor])
         if near:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
         if len(near) == 1:
@@ -232,12 +232,14 @@ def _propose_unit(proposal: Proposal, sensor: str, values: np.ndarray) -> None:
 def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns) -> None:
     """Column of the time and its unit, from its name or from a plausible rate."""
     length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
-    found = [c for c, (name, _) in names.items() if re.fullmatch(rf"(.*_)?{TIME_WORDS}", name or names[c][1])]
+    spelled = {c: (name or unit, spaced_name(c)) for c, (name, unit) in names.items()}
+    found = [c for c, each in spelled.items() if any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", name) for name in each)]
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
     if "gyro" in proposal.entries:
         group = proposal.entries["gyro"][0].rpartition("/")[0]
         found.sort(key=lambda c: c.rpartition("/")[0] != group)
+        found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     counter = counter_of(columns, length or 0)
     measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
@@ -253,15 +255,19 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         _propose_rate(proposal, columns, counter, length)
         return
     column = proposal.entries["time"] = found[0]
+    if re.match(OWN_TIME["gyro"], spelled[column][1]):
+        own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
+        proposal.entries |= {"accel_time": own[0]} if own else {}
     if (unit := names[column][1]) in TIME_NS:
         proposal.entries["time_unit"] = unit
         return
-    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
-        proposal.entries["time_unit"] = "100us"
-        proposal.reasons.append(f"{column!r} counts 100 us, as an Xsens sensor does")
-        return
     values = columns.values[column].astype(float)
     step = float(np.median(np.diff(values)))
+    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
+        counts = "100us" if step * TIME_NS["100us"] <= 1e9 / PLAUSIBLE_HZ[0] else "us"
+        proposal.entries["time_unit"] = counts
+        proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")
+        return
     plausible = [u for u, size in USUAL_TIME_NS.items() if PLAUSIBLE_HZ[0] <= 1e9 / (step * size) <= PLAUSIBLE_HZ[1]]
     epochs = [u for u in plausible if 1e18 < values[0] * TIME_NS[u] < 4e18]  # 2001 to 2096
     certain = epochs or plausible

@@ -9,6 +9,7 @@ ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages,
 TIME_WORDS = (
     rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
+    r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
 UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad per sec(ond)?",
@@ -26,10 +27,12 @@ UNITS = {
     "cm": r"cm|centimet(er|re)s?",
     "mm": r"mm|millimet(er|re)s?",
 }
+WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
+CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
-    "gyro": r"gyro(scope)?|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate|w_rs_s"
-    r"|dreh(rate|geschwindigkeit)",
+    "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
+    r"|w_rs_s|dreh(rate|geschwindigkeit)",
     "accel": r"accel(eration|erometer)?|acce?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
     r"|(linear)?beschleunigung|a_rs_s",
 }
@@ -39,6 +42,8 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_(?P<axis>roll|pitch|yaw){STATE}",
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<number>\d){STATE}",  # the first of several IMUs: ax1, acc_x_1
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<number>\d)_?(?P<axis>[xyz]){STATE}",  # acc1_x
 )
 AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z"}
@@ -47,7 +52,7 @@ TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z"}
 def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
     """Columns of three axes by what they are of, in the first form of names that has all three.
 
-    `names` are spellings of the columns' names; `left_gyr_x` is of `left`.
+    `names` are spellings of the columns' names; `left_gyr_x` is of `left`, `gx2` of `imu2`.
     """
     tries = (_triples(sensor, spelled, form) for form in FORMS for spelled in names)
     return next(filter(None, tries), {})
@@ -58,7 +63,8 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     axes = TURNS if sensor == "gyro" else AXES
     for column, name in names.items():
         if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
-            groups.setdefault(match["sensor"], {})[axes.get(match["axis"], match["axis"])] = column
+            number = f"imu{match['number']}_" if "number" in match.groupdict() else ""
+            groups.setdefault(number + match["sensor"], {})[axes.get(match["axis"], match["axis"])] = column
     whole = {name: group for name, group in groups.items() if set(group) == set("xyz")}
     owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name in whole]
     return dict(zip(owners if len({*owners}) == len(whole) else whole, whole.values(), strict=True))
@@ -75,6 +81,11 @@ def unit_named(text: str) -> str:
     return next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, text.strip("[]").lower())), "")
 
 
+def spaced_name(column: str) -> str:
+    """Name of a column with underscores between its words: UncompGyro_0, gyroTimestamp."""
+    return split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", column))[0]
+
+
 def split_name(column: str) -> tuple[str, str]:
     """Name in lower case with underscores, and the unit in brackets or at the end."""
     text = column.strip().lower()
@@ -84,7 +95,7 @@ def split_name(column: str) -> tuple[str, str]:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
-        end := re.search(r"_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
+        end := re.search(r"(?:_in)?_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imutool.recording import GRAVITY_M_S2, Imu
+
+from ._table_text import Columns
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
@@ -19,9 +23,16 @@ UNITS_OF: dict[str, dict[str, float]] = {
     "truth_time_unit": TIME_NS,
     "position_unit": POSITION_SI,
 }
+GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 MOST_OF_GRAVITY = 2.0  # factor between gravity and the median acceleration of a robot or a person that moves
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common gyros
 USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
+
+
+def gravity_units(columns: Columns, chosen: Sequence[str]) -> tuple[float, list[str]]:
+    """Median length of the vectors in three columns, and the units in which it is gravity."""
+    level = float(np.nanmedian(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0)))
+    return level, [u for u, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND]
 
 
 def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:

@@ -23,8 +23,8 @@ from . import Sequence
 from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_folder import is_split, load_split
-from ._table_groups import group_entries, known_layout, time_beside
-from ._table_map import IMU_TOPIC, Proposal, TableMap, imus_apart, propose, read_map
+from ._table_groups import group_entries, imus_apart, known_layout, time_beside
+from ._table_map import IMU_TOPIC, Proposal, TableMap, propose, read_map
 from ._table_rotations import of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times

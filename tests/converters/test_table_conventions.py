@@ -33,16 +33,18 @@ def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
     return path
 
 
-def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds(tmp_path):
+@pytest.mark.parametrize(("counts", "step"), [("100 us", 50), ("us", 5_000)])
+def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds_or_microseconds(tmp_path, counts, step):
     names = ["PacketCounter", "SampleTimeFine", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
-    columns = [np.arange(COUNT), 12_345 + 50 * np.arange(COUNT), *ACCEL.T, *GYRO.T]
+    columns = [np.arange(COUNT), 12_345 + step * np.arange(COUNT), *ACCEL.T, *GYRO.T]
     log = table.read_sequence(table.sequences(written(tmp_path / "xsens.csv", names, columns))[0])
     assert np.array_equal(np.diff(log.imus["/imu0"].t_ns), np.full(COUNT - 1, 5_000_000))
-    assert "'SampleTimeFine' counts 100 us, as an Xsens sensor does" in log.remarks.notes
+    assert f"'SampleTimeFine' counts {counts}, as an Xsens sensor does" in log.remarks.notes
 
 
-def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path):
-    names = ["TimeStartup", *(f"UncompAccel_{k}" for k in range(3)), *(f"UncompGyro_{k} [mdps]" for k in range(3))]
+@pytest.mark.parametrize("time", ["TimeStartup", "Time since start in ns"])
+def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path, time):
+    names = [time, *(f"UncompAccel_{k}" for k in range(3)), *(f"UncompGyro_{k} [mdps]" for k in range(3))]
     columns = [T_NS - START_NS + 5_000_000_000, *ACCEL.T, *np.rad2deg(GYRO * 1e3).T]
     imu = table.read_sequence(table.sequences(written(tmp_path / "vn.csv", names, columns))[0]).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, GYRO, rtol=1e-12)
@@ -295,6 +297,48 @@ def test_several_imus_of_one_table_are_several_imus_of_one_log(tmp_path, written
     assert np.array_equal(late_ns, np.full(length, 1_000_000 if written_by == "groups with clocks" else 0))
     assert log.scalars == {}
     assert log.metadata["imutool/map/right/imu"]["topic"] == "/right/imu"
+
+
+@pytest.mark.parametrize("form", ["{s}{a}{n}", "{s}_{a}_{n}", "{s}{n}_{a}"])
+def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
+    named = [
+        form.format(s=s, a=a, n=n) + f" [{u}]" for n in (1, 2) for s, u in (("gyr", "rad/s"), ("acc", "m/s^2")) for a in "xyz"
+    ]
+    path = written(tmp_path / "two.csv", ["t_ns", *named], [T_NS, *GYRO.T, *ACCEL.T, *GYRO[::-1].T, *ACCEL[::-1].T])
+    imus = table.read_sequence(table.sequences(path)[0]).imus
+    assert [*imus] == ["/imu1/imu", "/imu2/imu"]
+    np.testing.assert_allclose(imus["/imu1/imu"].accel, ACCEL)
+    np.testing.assert_allclose(imus["/imu2/imu"].gyro, GYRO[::-1])
+
+
+@pytest.mark.parametrize("without", ["lin_acc", "user_acceleration", "LinearAcceleration", "ac"])
+def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path, without):
+    names = [
+        "t_ns",
+        *(f"{without}_{a} [m/s^2]" for a in "xyz"),
+        *(f"{s}_{a} [{u}]" for s, u in (("acc", "m/s^2"), ("gyr", "rad/s")) for a in "xyz"),
+    ]
+    path = written(tmp_path / "phone.csv", names, [T_NS, *(ACCEL - [0.0, 0.0, 9.81]).T, *ACCEL.T, *GYRO.T])
+    log = table.read_sequence(table.sequences(path)[0])
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
+    assert any("acc_x [m/s^2]/y/z is the one with gravity" in note for note in log.remarks.notes)
+
+
+def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_rest(tmp_path):
+    s, late_s = (T_NS - START_NS) / 1e9 + 98_765.0, 0.001
+    names = [
+        "loggingTime(txt)", "accelerometerTimestamp_sinceReboot(s)", *(f"accelerometerAcceleration{a}(G)" for a in "XYZ"),
+        "gyroTimestamp_sinceReboot(s)", *(f"gyroRotation{a}(rad/s)" for a in "XYZ"),
+        *(f"motionRotationRate{a}(rad/s)" for a in "XYZ"), *(f"motionUserAcceleration{a}(G)" for a in "XYZ"),
+    ]  # fmt: skip
+    user = ACCEL - [0.0, 0.0, 9.81]
+    columns = [T_NS, s, *(-ACCEL / 9.80665).T, s + late_s, *GYRO.T, *(GYRO + 1.0).T, *(-user / 9.80665).T]
+    log = table.read_sequence(table.sequences(written(tmp_path / "sensorlog.csv", names, columns))[0])
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro[0], GYRO[0])
+    assert imu.t_ns[0] == 98_765_001_000_000
+    np.testing.assert_allclose(np.median(imu.accel, axis=0), [0.0, 0.0, 9.81], atol=0.05)
+    assert log.metadata["imutool/map"]["accel_time"] == "accelerometerTimestamp_sinceReboot(s)"
 
 
 def test_one_map_holds_for_several_imus_whose_unit_is_open(tmp_path):
