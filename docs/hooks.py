@@ -14,19 +14,7 @@ ROOT = Path(__file__).parents[1]
 INTRODUCTION = """# Commands
 
 Every command has `--help`. With `--json FILE|-` a command writes its report as JSON;
-`imutool schema NAME` prints the schema.
-
-| exit code | meaning | what to look at |
-|---|---|---|
-| 0 | success | |
-| 1 | a bug, with a traceback | please report it |
-| 2 | wrong usage | the command line |
-| 3 | a setting or file that cannot be used; or a part of a log is lost | the command, or the listed losses |
-| 4 | data contradict themselves or their format | the data |
-| 5 | a log that cannot be read | the log |
-| 6 | a model that cannot be used | the model |
-| 7 | numerics failed | step, window, rate |
-| 130 | interrupted | |
+`imutool schema NAME` prints the schema. [Exit codes](exit-codes.md) lists what each exit code means.
 """
 
 EFFECTS = """# Effects

@@ -15,7 +15,7 @@ def main(source: str, folder: str, model: str = "static") -> None:
         debiased = log.with_name(f"{log.stem}_debiased.mcap")
         report = imutool.debias(log, debiased, model=model, overwrite=True)
         for topic, start in report.starts.items():
-            print(f"{debiased}: {topic} with {report.models[topic]}, start bias from {start.how}")
+            print(f"{debiased}: {topic} with {report.models[topic]}, initial bias from {start.how}")
         for result in imutool.evaluate(log, models=[model]):
             print(f"  {result['model']:>12}: orientation {result['aoe_deg']:8.2f} deg, position {result['ape_m']:8.2f} m")
 

@@ -27,7 +27,7 @@ def main(path: str, name: str = "static") -> None:
     model = imutool.load_model(name)
     imu = imutool.read(path).imu  # a live node would collect the first two seconds
     start = imutool.bias_at_rest(model, imu.rows(slice(0, round(REST_S / imu.period_s))))
-    print(f"start bias from {start.how}: gyro {start.rest[:3].round(5)} rad/s, accel {start.rest[3:].round(4)} m/s²")
+    print(f"initial bias from {start.how}: gyro {start.rest[:3].round(5)} rad/s, accel {start.rest[3:].round(4)} m/s²")
 
     online, latency_s = imutool.OnlineDebiaser(model, start), []
     for stamp_ns, gyro, accel in driver(path):

@@ -16,7 +16,7 @@ def main(path: str, topic: str = "/imu0") -> None:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         for record in reader.iter_metadata():
             if "model" in record.metadata:
-                print(f"model {record.metadata['model']}, start bias from {record.metadata['init_how']}")
+                print(f"model {record.metadata['model']}, initial bias from {record.metadata['init_how']}")
         raw = {}
         pairs = 0
         for _, channel, message, imu in reader.iter_decoded_messages(topics=[topic, f"{topic}/debiased"]):

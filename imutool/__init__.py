@@ -15,7 +15,7 @@ From a raw folder to a debiased log::
     imutool.view("debiased.mcap", html="debiased.html")                       # one page; without html a viewer opens
 
 Units: gyro in rad/s, accel (specific force) in m/s², time in integer nanoseconds, quaternions as w, x, y, z.
-Every error is an `ImutoolError` that says where, what, what was expected, and what to do.
+Every error is an `ImutoolError`. Its message names the place, the problem, what was expected, and what to do.
 """
 
 from importlib import import_module as _import_module

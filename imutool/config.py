@@ -52,7 +52,7 @@ def toml(path: Path, what: str) -> dict[str, Any]:
                 f"{what} cannot be read (more than {MOST_BYTES} bytes)",
                 where=path,
                 expected=f"a TOML file of at most {MOST_BYTES} bytes",
-                fix="See whether this is the file that was meant",
+                fix="Check the name of the file",
             )
         values = tomllib.loads(raw.decode())
     except OSError as error:

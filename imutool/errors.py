@@ -41,7 +41,7 @@ class ImutoolError(Exception):
     Secrets in the URLs of a message are replaced by ***.
 
     Args:
-        what: what happened, with the offending value in it.
+        what: what happened, with the wrong value.
         where: the file or URL, optionally with a line (``data.csv:17``), the topic, the setting, or the parameter.
         expected: what would have been right, as the end of "expected ...".
         fix: what the user can do, as a sentence without its full stop.
@@ -61,7 +61,7 @@ class ImutoolError(Exception):
         return f"{place}{self.what}{expected}.{fix}"
 
     def at(self, where: object) -> ImutoolError:
-        """Error with its place filled in, for a caller that knows the file."""
+        """Error with its place filled in, by a caller that has the name of the file."""
         return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -74,7 +74,7 @@ def _rebuild(kind: type[ImutoolError], what: str, where: str | None, expected: s
 
 
 class ConfigError(ImutoolError):
-    """A parameter or a settings file asks for something impossible."""
+    """A parameter, a settings file or a place of a file cannot be used."""
 
     exit_code = 3
 

@@ -34,8 +34,8 @@ def read(
 ) -> Recording:
     """Read a log as numpy arrays; `read(write(recording)) == recording`, bit for bit.
 
-    A log of another program gets the file's name. Its pose topics become `truths`, its Float64 and Vector3Stamped topics
-    become `scalars`, and the field `temperature` of any other message as `TOPIC.temperature`, two numbers a second at most.
+    A log of another program gets the file's name. Its pose topics become `truths`. Its Float64 and Vector3Stamped topics become
+    `scalars`, and so does the field `temperature` of any other message, as `TOPIC.temperature`, at most twice a second.
 
     Args:
         path: MCAP log: a file, or a URL such as `s3://bucket/log.mcap`.
@@ -118,9 +118,9 @@ def convert(
         overwrite: Replace existing logs.
         sensor: Name of the IMU, where the recording does not state it.
         kinds: Kind of the poses by topic, as `TOPIC=truth|estimate|odometry|unknown`.
-        mapping: TOML file that states what the columns of a table mean.
+        mapping: TOML file with the meaning and units of a table's columns.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
-        correct: `conventions`: units, axes and frames that the motion shows to be wrong; `stamps`: put them on a line.
+        correct: `conventions`: wrong units, axes and frames, as the motion shows; `stamps`: late stamps of the IMU.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
         progress: Callback with sequences done, sequences in all, and the name of the last one.
 
@@ -185,7 +185,7 @@ def export(
     """Write a log as a EuRoC (ASL) or rosbag2 folder, or a sensor for a simulator.
 
     Args:
-        log: MCAP log; for a simulator the folder of a diagnosis, or a folder of several, whose spread gives the ranges.
+        log: MCAP log. For a simulator: the folder of a diagnosis, or a folder of several; their spread gives the ranges.
         out: Folder to make.
         format: `euroc` or `rosbag2`; `mujoco`, `gazebo`, `isaac` or `toml` for a diagnosed sensor.
         imu: IMU topic for a EuRoC folder; by default the debiased one.

@@ -39,8 +39,8 @@ def load_model(name: str | Path, *, rate_hz: float | None = None, on_s: float | 
     Args:
         name: `FILE.safetensors`, a name that `imutool models` lists, `static`, or a `physics.toml`.
         rate_hz: Sample rate; needed for a `physics.toml` alone.
-        on_s: Seconds for which the sensor was on before its first sample, for a model that has learned how it warms up. Without
-            them a recording tells; an `OnlineDebiaser`, which cannot look ahead, takes the sensor for cold.
+        on_s: Seconds for which the sensor was on before its first sample, for a model with a warm-up. By default a recording
+            shows it; an `OnlineDebiaser` cannot look ahead and assumes a cold sensor.
 
     Raises:
         ModelError: No such model (the message suggests the nearest name), or a damaged file.
@@ -162,22 +162,22 @@ def debias(
     """Subtract the IMU's bias from a recording, or write a debiased log.
 
     `debias(recording, model)` returns arrays. `debias("in.mcap", "out.mcap", model=...)` writes a log with every record of the
-    old one, `/imu0/debiased`, the bias and its covariance; without `smooth` it depends on no later sample.
+    old one, `/imu0/debiased`, the bias and its covariance. Without `smooth` the bias of a sample depends on no later sample.
 
     Args:
         source: Recording, or MCAP log: a file or a URL.
         target: Log to write. With a recording, the second argument is the model.
         model: Model file, name of a model that ships, `static`, or a dictionary from IMU topic to model. By default the
-            model that ships for the log's very sensor, else the mean at rest. With a recording, also a loaded model.
+            model that ships for this unit of the sensor, else the mean at rest. With a recording, also a loaded model.
         init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers.
         smooth: Estimate the initial bias from the whole log, forward and backward.
         imus: IMU topics of a log; by default the only one.
         in_place: Replace the log `source` instead of writing `target`.
         check: Chunks of a log whose CRC is compared: `imu`, `all` or `none`.
         force: Use a model although it does not fit the log.
-        encoding: Of the new IMU topic: `own`, that of its source, or `cdr`.
+        encoding: Encoding of the new IMU topic: `own`, as its source, or `cdr`.
         overwrite: Replace an existing `target`.
-        progress: Callback with bytes done and in all.
+        progress: Callback with bytes done and bytes in all.
 
     Raises:
         ConfigError: A file cannot be opened, `target` is missing or exists, or options contradict each other.

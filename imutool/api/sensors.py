@@ -71,7 +71,7 @@ def simulate(
     Raises:
         ConfigError: A setting, a settings file, or an existing log.
         LogError: No poses, or damage.
-        DataError: Less than 2 s of usable motion, or an effect lacks its input channel.
+        DataError: Less than 2 s of usable motion, or no input channel for an effect.
 
     Examples:
         >>> import imutool
@@ -115,7 +115,7 @@ def diagnose(
         truth: Topic of the true poses; by default the first.
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
         output: Folder for `findings.json`, `physics.toml`, `noise.toml`, `report.html`, `log.html` and `view.rrd`.
-        close: Simulate again with the physics that was found, diagnose again, and compare. Needs one recording and `output`.
+        close: Simulate again with the physics that was found, diagnose again, and compare. It needs one recording and `output`.
         metric: Your own figure for `close`, from the path of a simulated log.
         overwrite: Replace an earlier diagnosis in `output`.
         progress: Callback with steps done, steps in all, and the current step.

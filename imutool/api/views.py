@@ -47,7 +47,7 @@ def load_run(
         truth: Topic of the true poses; by default the first.
         align: Alignment of each path with the truth: `none`, `origin`, `yaw` or `se3`.
         findings: Folder of a diagnosis, whose findings become events.
-        aid: Also the smoothed path of each model with aids, as in `evaluate`.
+        aid: Aids for a smoothed path of each model, as in `evaluate`.
 
     Returns:
         `traces` (of `raw`, each model and each aided path), each with `run`, `path`, `errors` and `windows`; `events`; and
@@ -102,7 +102,7 @@ def view(
     Args:
         logs: Logs (files or URLs), or runs from `load_run`.
         at: Position of the cursor: seconds from the first sample, or `worst`, the largest orientation error of a model.
-        source: Also show what else the log holds, for example cameras.
+        source: Also show the other topics of the log, for example cameras.
         save: .rrd file for the Rerun viewer.
         connect: Address of a running viewer, `HOST:PORT`.
         web: Serve to a browser on this machine, until Ctrl-C.

@@ -127,10 +127,10 @@ class CovarianceModel(Protocol):
 class BiasModel(ABC):
     """Bias model with the statistics of its sensor's training runs, from which every run starts.
 
-    It computes in float64; files hold float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
-    those that are not given are zero. `log_drift` is that of the log that the model is bound to, and its streams take samples
-    without it; `remarks` say what makes it less sure. `load_before` is what load the sensor bore before the log, where it did
-    not begin cold (`imutool.bias_start.earlier_load`).
+    It computes in float64; files store float32. `tensors` are the weights and statistics by name, with the shapes of `shapes`;
+    missing ones are zero. `log_drift` is the drift in the log that the model is bound to; its streams take samples without
+    this drift. `remarks` lists the reasons for a larger uncertainty. `load_before` is the load on the sensor before the log, if
+    it was warm at the start (`imutool.bias_start.earlier_load`).
     """
 
     method: ClassVar[str]
@@ -146,7 +146,7 @@ class BiasModel(ABC):
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
-        """Shapes of the tensors by name; they cost no memory, whatever sizes the settings name.
+        """Shapes of the tensors by name; they need no memory, whatever sizes the settings give.
 
         Raises:
             ConfigError: settings that do not fit each other, or an unknown effect.
@@ -208,7 +208,7 @@ class BiasModel(ABC):
         """
 
     def stream(self, rest: Vector6) -> SampleStream:
-        """Bias stream from a rest bias, for long logs and live use; after a gap a new stretch begins."""
+        """Bias stream from a rest bias, for long logs and live use; a new stretch begins after a gap."""
         return _Stretches(self, rest)
 
 

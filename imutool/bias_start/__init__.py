@@ -1,4 +1,4 @@
-"""Initial bias of a model in a log, its course, and the verdict on whether the model fits."""
+"""Initial bias of a model in a log, its change over time, and whether the model fits."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Fitness(Section, frozen=True):
             raise ModelError(
                 f"the model {name!r} does not fit this log: {reasons}",
                 where=where,
-                expected="a model of this very sensor, and samples in rad/s and m/s²",
+                expected="a model of this unit of the sensor, and samples in rad/s and m/s²",
                 fix="Correct wrong units with imutool convert LOG OUT --fix; else give `model=static` or one trained on logs "
-                "of this sensor, or use it all the same with `force`",
+                "of this sensor, or use it anyway with `force`",
             )
         if self.verdict != "fits":
             logger.warning("%s: %s", where, self.sentence(f"the model {name}"))

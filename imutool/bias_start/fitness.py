@@ -76,7 +76,9 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         return Fitness("unfit", (wrong,))
     if model.method == static.Model.method:
         units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
-        return Fitness("fits", (f"it is a constant bias of this log, not a trained one; models ship for {', '.join(units)}",))
+        return Fitness(
+            "fits", (f"it is the bias at rest of this log, without training; trained models ship for {', '.join(units)}",)
+        )
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)
@@ -110,10 +112,10 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:
         return Fitness("doubtful", tuple(doubts))
-    agreement = _asked(share) if confirmed else _agreement(found, prior)
+    agreement = _shown_share(share) if confirmed else _agreement(found, prior)
     followed = [] if model.log_drift is None else [f"its bias follows {model.log_drift.name}"]
     if model.load_before is not None:
-        followed.append("the sensor was in use before the log, so that its drift does not begin cold")
+        followed.append("the sensor was in use before the log, so its drift does not start cold")
     return Fitness("fits", (agreement, *other_bias, *followed))
 
 
@@ -225,7 +227,7 @@ def _other_bias(found: _Evidence, prior: BiasPrior, most: Vector6) -> Iterator[s
         if deviations[axis] > most[axis]:
             yield (
                 f"the {sensor}'s bias about {'xyz'[axis % 3]} differs by {found.difference[axis]:+.2g} {unit} from the training"
-                f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another switching-on"
+                f" runs, {deviations[axis]:.0f} standard deviations: another unit, or another turn-on"
             )
 
 
@@ -239,21 +241,21 @@ def _disagreement(found: _Evidence, none: _Evidence) -> Iterator[str]:
 
 
 def _refuted(share: Share) -> Iterator[str]:
-    """Sentence on a correction of which the log asks for less than half."""
+    """Sentence on a correction of which the log shows less than half."""
     if LEAST_SHARE < share.value < HALF - SURE * share.std:
-        yield f"{_asked(share)}: what it corrects there is another unit's"
+        yield f"{_shown_share(share)}: the correction is another unit's"
 
 
-def _asked(share: Share) -> str:
-    """Share of the correction that the log asks for, in words."""
-    return f"gravity and stops ask for {share.value:.0%} ± {share.std:.0%} of the model's correction in motion"
+def _shown_share(share: Share) -> str:
+    """Share of the correction that the log shows, in words."""
+    return f"gravity and stops show {share.value:.0%} ± {share.std:.0%} of the model's correction in motion"
 
 
 def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior: BiasPrior, none: _Evidence) -> list[str]:
     """Sentences on a model that explains a log worse than no model, even from its start in that log."""
     shown = found.variance < MOST_CHANGE**2 / MOST_DEVIATIONS**2
     if (shown & (np.abs(found.difference) > MOST_CHANGE + MOST_DEVIATIONS * prior.std)).any():
-        return ["no switching-on changes the bias by so much: the log is of another unit"]
+        return ["no turn-on changes the bias by so much: the log is of another unit"]
     evidence = _evidence(samples, used).log_likelihood - none.log_likelihood
     if evidence > LEAST_EVIDENCE:
         return []

@@ -61,11 +61,11 @@ class NoRestError(DataError):
 
 @dataclass(frozen=True)
 class InitialBias:
-    """Rest bias (gyro rad/s, accel m/s²) with standard deviation, and a few words on its source.
+    """Rest bias (gyro rad/s, accel m/s²) with standard deviation, and its source in words.
 
-    It holds for the whole log, unless `track` or `follows` is set. `track` is the rest bias in time. With `follows`, the prior
-    before the first sample, the rest bias is tracked from the samples from `hold_s` on (s from the first sample). With
-    `least_std`, a prior's standard deviation lies between that and `std`.
+    It is valid for the whole log, unless `track` or `follows` is set. `track` is the rest bias over time. `follows` is the
+    prior before the first sample: the rest bias is then tracked from `hold_s` seconds after the first sample. With
+    `least_std`, the standard deviation of a prior lies between `least_std` and `std`.
     """
 
     rest: Vector6

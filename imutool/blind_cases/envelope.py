@@ -127,7 +127,9 @@ def unseal(envelope: Path, key: Path) -> ConcealedTruth:
         raise DataError(f"the envelope is damaged ({error})", where=envelope, expected="one that conceal wrote") from error
     text = _xor(hidden, secret)
     if not secrets.compare_digest(_commitment(salt, text, contents.logs), contents.commitment):
-        raise DataError("the envelope was changed, or the key is another's", where=envelope, expected="its commitment")
+        raise DataError(
+            "the envelope was changed, or the key belongs to another one", where=envelope, expected="its commitment"
+        )
     for name, value in contents.logs.items():
         if digest(envelope.parent / Path(name).name) != value:
             raise DataError(

@@ -65,7 +65,7 @@ def chosen(only: Iterable[str], without: Iterable[str], force: bool = False, fix
     rules = CleaningSettings(only=tuple(only), without=tuple(without), force=force, fix=fix)
     rules.names()
     if both := set(rules.only) & set(rules.without):
-        raise ConfigError(f"{min(both)} is asked for and left out", where="rule", fix="Give `rule` or `no_rule`")
+        raise ConfigError(f"{min(both)} is in both lists", where="rule", fix="Give `rule` or `no_rule`")
     return rules
 
 

@@ -41,7 +41,7 @@ class Stamps(NamedTuple):
     unset: bool
 
     @property
-    def told(self) -> list[str]:
+    def faults(self) -> list[str]:
         """What is wrong, in words."""
         if self.unset:
             return [f"the stamps are not set: each is {self.stamp_ns[0]} ns"]

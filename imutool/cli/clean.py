@@ -61,7 +61,7 @@ def clean(
 ) -> None:
     """Find the defects of a log's IMU, and say whether the log can be trusted.
 
-    With OUT, write the log with a clean IMU beside the raw one.
+    With OUT, write the log with a clean IMU next to the raw one.
     """
     from imutool.cleaning.rule import chosen
 

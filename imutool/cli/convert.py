@@ -82,7 +82,7 @@ def convert(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert any recording with an IMU to MCAP; its content tells the format."""
+    """Convert any recording with an IMU to MCAP; the format is recognised."""
     from imutool.conversion.run import convert as run
 
     with progress("Converting", verbose, quiet) as tell:
@@ -170,4 +170,4 @@ def new_converter(
     place = Path(f"imutool-{name}") if folder is None else folder
     for path in write_template(name, place):
         say(str(path))
-    say(f"Change imutool_{name}.py, run pytest {place}, then pip install -e {place}: imutool convert knows {name}.")
+    say(f"Change imutool_{name}.py, run pytest {place}, then pip install -e {place}: imutool convert accepts {name}.")

@@ -38,7 +38,7 @@ def debias(
     source: Annotated[str, typer.Argument(metavar="IN", help="An MCAP log: a file, or a URL such as s3://bucket/log.mcap.")],
     target: Annotated[
         str | None,
-        typer.Argument(metavar="OUT", help="New log with the debiased IMU beside the raw one.", show_default=False),
+        typer.Argument(metavar="OUT", help="New log with the debiased IMU next to the raw one.", show_default=False),
         LOG,
     ] = None,
     model: Annotated[list[str] | None, typer.Option(help=MODEL_HELP)] = None,
@@ -112,7 +112,7 @@ class StretchEntry(Section, frozen=True):
 
 
 class DebiasedImu(Section, frozen=True):
-    """Model and start bias of an IMU (gyro rad/s, accel m/s²) with its standard deviation."""
+    """Model and initial bias of an IMU (gyro rad/s, accel m/s²) with its standard deviation."""
 
     model: str
     init_how: str
@@ -182,10 +182,10 @@ def _say(report: DebiasReport, summary: DebiasSummary) -> None:
     for topic, imu in summary.imus.items():
         gyro = ", ".join(f"{b:+.5f}" for b in imu.gyro_bias)
         accel = ", ".join(f"{b:+.4f}" for b in imu.accel_bias)
-        say(f"{topic}: {imu.model}, start bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
+        say(f"{topic}: {imu.model}, initial bias {gyro} rad/s; {accel} m/s² ({imu.init_how})")
         say(f"{topic}: {report.fits[topic].sentence('the model')}")
     counts = ", ".join(f"{count} on {name}" for name, count in summary.added.items())
-    say(f"{summary.output}: {summary.copied} messages as they were, {counts}")
+    say(f"{summary.output}: {summary.copied} messages copied, {counts}")
     verified = summary.verified
     chunks = f"{verified.chunks_checked} of {verified.chunks} chunks"
     say(f"checked: every index, and the contents of {chunks} (--verify {verified.mode})")

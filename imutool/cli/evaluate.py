@@ -34,7 +34,9 @@ from imutool.report import UNSET, Report, Section, UnsetType
 
 logger = logging.getLogger(__name__)
 
-ALIGNED_HELP = "Also print evo's orientation error after an alignment of the positions (SE(3)); it says little about attitude."
+ALIGNED_HELP = (
+    "Also print evo's orientation error after an alignment of the positions (SE(3)); it is no measure of the attitude."
+)
 TRAJECTORIES = Written(files=("*.tum",), keeps=True, of_each="{}_*.tum")
 
 
@@ -101,7 +103,7 @@ def evaluate(
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:
-    """Integrate the IMU from the true start, raw and debiased, and score it on the truth.
+    """Integrate the IMU from the true start, raw and debiased, and compare it with the truth.
 
     A model that does not apply to a log is named at the end, after the scores of the others.
     """

@@ -31,7 +31,7 @@ app.add_typer(fleet)
 FOLDER, PAGE = Written(files=(), keeps=True), Written(output_conflicts.HTML, keeps=True)  # the journal says whose the files are
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
-PAGES_HELP = "Also write a page beside each log, with a link from --report; 5 to 10 s for a log of minutes."
+PAGES_HELP = "Also write a page for each log, with a link from --report; it takes 5 to 10 s for a log of minutes."
 RESUME = "Continue an earlier run: skip finished logs."
 CODES = "\n\nExit code: 0 all logs are intact; 3 data were lost or quarantined; else the largest code of the failed logs."
 
@@ -114,7 +114,7 @@ def repair(
 ) -> Settings:
     """Repair every log and ROS 1 bag, as `imutool repair` does; copy intact ones."""
     if damaged not in {"drop", "keep"}:
-        raise ConfigError(f"{damaged!r} is nothing to do with damage", where="damaged", expected="drop or keep")
+        raise ConfigError(f"unknown value {damaged!r}", where="damaged", expected="drop or keep")
     return Settings(command="repair", damaged=damaged)
 
 

@@ -97,7 +97,7 @@ def _print(report: LogInfo, identified: IdentifiedNoise | None) -> None:
     table(topic_rows(report), keys=1)
     table(imu_rows(report), keys=2)
     if report.models:
-        say(f"Models that ship for this very sensor: {', '.join(report.models)}")
+        say(f"Models that ship for this unit of the sensor: {', '.join(report.models)}")
     if identified is not None:
         from imutool import noise_identification
 

@@ -76,7 +76,7 @@ def live(
         stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds)
     shown = [] if show is None else show.shown
     if malformed.count:
-        tell_warning(f"{malformed.count} messages hold no sample, the first: {malformed.first}")
+        tell_warning(f"messages without a sample: {malformed.count}, the first: {malformed.first}")
     if not write_json(LiveReport(origin, model, stream, shown), json_to, overwrite=overwrite):
         for line in _lines(stream, shown):
             err.print(plain(line), highlight=False, soft_wrap=True) if to_stdout else say(line)

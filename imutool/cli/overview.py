@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 # A test compares names and texts with the commands themselves. The order is that of the page.
 COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the first line of the command's help
-    "convert": ("convert", "Convert any recording with an IMU to MCAP; its content tells the format."),
+    "convert": ("convert", "Convert any recording with an IMU to MCAP; the format is recognised."),
     "export": ("convert", "Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."),
     "new-converter": ("convert", "Write a template of a converter, with a test, as a package of its own."),
     "info": ("info", "Report the topics, quality and damage of a log; with --noise, also its IMU noise."),
@@ -14,7 +14,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "train": ("train", "Train a bias model on logs of one sensor with true poses."),
     "debias": ("debias", "Write a log with a debiased IMU topic; all other messages stay unchanged."),
     "clean": ("clean", "Find the defects of a log's IMU, and say whether the log can be trusted."),
-    "evaluate": ("evaluate", "Integrate the IMU from the true start, raw and debiased, and score it on the truth."),
+    "evaluate": ("evaluate", "Integrate the IMU from the true start, raw and debiased, and compare it with the truth."),
     "vio": ("evaluate", "Score a visual-inertial estimate on the log's IMU, raw and with each model."),
     "view": ("view", "Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files."),
     "live": ("live", "Debias a stream of samples as it comes, show it, and measure the delay."),

@@ -160,7 +160,7 @@ def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:
         ConfigError: another method than `hybrid`, or a file that says nothing to it.
     """
     if method != "hybrid":
-        raise ConfigError(f"{method} knows no effects", where="--physics", fix="Leave it out, or train --method hybrid")
+        raise ConfigError(f"{method} has no effects", where="--physics", fix="Leave it out, or train --method hybrid")
     from imutool.training.run import settings_from_physics
 
     return settings_from_physics(physics)

@@ -34,6 +34,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
 NOT_TURNED = Body(np.eye(3), frozenset())
+MOST_ROUNDS = 3  # a wrong clock of poses hides a turned body, and that a wrong world: each shows after the one before
 SAME_CLOCK_NS = 10**9  # most by which a topic may come into the log later than the IMU
 XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 
@@ -67,7 +68,9 @@ class Corrections:
         """Log with corrected messages, and the record of what was corrected."""
         said = [f"{topic}: {note}" for topic, note in self.notes.items()]
         content.remarks.notes.extend(said)
-        metadata = {**content.metadata, RECORD: dict(self.notes)}
+        earlier = content.metadata.get(RECORD, {})  # of another round, or of an earlier command
+        record = {topic: "; ".join(filter(None, (earlier.get(topic), note))) for topic, note in self.notes.items()}
+        metadata = {**content.metadata, RECORD: {**earlier, **record}}
         return replace(content, messages=lambda: self._each(content.messages()), metadata=metadata)
 
     def _each(self, messages: Iterator[Message]) -> Iterator[Message]:
@@ -202,7 +205,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 moved_s = 1e-9 * float(np.abs(stamps[topic] - late_stamps).max(initial=0))
                 under = "the log times" if found.unset else "them"
                 line = f"stamps are now on a line under {under}, moved by {moved_s:.6f} s at most"
-                notes[topic].append("; ".join([*found.told, line]))
+                notes[topic].append("; ".join([*found.faults, line]))
                 if found.wraps and not clock:
                     clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
             if CONVENTIONS not in wanted:
@@ -226,8 +229,8 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 whole_ns = log_ns if found.unset else _unwrapped(log_ns, before, **clock)
                 if (whole_ns != before).any():
                     stamps[described.name] = whole_ns
-                    told = "; ".join(found.told) or "stamps start after a wrap"
-                    notes[described.name].append(f"{told}; they {'are the log times' if found.unset else 'run on'} now")
+                    faults = "; ".join(found.faults) or "stamps start after a wrap"
+                    notes[described.name].append(f"{faults}; they {'are the log times' if found.unset else 'run on'} now")
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
     return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, said)
 
@@ -271,20 +274,25 @@ def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
 
 
 def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
-    """Write a log with what its motion shows to be wrong corrected; notes say what.
+    """Write a log with corrections of what its motion shows to be wrong; return notes on them.
+
+    Each round writes a file in a new folder next to `log`. The last one, or `log` itself, becomes the target.
 
     Raises:
         ImutoolError: damage, or the target cannot be written.
     """
-    found = find_corrections(log, wanted)
-    if not found:
-        refuse_existing(target, overwrite=overwrite)
-        log.replace(target)
-        return ("the motion shows nothing to correct",)
-    module = registry.load("imutool.converters", "mcap_log")
-    content: MessageLog = module.read_sequence(next(iter(module.sequences(log))))
-    with Log(log) as opened:
-        own = opened.metadata()
-    content = found.put_on(replace(content, metadata=own))
-    write_log(content, target, compression=compression, overwrite=overwrite)
-    return tuple(content.remarks.notes)
+    refuse_existing(target, overwrite=overwrite)
+    module, notes = registry.load("imutool.converters", "mcap_log"), list[str]()
+    for number in range(MOST_ROUNDS if CONVENTIONS in wanted else 1):
+        found = find_corrections(log, [CONVENTIONS] if number else wanted)
+        if not found:
+            break
+        content: MessageLog = module.read_sequence(next(iter(module.sequences(log))))
+        with Log(log) as opened:
+            content = found.put_on(replace(content, metadata=opened.metadata()))
+        log = log.parent / f"round_{number}" / log.name
+        log.parent.mkdir()
+        write_log(content, log, compression=compression, overwrite=overwrite)
+        notes += content.remarks.notes
+    log.replace(target)
+    return tuple(notes) or ("the motion shows nothing to correct",)

@@ -156,7 +156,7 @@ class _Stream:
         for topic, number in self._channels.items():
             self.counts[topic.name] += self._sequence[number]
         for name, count in self._lacking.items():
-            self._source.remarks.losses.append(f"{count} messages of {name} hold no sample: see {name}/as_recorded")
+            self._source.remarks.losses.append(f"messages of {name} without a sample: {count}; see {name}/as_recorded")
 
     def _put(self, number: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> _Buffer:
         buffer = self._buffers[number]

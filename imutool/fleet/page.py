@@ -155,7 +155,7 @@ def _logs(statistics: Statistics, link: Links) -> Iterator[str]:
     )
     yield f"<table><thead><tr><th>Log</th><th>What its page says</th></tr></thead><tbody>{rows}</tbody></table>"
     if statistics.pages > len(statistics.drawn):
-        yield f'<p class="note">{statistics.pages - len(statistics.drawn):,} more pages lie beside their logs.</p>'
+        yield f'<p class="note">{statistics.pages - len(statistics.drawn):,} more pages are next to their logs.</p>'
 
 
 def _warnings(statistics: Statistics) -> Iterator[str]:
@@ -213,7 +213,7 @@ def _spread(statistics: Statistics) -> Iterator[str]:
     for k, (signal, values) in enumerate(statistics.biases.items()):
         if len(values) > 1:
             rows = np.array(values)
-            caption = f"Start bias of the {signal} over {len(rows)} IMUs, by axis"
+            caption = f"Initial bias of the {signal} over {len(rows)} IMUs, by axis"
             yield _figure(_axes(rows, f"{signal} bias ({UNITS[signal]})"), f"b{k}", caption)
     times = [(statistics.seconds, "seconds a log"), (statistics.speeds, "MB/s of one worker")]
     yield _figure(

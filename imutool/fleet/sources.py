@@ -87,7 +87,7 @@ def relative(file: str, root: str) -> str:
         ConfigError: the name leads elsewhere, or a terminal or a file system would not take it.
     """
     if not file.startswith(f"{root.rstrip('/')}/"):
-        raise ConfigError("lies outside what was asked for", expected=f"something below {root}")
+        raise ConfigError("lies outside the source", expected=f"something below {root}")
     name = file[len(root.rstrip("/")) + 1 :]
     parts = name.split("/")
     if not name.isprintable() or _shown(name) != name:

@@ -83,7 +83,7 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Imu(msgspec.Struct, frozen=True):
-    """Start bias of an IMU, gyro (rad/s) and accel (m/s²), with model and method."""
+    """Initial bias of an IMU, gyro (rad/s) and accel (m/s²), with model and method."""
 
     topic: str
     model: str

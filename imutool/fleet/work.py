@@ -253,7 +253,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
 
 
 class UnitReport(Report, frozen=True, tag="imutool.unit/1"):
-    """Parameters of one robot's sensor from one log, with the start bias (rad/s, m/s²)."""
+    """Parameters of one robot's sensor from one log, with the initial bias (rad/s, m/s²)."""
 
     robot: str
     bias: list[list[float]]

@@ -10,6 +10,7 @@ import numpy as np
 from imutool.array_types import Int64
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
+from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.units import Units
@@ -25,9 +26,12 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
-NO_TURN = "no order of the axes fits clearly: little motion, turns about one axis only, or a turned body"
 TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
 NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns that hardly change"
+NO_TURN = (
+    "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or clocks that differ by "
+    f"more than {LONGEST_DELAY_S:g} s"
+)
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
 
@@ -46,7 +50,7 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
-    """Log the warnings about units, axes and frames for whoever uses the samples as they are."""
+    """Log the warnings about units, axes and frames of samples that are used uncorrected."""
     warnings = convention_warnings(convention_summary(imu, truth)) if len(imu) else []
     found = agreement(truth, imu) if truth is not None and not warnings else None
     if truth is not None and found is not None and found.turned is not None:

@@ -47,9 +47,9 @@ NOISE_WINDOW_S = 1.0
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Describe a log: topics, clocks, IMU defects and noise, coverage by the truth, warnings.
 
-    Of a damaged log the sound part is described, and `losses` lists the rest. For that every chunk is read once; without
-    `check` only chunks with IMU messages are read, and damage elsewhere may go unnoticed.
-    A chunk of more than `max_chunk` bytes counts as lost.
+    The sound part of a damaged log is described, and `losses` lists the rest. Every chunk is read once; without `check` only
+    chunks with IMU messages are read, and damage elsewhere may go unnoticed. A chunk of more
+    than `max_chunk` bytes counts as lost.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -266,7 +266,7 @@ def _imu_warnings(
         "saturated": "samples saturated",
     }
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.told]
+    warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.faults]
     warnings += jump_warnings(jumps)
     if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S:
         warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")

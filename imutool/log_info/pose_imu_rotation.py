@@ -17,9 +17,9 @@ from imutool.recording.columns import median
 
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
-LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be told
+LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
 ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
-UNSURE_DEG = 3.0  # standard deviation of a rotation that is not told
+UNSURE_DEG = 3.0  # standard deviation of a rotation that is not reported
 TURNED_DEG = 10.0  # more than a mount that was meant to be straight
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 

@@ -38,9 +38,9 @@ logger = logging.getLogger(__name__)
 class Log:
     """An MCAP file or object in a store, open for reading.
 
-    Memory is bounded by its largest chunk; one of more than `max_chunk` bytes is refused. An open `Source` can be given in
-    place of a path. Times given to a method select by log time, both ends included. The first damage is an error;
-    `recovery.recovered_log.RecoveredLog` reads what is intact of a damaged log.
+    Memory is bounded by the largest chunk; a chunk of more than `max_chunk` bytes is refused. The path may also be an open
+    `Source`. Times in a method's arguments select by log time, both ends included. The first damage is an error;
+    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -104,7 +104,7 @@ class Log:
 
     @property
     def profile(self) -> str:
-        """What the header says the log follows: `ros2`, `ros1` or nothing."""
+        """Profile in the header: `ros2`, `ros1` or nothing."""
         return str(self.index.header.profile)
 
     @property
@@ -133,7 +133,7 @@ class Log:
 
     @property
     def pose_topics(self) -> list[str]:
-        """Topics with poses; /tf counts only where nothing else has any, and never the static one."""
+        """Topics with poses; /tf only where no other topic has poses, and never /tf_static."""
         dedicated = [t.name for t in self.with_schema(MESSAGE_POSES)]
         return dedicated or [t.name for t in self.with_schema((schemas.TF,)) if not t.name.endswith("tf_static")]
 
@@ -144,13 +144,13 @@ class Log:
         return [name for wanted in ("truth", "unknown") for name, kind in kinds.items() if kind == wanted]
 
     def with_schema(self, schema_names: Collection[str]) -> list[Topic]:
-        """The topics that carry one of these messages, in order of their channel ids."""
+        """Topics with one of these message types, in order of their channel ids."""
         return [t for t in self.topics.values() if t.schema_name in schema_names]
 
     def topic(self, name: str, schema_names: Collection[str]) -> Topic:
-        """A topic by name, which must carry one of these messages in an encoding that imutool reads.
+        """A topic by name, with one of these message types in an encoding that imutool reads.
 
-        `gyro=TOPIC,accel=TOPIC` joins two topics to one IMU, and says the delay between them.
+        `gyro=TOPIC,accel=TOPIC` joins two topics to one IMU, and logs the delay between them.
 
         Raises:
             LogError: no such topic, other messages, or another encoding.
@@ -182,7 +182,7 @@ class Log:
         return ", ".join(every) if every else "a log with topics (this one has none)"
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name; of two of one name, later entries replace earlier ones."""
+        """Metadata records by name; in records of the same name, later entries replace earlier ones."""
         found: dict[str, dict[str, str]] = {}
         for name, values in self.metadata_records():
             found.setdefault(name, {}).update(values)
@@ -242,7 +242,7 @@ class Log:
                 yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)
 
     def channel_ids(self, topic: str) -> set[int]:
-        """The channels of a topic; of a joined IMU those of its gyroscope."""
+        """Channels of a topic; for a joined IMU those of its gyroscope."""
         name = (found.gyro_topic if (found := self.topics.get(topic)) else "") or topic
         return {i for i, channel in self.index.channels.items() if channel.topic == name}
 

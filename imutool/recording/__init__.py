@@ -55,7 +55,7 @@ class Imu(Columns):
         self.check(gyro=(3,), accel=(3,))
 
     def check_rate(self, where: str) -> None:
-        """Refuse stamps too close for an IMU, as of microseconds where nanoseconds are expected.
+        """Refuse stamps too close for an IMU, such as microseconds in place of nanoseconds.
 
         Raises:
             DataError: more than half of the samples follow within 20 µs.
@@ -87,7 +87,7 @@ class Poses(Columns):
 
     @property
     def has_positions(self) -> bool:
-        """Whether positions are known; of orientations alone all are zero while the body turns."""
+        """Whether positions are known; without them all are zero while the body turns."""
         turns = len(self) > 0 and bool((np.ptp(self.q_wb_wxyz, axis=0) > TURNED).any())
         return not turns or bool(self.p_wb.any() or (self.v_w is not None and self.v_w.any()))
 
@@ -138,7 +138,7 @@ class Scalars(Columns):
 
 @dataclass(frozen=True)
 class Frames:
-    """Camera frames that stay in their source; a writer copies them in the order of the source."""
+    """Camera frames in their source file; a writer copies them in the order of the source."""
 
     format: str
     count: int
@@ -159,7 +159,7 @@ class Recording:
     """Recording of one IMU with its true poses, scalar channels, camera frames and metadata.
 
     `truths`, `scalars` and `frames` are keyed by topic (`/ground_truth/pose`), `metadata` by record name. `truths` holds an
-    estimate or odometry only where it was asked for by name; `other_poses` then states its kind. Equality ignores
+    estimate or odometry only if the caller named its topic; `other_poses` then states its kind. Equality ignores
     frames: the writer copies them byte for byte, which its tests check.
     """
 
@@ -208,18 +208,18 @@ class Recording:
         return next(iter(self.truths.values()))
 
     def kind_of(self, topic: str) -> str:
-        """What poses are worth; those of a transform, TOPIC/CHILD_FRAME, what their topic is."""
+        """Kind of a pose topic; a transform, TOPIC/CHILD_FRAME, has the kind of its topic."""
         others = self.other_poses.items()
         return next((kind for other, kind in others if topic == other or topic.startswith(f"{other}/")), "truth")
 
     @property
     def truth_caveat(self) -> str:
-        """Caveat on poses that were asked for and are no truth; else empty."""
+        """Caveat on named poses that are no truth; else empty."""
         chosen = [f"{topic} ({kind})" for topic in self.truths if (kind := self.kind_of(topic)) != "truth"]
         return f"{', '.join(chosen)} is no truth: poses made with this IMU hide errors of it" if chosen else ""
 
     def no_truth(self, what: str, expected: str = "a pose topic in the log") -> DataError:
-        """Error of a recording without truth; it names the poses that are an estimate or odometry."""
+        """Error of a recording without truth; it lists the poses that are an estimate or odometry."""
         if not self.other_poses:
             return DataError(what, where=self.name, expected=expected)
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in self.other_poses.items())
@@ -227,7 +227,7 @@ class Recording:
             f"{what}: the poses are {listed}",
             where=self.name,
             expected=expected,
-            fix="Take one of them all the same with `truth`",
+            fix="Name one with `truth` to use it anyway",
         )
 
     def with_truth(self, topic: str) -> Recording:
@@ -253,13 +253,13 @@ class Recording:
         )
 
     def between_jumps(self) -> list[Recording]:
-        """Recordings of the stretches between jumps of the IMU's clock; itself where there is none."""
+        """Recordings of the stretches between jumps of the IMU's clock; the recording itself without a jump."""
         starts = [start_ns for start_ns, _ in clock_jumps(self.imu.t_ns)]
         edges = [*self.imu.t_ns[:1].tolist(), *starts, *(self.imu.t_ns[-1:] + 1).tolist()]
         return [self.between(a, b - 1) for a, b in pairwise(edges)] if starts else [self]
 
     def overlap(self) -> Recording:
-        """Recording cut to the time that IMU and (first) truth share.
+        """Recording cut to the time that the IMU and the first truth share.
 
         Raises:
             DataError: no truth, or the two share less than two samples.

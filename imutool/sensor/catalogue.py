@@ -50,5 +50,5 @@ def trained(sensor: Sensor, names: Sequence[str] | None = None) -> tuple[LinearF
         listed = ", ".join(form.name for form in trained(sensor))
         raise ConfigError(f"{refused} does not act on the {sensor}", where=where, expected=f"some of {listed}")
     if names is not None and len(set(names)) < len(names):
-        raise ConfigError(f"{', '.join(names)}: a name stands there twice", where=where, expected="each at most once")
+        raise ConfigError(f"{', '.join(names)}: a name occurs twice", where=where, expected="each at most once")
     return tuple(linear_form(effect, sensor) for effect in chosen)

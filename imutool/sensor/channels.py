@@ -42,7 +42,7 @@ class Channels:
         """Sentence on the fields that were tried as causes, empty where there are none."""
         if not self.added:
             return ""
-        text = f"Tried as causes, beside the log's scalar topics: {', '.join(self.added)}"
+        text = f"Tried as causes, in addition to the log's scalar topics: {', '.join(self.added)}"
         if self.untried:
             shown = ", ".join(self.untried[:LISTED])
             more = f" and {len(self.untried) - LISTED} more" if len(self.untried) > LISTED else ""

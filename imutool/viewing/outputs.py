@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from imutool import __version__
 from imutool.errors import ConfigError, DataError
+from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.viewing import Output
 from imutool.viewing.html import report
 from imutool.viewing.html.drawing import require_matplotlib
@@ -192,7 +193,9 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
 def _open(logs: Sequence[RunData], asked: RequestedOutputs, at_s: float | None) -> Output:
     """Open a viewer, or write a page without Rerun."""
     if find_spec("rerun") is None:
-        page = _page(logs, Path(f"{recording_name(logs)}.html"), asked.overwrite)
+        path = Path(f"{recording_name(logs)}.html")
+        refuse_existing(path, overwrite=asked.overwrite, choose="Give another name as `html`")
+        page = _page(logs, path, asked.overwrite)
         return replace(page, said=f"{NO_VIEWER}. {page.said}")
     from imutool.viewing.rerun import viewer
 
@@ -222,4 +225,4 @@ def _check_contradictions(asked: RequestedOutputs) -> None:
     if asked.port is not None and not asked.web:
         raise ConfigError(f"{asked.port} has no effect without `web`", where="port", fix="Add `web`")
     if asked.at is not None and not asked.has_cursor:
-        raise ConfigError("a file has no cursor", where="at", fix="Leave it out, or add `connect`, `web` or `export`")
+        raise ConfigError("a file has no cursor", where="at", fix="Leave it out, or add `connect`, `web` or `export_web`")

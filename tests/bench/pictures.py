@@ -99,7 +99,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", type=Path)
     parser.add_argument("--model", default="static")
-    parser.add_argument("--init", default="auto", help="start bias, as of imutool view")
+    parser.add_argument("--init", default="auto", help="initial bias, as of imutool view")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/images"))
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ def test_batches_are_told_and_the_sensors_clock_comes_back(size: int, apart_ns: 
     again = restamped(stamps)
     assert (np.diff(again) > 0).all()
     assert np.abs(again - true).max() < 300_000  # the stamps themselves are late by up to 20 periods
-    assert read_stamps(again).told == []
+    assert read_stamps(again).faults == []
 
 
 @pytest.mark.parametrize("name", ["32 bit of us", "32 bit of ns", "16 bit of ms"])
@@ -51,7 +51,7 @@ def test_a_counter_that_wraps_is_named_and_runs_on(name: str) -> None:
 @pytest.mark.parametrize("jitter_ns", [0, 100_000, 1_000_000])
 def test_stamps_one_by_one_are_no_batches(jitter_ns: int) -> None:
     stamps = sampled() + np.random.default_rng(3).integers(-jitter_ns, jitter_ns + 1, 12_000)
-    assert read_stamps(stamps).told == []
+    assert read_stamps(stamps).faults == []
 
 
 def test_a_clock_set_back_is_no_wrap_and_a_pause_ends_the_line() -> None:

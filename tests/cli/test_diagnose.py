@@ -196,7 +196,7 @@ def test_a_diagnosis_stays_where_one_is(diagnosed: tuple[Path, Done]) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        (["untrue.mcap", "--sim", "another.mcap"], 4, "turns otherwise"),
+        (["untrue.mcap", "--sim", "another.mcap"], 4, "turn differently"),
         (["arm.mcap", "--imu", "/imu7"], 5, "/imu7"),
         (["arm.mcap", "--truth", "/nowhere"], 5, "/nowhere"),
         (["untrue.mcap"], 4, "no simulation and no true poses"),

@@ -80,6 +80,23 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
 
 
+def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_path: Path) -> None:
+    """As a motion capture gives them: a clock of its own, markers mounted askew, y up. Each error hides the next."""
+    made = flight(3, duration_s=60.0, rate_hz=100.0, truth_rate_hz=50.0)
+    turn = Rotation.from_rotvec([42.0, 20.0, 110.0], degrees=True)
+    y_up = Rotation.from_euler("x", -90.0, degrees=True)
+    true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
+    q_wxyz = (y_up * true * turn).as_quat(scalar_first=True)
+    late = Poses(made.truth.t_ns + 1_200_000_000, made.truth.p_wb @ y_up.as_matrix().T, q_wxyz)
+    write(replace(made, truths={"/vicon/pose": late}), tmp_path / "late.mcap")
+    convert(tmp_path / "late.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    assert inspect(tmp_path / "right.mcap").warnings == []
+    with Log(tmp_path / "right.mcap") as log:
+        said = log.metadata()[RECORD]["/vicon/pose"]
+    assert all(part in said for part in ("earlier now", "the body is now that of the IMU", "the world's x, y, z are now"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "right.mcap"]
+
+
 def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
     write(made, tmp_path / "made.mcap")
     report = convert(tmp_path / "made.mcap", tmp_path / "same.mcap", correct=["conventions"])

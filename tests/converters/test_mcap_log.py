@@ -120,7 +120,7 @@ def test_an_imu_in_another_encoding_becomes_one_that_every_command_reads(convert
 def test_a_message_without_a_sample_is_a_loss(convert, tmp_path):
     done = convert(write_log(tmp_path / "in.mcap", "protobuf", lacking=7), tmp_path / "out.mcap")
     assert done.returncode == 3
-    assert "1 messages of /robot/imu hold no sample: see /robot/imu/as_recorded" in done.stderr
+    assert "messages of /robot/imu without a sample: 1; see /robot/imu/as_recorded" in done.stderr
     assert len(read(tmp_path / "out.mcap").imu) == COUNT - 1
 
 

@@ -109,7 +109,7 @@ def test_what_only_the_recording_has_is_found_beside_a_simulation_of_another_mot
 def test_another_motion_without_poses_on_both_sides_is_refused(tmp_path: Path) -> None:
     real = log(tmp_path, "real", 3, {}, poses=False)
     sim = log(tmp_path, "sim", 7, {})
-    with pytest.raises(DataError, match="turns otherwise"):
+    with pytest.raises(DataError, match="turn differently"):
         diagnose([real], sim)
 
 

@@ -171,7 +171,7 @@ def test_an_effect_on_the_wrong_sensor_or_given_twice_is_refused() -> None:
         ConfigError, match=r"effects of the gyro: lever_arm does not act on the gyro; expected some of .*gyro_scale"
     ):
         catalogue.trained("gyro", ["gyro_scale", "lever_arm"])
-    with pytest.raises(ConfigError, match="a name stands there twice"):
+    with pytest.raises(ConfigError, match="a name occurs twice"):
         catalogue.trained("gyro", ["gyro_scale", "gyro_scale"])
     assert [effect.name for effect in catalogue.trained("gyro", ["rate_curve", "gyro_scale"])] == ["rate_curve", "gyro_scale"]
 

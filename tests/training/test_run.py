@@ -372,7 +372,7 @@ def test_without_a_remainder_no_ode_is_trained(logs: list[Path], tmp_path: Path)
     [
         ({"gyro_effects": ["gyro_scal"]}, r"'gyro_scal' is not known.*Did you mean 'gyro_scale'"),
         ({"gyro_effects": ["lever_arm"]}, "lever_arm does not act on the gyro"),
-        ({"accel_effects": ["accel_scale", "accel_scale"]}, "a name stands there twice"),
+        ({"accel_effects": ["accel_scale", "accel_scale"]}, "a name occurs twice"),
         ({"remainer": False}, r"remainer is not a setting.*Did you mean remainder"),
     ],
 )
@@ -418,4 +418,4 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path,
     words = ["train", "a.mcap", "-o", tmp_path / "m.safetensors", "--method", "linear", "--physics", file]
     said = imutool(*words, cwd=tmp_path)
     assert said.returncode == 3
-    assert "linear knows no effects" in said.stderr
+    assert "linear has no effects" in said.stderr

@@ -1,4 +1,4 @@
-"""Stamps that go back, stamps far ahead of all that follow, and clocks that were set anew.
+"""Decreasing stamps, stamps far ahead of all later ones, and clocks that were reset.
 
 A sample is *ahead* when most of the next samples come before it: then it is the one that is wrong, and without this a single
 stamp of the year 2100 would cost the rest of the log. A sample is *late* when it does not come after all that were kept.

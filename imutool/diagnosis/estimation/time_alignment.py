@@ -43,7 +43,7 @@ def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings 
     shift_s = _shift(real.imu, sim.imu, settings.alignment)
     if shift_s is None:
         raise DataError(
-            "the simulation turns otherwise than the recording",
+            "the simulation and the recording turn differently",
             where=real.name,
             expected="one motion, or true poses in both logs",
             fix="Leave `sim` out to compare the recording with its own true poses",

@@ -47,8 +47,8 @@ def lag_at_first_sight(
     best = int(np.argmax(correlation))
     if correlation[best] < least[1]:
         raise DataError(
-            f"recording and simulation of {names[0]} are not alike (correlation {correlation[best]:.2f} at best; two motions"
-            f" that have nothing to do with each other reach {least[1]:.2f})",
+            f"recording and simulation of {names[0]} are not alike (correlation {correlation[best]:.2f} at best; two unrelated"
+            f" motions reach {least[1]:.2f})",
             where=names[0],
             expected="one motion",
             fix="Simulate what was recorded, or choose another field",

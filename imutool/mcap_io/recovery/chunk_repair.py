@@ -67,7 +67,7 @@ def _contents(
             raise UnreadableError(error.what) from error
         raise  # `raise error from error` would be a cycle that keeps the contents: no collector runs in a scan
     if not head.crc and not is_consistent(raw, offset, known):
-        raise LogError(f"the head of the chunk at byte {offset} is damaged, and it has no CRC to tell by")
+        raise LogError(f"the head of the chunk at byte {offset} is damaged, and it has no CRC")
     if not head.crc and not is_boundary(offset + len(raw)):
         raise LogError(f"the chunk at byte {offset} has no CRC, and no record follows it")
     return found, head

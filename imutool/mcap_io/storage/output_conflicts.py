@@ -83,8 +83,10 @@ def check_outputs(outputs: Iterable[OutputFile], inputs: Iterable[object] = (), 
             _refuse_existing_files(output, [place.stem for place in read])
 
 
-def refuse_existing(path: Location, *, overwrite: bool) -> None:
+def refuse_existing(path: Location, *, overwrite: bool, choose: str = "Choose another name") -> None:
     """Refuse a target that is a folder, or exists without `overwrite`; a device may exist.
+
+    `choose` tells how to give another name.
 
     Raises:
         ConfigError: it is a folder, a disk or a socket, or it exists.
@@ -100,7 +102,7 @@ def refuse_existing(path: Location, *, overwrite: bool) -> None:
     else:
         exists = os.path.lexists(path)  # a link to nothing is there too
     if exists and not overwrite:
-        raise ConfigError("the target exists", where=path, fix="Choose another name, or add `overwrite=True`")
+        raise ConfigError("the target exists", where=path, fix=f"{choose}, or add `overwrite=True`")
 
 
 def _check_suffix(output: OutputFile) -> None:

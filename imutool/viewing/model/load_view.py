@@ -99,7 +99,7 @@ def load(
 def _with_models(
     recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool, aids: Aids | None
 ) -> tuple[list[Run], list[Run], dict[str, str]]:
-    """Run of each model, the same with aids, and by its name its file digest, method and start bias."""
+    """Run of each model, the same with aids, and by its name its file digest, method and initial bias."""
     from imutool.bias_start.bias_from_truth import TRUTH_S
     from imutool.bias_start.correction import apply_with_std
     from imutool.evaluation import started

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.target import Target
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
@@ -53,6 +54,8 @@ def save(logs: Sequence[RunData], path: Path | None = None, *, source: bool = Tr
     place = path or Path()
     target = place / f"{recording_name(logs)}.rrd" if place.is_dir() else place
     require_rerun()
+    if path is None:
+        refuse_existing(target, overwrite=overwrite, choose="Give another name as `save`")
     with Target(target, overwrite=overwrite) as file:  # refuses before the work is done, leaves nothing after a failure
         file.write(rrd(logs, source=source))
     return Output("rrd", str(target), f"Saved {target}. Open with: rerun {target}")

@@ -14,7 +14,7 @@ class Delay(Section, frozen=True):
 
 
 class StreamStatistics(Section, frozen=True):
-    """Statistics of a live stream; `start` says where the start bias comes from."""
+    """Statistics of a live stream; `start` says where the initial bias comes from."""
 
     samples: int
     seconds: float

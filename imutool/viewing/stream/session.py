@@ -29,7 +29,7 @@ from imutool.viewing.stream import Delay, StreamStatistics
 from imutool.viewing.stream.samples import Malformed, Sample
 from imutool.viewing.stream.sources import Samples
 
-START_S = 2.0  # of the stream, from which the start bias is taken
+START_S = 2.0  # of the stream, from which the initial bias is taken
 BATCH_S = 0.1  # shown together
 SWITCH_S = 0.0005  # that the viewer's thread may keep the interpreter: Python's own 5 ms are the whole delay allowed
 SILENT_S = 5.0  # without a sample, before a warning
@@ -52,7 +52,7 @@ def run(
 ) -> StreamStatistics:
     """Debias a stream until it ends, `seconds` have passed or Ctrl-C is pressed.
 
-    The start bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
+    The initial bias is that of the stop in the first two seconds, else the model's prior (`bias_start.bias_at_rest.auto`); the
     samples until then are corrected late and are not counted in the delay.
 
     Raises:
@@ -102,7 +102,7 @@ class _Session:
         self._bias = np.zeros(6)
 
     def add(self, found: Sample, batches: _Batches) -> None:
-        """Correct a sample, or keep it until the start bias is known."""
+        """Correct a sample, or keep it until the initial bias is known."""
         self._count(found)
         if self._online is not None:
             self._correct(found, batches)
@@ -176,7 +176,7 @@ class _Session:
         self._samples += 1
 
     def _start(self, batches: _Batches) -> None:
-        """Take the start bias from the first samples, and correct them.
+        """Take the initial bias from the first samples, and correct them.
 
         Raises:
             DataError: an untrained model, and no rest.
@@ -192,7 +192,7 @@ class _Session:
             start = auto(model, without_drift(model, seen))
         except DataError as error:
             fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
-            raise DataError(error.what, where="source", fix=fix) from error
+            raise DataError("the stream does not start at rest", where="source", fix=fix) from error
         self._how, self._std = start.how, start.std
         self._online = OnlineDebiaser(after_load(self._model, model.load_before), start)
         for sample in self._first:

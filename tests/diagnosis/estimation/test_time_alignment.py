@@ -192,7 +192,7 @@ def test_clocks_aligned_by_the_motion_leave_the_same_misfit_but_for_the_step_of_
 def test_another_motion_is_refused(away_ns: int) -> None:
     real, _ = logs()
     _, sim = logs(seed=5, sim_start_ns=planted.START_NS + away_ns)
-    with pytest.raises(DataError, match="turns otherwise"):
+    with pytest.raises(DataError, match="turn differently"):
         with_simulation(real, sim)
 
 

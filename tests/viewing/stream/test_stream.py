@@ -240,7 +240,7 @@ def test_standard_input_is_printed_debiased_until_ctrl_c(imu: Imu, tmp_path: Pat
         told = process.stderr.read()
         assert process.wait(30) == 0, told
     assert [row["t_ns"] for row in printed] == imu.t_ns.tolist()
-    assert "1 messages hold no sample" in told
+    assert "messages without a sample: 1" in told
     report = json.loads((tmp_path / "r.json").read_text())
     assert (report["stream"]["samples"], report["stream"]["malformed"]) == (len(imu), 1)
 
