@@ -18,8 +18,8 @@ import numpy as np
 from imutool import __version__
 from imutool.array_types import Float64
 from imutool.bias import static
-from imutool.bias.io import shipped, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import shipped, shipped_for
 from imutool.bias.temperature_drift import rows_without_drift, with_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_covariance import BiasEstimator

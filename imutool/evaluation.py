@@ -14,8 +14,8 @@ from msgspec import to_builtins
 
 from imutool.array_types import Bool, Float64
 from imutool.bias import static
-from imutool.bias.io import check_rate, find_model
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import check_rate, find_model
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
@@ -26,7 +26,7 @@ from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, find_aids, parse_aids
 from imutool.inertial.strapdown import StartPose, along_truth, drift
-from imutool.log_info.conventions import warn_of_recordings
+from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.recording import Imu, Poses, Recording
 

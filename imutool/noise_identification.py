@@ -162,7 +162,7 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
 
     from imutool.bias.networks import static
     from imutool.training import closed_form
-    from imutool.training.segments import Pool
+    from imutool.training.training_windows import Pool
 
     pool = Pool.of([recording])
     model = static.Network(rate_hz=pool.rate_hz).double()

@@ -30,7 +30,7 @@ __all__ = ["REPORTS", "UNSET", "Report", "Section", "UnsetType", "json_schema", 
 REPORTS = {
     "catalog": "imutool.cli.fleet_view:CatalogReport",
     "audit": "imutool.diagnosis.audit:AuditReport",
-    "clean": "imutool.cleaning.first_pass:CleaningReport",
+    "clean": "imutool.cleaning.survey:CleaningReport",
     "conversion": "imutool.cli.convert:Conversion",
     "debias": "imutool.cli.debias:DebiasSummary",
     "demo": "imutool.cli.demo:DemoReport",
@@ -47,7 +47,7 @@ REPORTS = {
     "score": "imutool.blind_cases:OpenedCase",
     "simulation": "imutool.cli.simulate:SimulationReport",
     "training": "imutool.cli.train:TrainingReport",
-    "unit": "imutool.fleet.work:UnitReport",
+    "unit": "imutool.fleet.one_log:UnitReport",
     "view": "imutool.cli.view:View",
     "vio": "imutool.cli.evaluate:VioReport",
 }

@@ -20,7 +20,7 @@ import pytest
 from support.in_process import run_script
 
 import imutool
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.cli.demo import write_asl
 
 ROOT = Path(__file__).parents[1]

@@ -27,7 +27,7 @@ from mcap_ros2.writer import Writer
 
 from fuzz import bounded
 from fuzz.numbers import put_log
-from imutool.bias import io
+from imutool.bias import model_file
 from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
@@ -247,7 +247,7 @@ def test_samples_of_no_sensor_are_left_out_or_refused(tmp_path: Path, imutool: R
 
 @pytest.mark.parametrize("name", ["debias", "repair", "clean", "convert"])
 def test_a_log_without_crcs_is_said_to_be_unchecked(tmp_path: Path, imutool: Run, name: str) -> None:
-    """Fleets: tests/fleet/test_work.py."""
+    """Fleets: tests/fleet/test_one_log.py."""
     recording = flight(1, duration_s=4.0)
     put_log(tmp_path / "in.mcap", recording.imu.t_ns, recording.imu.gyro, recording.imu.accel, None, crcs=False)
     done = imutool(name, "in.mcap", "out.mcap", cwd=tmp_path)
@@ -265,7 +265,7 @@ JUMPING: tuple[tuple[str, ...], ...] = (
     ("live", "--from", "in.mcap", "--speed", "1e12", "--no-view"),
     ("clean", "in.mcap", "--json", "-"),
     ("view", "in.mcap", "--html", "out.html"),
-)  # debias: tests/bias_start/test_stretches.py; train: tests/training/test_segments.py
+)  # debias: tests/bias_start/test_stretches.py; train: tests/training/test_training_windows.py
 
 
 @pytest.mark.parametrize("words", JUMPING, ids=lambda words: words[0])
@@ -368,8 +368,8 @@ def test_a_model_for_another_rate_is_refused(here: Path, refuse: Refuse) -> None
 
 
 def test_a_model_of_another_version_is_refused(here: Path, refuse: Refuse) -> None:
-    tensors, header = io.read_tensors(here / "linear.safetensors", io.FORMAT)
-    io.write_tensors(tensors, header | {"format": "imutool.model/99"}, here / "future.safetensors", overwrite=False)
+    tensors, header = model_file.read_tensors(here / "linear.safetensors", model_file.FORMAT)
+    model_file.write_tensors(tensors, header | {"format": "imutool.model/99"}, here / "future.safetensors", overwrite=False)
     message = refuse(MODEL, "debias", "flight_2.mcap", "out.mcap", "--model", "future.safetensors")
     assert "imutool.model/99" in message
 

@@ -18,8 +18,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
-from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import load, save
 from imutool.bias.networks import linear, neural_ode, static
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.neural_ode import Config
@@ -409,7 +409,7 @@ def test_without_a_model_the_one_the_logs_metadata_names_is_used(
     shelf = tmp_path / "shelf"
     shelf.mkdir()
     save(make_model("linear"), shelf / "adis.safetensors")
-    monkeypatch.setattr("imutool.bias.io.library", lambda: shelf)
+    monkeypatch.setattr("imutool.bias.model_file.library", lambda: shelf)
     log = tmp_path / "log.mcap"
     write(Recording("r", recording.imu, metadata={"imutool": {"model": "adis"}}), log)
     assert dict(debias(log, tmp_path / "out.mcap").models) == {"/imu0": "adis"}

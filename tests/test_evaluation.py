@@ -17,7 +17,7 @@ from support.evo import statistics
 
 from imutool import evaluation
 from imutool.bias import linear
-from imutool.bias.io import find_model, save
+from imutool.bias.model_file import find_model, save
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.initial_bias import LEAST_STD
 from imutool.bias_start.model_choice import find_initial_bias

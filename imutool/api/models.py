@@ -14,8 +14,8 @@ from imutool import debiasing, evaluation
 from imutool.api import Progress
 from imutool.array_types import Float64
 from imutool.bias import static
-from imutool.bias.io import find_model, shipped_for
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import find_model, shipped_for
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std

@@ -29,8 +29,8 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_pair
 from imutool.sensor.effects import clock_offset
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile
+from imutool.sensor.physics_file_terms import DRIVEN
 from imutool.sensor.samples import SensorSamples
-from imutool.sensor.unnamed_effects import DRIVEN
 from imutool.units import AXES, SENSORS, Sensor
 
 # Spread of a bias from run to run: of the ADIS16448 in EuRoC's training sequences, 2 mrad/s and 0.02 m/s². Where the file

@@ -23,8 +23,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imutool.bias import static
-from imutool.bias.io import library, shipped_for
 from imutool.bias.model import BiasModel, Vector6
+from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior

@@ -14,8 +14,8 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.bias import static
-from imutool.bias.io import check_rate, shared_model
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import check_rate, shared_model
 from imutool.bias.temperature_drift import bound, rows_without_drift, without_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
@@ -33,12 +33,12 @@ from imutool.bias_start.initial_bias import (
 )
 from imutool.bias_start.stretches import Sieve, measured
 from imutool.cleaning import Survey, cleaned
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.file_location import Location
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
-from imutool.log_info.conventions import warn_of_conventions
+from imutool.log_info.convention_report import warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.random import Generator, SeedSequence, default_rng
 
-from imutool.blind_cases import catalogue, draw
+from imutool.blind_cases import catalogue, random_case
 from imutool.blind_cases.catalogue import NO_LIMIT
 from imutool.blind_cases.detectability import achievable_rms, cramer_rao_bounds, detectability, location
 from imutool.blind_cases.effects import Model, Theta
@@ -51,7 +51,7 @@ class Plan(NamedTuple):
     """Scene of a case, its effects, its random generators, and the grade of the noise."""
 
     scene: Scene
-    concealed: draw.Concealed
+    concealed: random_case.Concealed
     rngs: Sequence[Generator]
     grade: str
 
@@ -78,8 +78,8 @@ def conceal(
         ConfigError: unknown kind, size, noise or effect; the folder holds a case already.
         DataError, LogError: a trajectory that cannot be read, or does not show the effects.
     """
-    _check("kind", kind, [*draw.KINDS, "any"])
-    _check("size", size, [*draw.SIZES, "any"])
+    _check("kind", kind, [*random_case.KINDS, "any"])
+    _check("size", size, [*random_case.SIZES, "any"])
     for name in (SIM, REAL, ENVELOPE, KEY, FINDINGS, OPENED):
         if (folder / name).exists():
             raise ConfigError("the folder holds a case already", where=folder / name, fix="Choose another folder")
@@ -99,15 +99,15 @@ def plan(
     return Plan(scene, _draw(scene, rngs[0], kind, size, effects), rngs, grade)
 
 
-def _draw(scene: Scene, rng: Generator, kind: str, size: str, effects: Sequence[str]) -> draw.Concealed:
+def _draw(scene: Scene, rng: Generator, kind: str, size: str, effects: Sequence[str]) -> random_case.Concealed:
     """Effects that the motion shows; an open kind or size is drawn until it does."""
     seen = detectability(scene)
-    kinds, chances = zip(*draw.CHANCES.items(), strict=True)
-    for _ in range(draw.TRIES if "any" in (kind, size) else 1):
+    kinds, chances = zip(*random_case.CHANCES.items(), strict=True)
+    for _ in range(random_case.TRIES if "any" in (kind, size) else 1):
         drawn_kind = str(rng.choice(kinds, p=chances)) if kind == "any" else kind
-        drawn_size = str(rng.choice(draw.SIZES)) if size == "any" else size
+        drawn_size = str(rng.choice(random_case.SIZES)) if size == "any" else size
         try:
-            return draw.draw_effects(seen, rng, drawn_kind, drawn_size, effects)  # type: ignore[arg-type]  # `conceal` checked
+            return random_case.draw_effects(seen, rng, drawn_kind, drawn_size, effects)  # type: ignore[arg-type]  # `conceal` checked
         except DataError as error:
             hidden = error
     raise hidden
@@ -115,7 +115,9 @@ def _draw(scene: Scene, rng: Generator, kind: str, size: str, effects: Sequence[
 
 def _write(folder: Path, planned: Plan, pose_noise: tuple[float, float], seed: int, trajectory: str) -> None:
     scene, concealed, rngs, grade = planned
-    bias = np.concatenate([draw.GYRO_BIAS * rngs[1].standard_normal(3), draw.ACCEL_BIAS * rngs[1].standard_normal(3)])
+    bias = np.concatenate(
+        [random_case.GYRO_BIAS * rngs[1].standard_normal(3), random_case.ACCEL_BIAS * rngs[1].standard_normal(3)]
+    )
     real, came_to = scene.real(concealed.acting, bias, rngs[1])
     sim = scene.simulated(concealed.acting, rngs[2])
     channels = {
@@ -232,12 +234,12 @@ def open_case(folder: Path, findings: Path | None = None) -> OpenedCase:
 
 
 def _grade(noise: str | Path, rng: Generator) -> tuple[str, Noise]:
-    names, chances = zip(*draw.GRADE_CHANCES.items(), strict=True)
+    names, chances = zip(*random_case.GRADE_CHANCES.items(), strict=True)
     drawn = str(rng.choice(names, p=chances))  # always, so that one seed means one case
     if noise == "any":
-        return drawn, draw.GRADES[drawn]
-    if isinstance(noise, str) and noise in draw.GRADES:
-        return noise, draw.GRADES[noise]
+        return drawn, random_case.GRADES[drawn]
+    if isinstance(noise, str) and noise in random_case.GRADES:
+        return noise, random_case.GRADES[noise]
     return str(noise), read_noise(noise)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from imutool.array_types import Bool
 from imutool.cleaning.finding import Finding
-from imutool.cleaning.first_pass import Survey, UntrustedError, look, raw_batches, survey
 from imutool.cleaning.rule import CleaningSettings
+from imutool.cleaning.survey import Survey, UntrustedError, look, raw_batches, survey
 from imutool.errors import LogError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log

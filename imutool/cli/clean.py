@@ -111,7 +111,7 @@ def _tell(
     overwrite: bool,
 ) -> None:
     """Report findings and output as JSON or text; with losses the exit code is 3."""
-    from imutool.cleaning.first_pass import CleaningReport
+    from imutool.cleaning.survey import CleaningReport
 
     report = CleaningReport(
         log=source,

@@ -18,8 +18,8 @@ from imutool.errors import ConfigError
 from imutool.report import Report, Section
 
 if TYPE_CHECKING:
-    from imutool.fleet.catalog import Catalog, Segment
-    from imutool.fleet.layers import Layers
+    from imutool.fleet.rerun_catalog import Catalog, Segment
+    from imutool.fleet.rerun_layers import Layers
 
 WAITS_S = 3600.0  # Ctrl-C ends it at once
 BY_HELP = "Measure of the worst logs: aoe, score, bias, effects or losses; by default the first that a log has."
@@ -74,16 +74,16 @@ def view(
 
     Each log is a segment with the layers raw, debiased and diagnosis. Only this machine can reach the server.
     """
-    from imutool.fleet import catalog, layers
+    from imutool.fleet import rerun_catalog, rerun_layers
 
-    catalog.require_catalog()
-    if by is not None and by not in catalog.MEASURES:
-        raise ConfigError(f"{by!r} is no measure", where="by", expected=", ".join(catalog.MEASURES))
-    logs = layers.logs_of(folders)
-    store = cache or folders[0] / catalog.FOLDER
+    rerun_catalog.require_catalog()
+    if by is not None and by not in rerun_catalog.MEASURES:
+        raise ConfigError(f"{by!r} is no measure", where="by", expected=", ".join(rerun_catalog.MEASURES))
+    logs = rerun_layers.logs_of(folders)
+    store = cache or folders[0] / rerun_catalog.FOLDER
     built: list[Layers] = []
     with progress("Reading", verbose, quiet) as tell:
-        for done in layers.build(logs, store, workers=workers):
+        for done in rerun_layers.build(logs, store, workers=workers):
             built.append(done)
             tell(len(built), len(logs), done.name)
     shown = [log for log in built if log.files]
@@ -92,7 +92,7 @@ def view(
             tell_warning(f"not shown: {log.name}: {log.trouble}")
     if not shown:
         raise ConfigError("no log of the fleet can be shown", where=folders[0])
-    with catalog.Catalog(shown, store, port) as served:
+    with rerun_catalog.Catalog(shown, store, port) as served:
         measure, segments = served.worst(by, worst)
         report = CatalogReport(
             url=served.url,
@@ -102,7 +102,7 @@ def view(
             not_shown=[NotShown(log.name, log.trouble) for log in built if log.trouble],
         )
         if not write_json(report, json_to, overwrite=overwrite):
-            _show(report, catalog.MEASURES[measure].meaning)
+            _show(report, rerun_catalog.MEASURES[measure].meaning)
         sys.stdout.flush()  # a program that reads it through a pipe wants the address now
         if not list_only:
             with contextlib.suppress(KeyboardInterrupt):

@@ -81,7 +81,7 @@ def _described(
     with RecoveredLog(place, max_chunk=max_chunk) as opened:
         report, about = describe(opened, check=not quick), opened.metadata().get("imutool", {})
         if "dataset" in about:
-            from imutool.bias.io import shipped_for
+            from imutool.bias.model_file import shipped_for
 
             report = replace(report, models=shipped_for(about))
         if not noise:

@@ -31,7 +31,7 @@ class Models(Report, frozen=True, tag="imutool.models/1"):
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
 def models(overwrite: Overwrite = False, json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False) -> None:
     """List the models that come with imutool: method, sensor, data set and rate."""
-    from imutool.bias.io import header_of, library
+    from imutool.bias.model_file import header_of, library
 
     log_to_stderr(verbose, quiet)
     entries = []

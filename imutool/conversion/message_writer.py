@@ -21,9 +21,9 @@ from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected, reflect
+from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import BODY, CHUNK_BYTES, RECORD, WORLD, Series, chunks, scalar_series, velocity_series
-from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording import nanoseconds
 from imutool.recording.columns import MOST_GAP_S, clock_jumps, jump_warnings
 from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind

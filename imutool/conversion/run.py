@@ -14,7 +14,7 @@ from types import ModuleType
 
 from imutool import registry
 from imutool.conversion.corrections import parse_corrections
-from imutool.conversion.labels import Labels, parse_kinds, parse_pair
+from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import compression, local

@@ -11,8 +11,8 @@ from typing import Any
 
 from imutool import registry
 from imutool.conversion.corrections import write_corrected
-from imutool.conversion.labels import Labels
 from imutool.conversion.message_writer import write_log
+from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.write import write
 from imutool.processes.worker_pool import WorkerBugError, WorkerPool

@@ -48,7 +48,7 @@ from imutool.diagnosis.signals import with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
 from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import Location
-from imutool.log_info.conventions import check_one_sensor, warn_of_recordings
+from imutool.log_info.convention_report import check_one_sensor, warn_of_recordings
 from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read

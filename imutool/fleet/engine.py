@@ -21,8 +21,8 @@ from typing import Any, Protocol
 import msgspec
 
 from imutool.errors import ConfigError, LogError, not_installed, redact
+from imutool.fleet.one_log import work
 from imutool.fleet.task import Result, Task
-from imutool.fleet.work import work
 from imutool.processes import system
 from imutool.processes.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 

@@ -18,11 +18,11 @@ from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
 from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.journal import Journal
+from imutool.fleet.one_log import page_name, target_name, write_json
 from imutool.fleet.results import FleetSummary, LogProblem
 from imutool.fleet.robots import Comparison, compare
 from imutool.fleet.sources import Found, find, partial_files, remove_files
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
-from imutool.fleet.work import page_name, target_name, write_json
 from imutool.report import UNSET
 
 LOST = 3  # something of a log was lost, or a log was quarantined

@@ -52,7 +52,7 @@ def with_model_hash(settings: Settings) -> Settings:
     Raises:
         ModelError: no such model.
     """
-    from imutool.bias.io import digest, find_model, library
+    from imutool.bias.model_file import digest, find_model, library
 
     name = settings.model
     if name is not None and Path(name).suffix in {".safetensors", ".toml"}:

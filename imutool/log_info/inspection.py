@@ -21,7 +21,7 @@ from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location
 from imutool.inertial.stationary import rest_stretches
-from imutool.log_info.conventions import (
+from imutool.log_info.convention_report import (
     convention_summary,
     convention_warnings,
     conventions,

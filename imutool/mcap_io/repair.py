@@ -26,6 +26,7 @@ from imutool.file_location import Location, identity, io_errors, same_location
 from imutool.mcap_io.blocks import Attachment, MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, ChunkHead
+from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.recovery import chunk_repair
 from imutool.mcap_io.recovery.losses import Loss, Losses
 from imutool.mcap_io.recovery.recovered_index import RecoveredIndex
@@ -34,7 +35,6 @@ from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.storage.source import BLOCK_BYTES, Source, crc_of
 from imutool.mcap_io.storage.target import Target
 from imutool.mcap_io.verify import verify, verify_index
-from imutool.mcap_io.writer import LogWriter
 from imutool.processes.system import collector_paused
 
 RECORD = "imutool_repair"  # name of the metadata record

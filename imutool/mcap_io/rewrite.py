@@ -27,6 +27,7 @@ from imutool.mcap_io.blocks import Attachment, MessageBlock, MessageIndexes, Rec
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.messages import Messages
 from imutool.mcap_io.codec.records import HEAD, ChunkHead
+from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedStream, DerivedTopics, check_new_topics, define
@@ -34,7 +35,6 @@ from imutool.mcap_io.passthrough.chunk_check import check_chunk, parts_of
 from imutool.mcap_io.storage.target import PassThrough
 from imutool.mcap_io.verify import Verified, check_data_crc, check_mode, stated_crc, verify
 from imutool.mcap_io.write import CHUNK_BYTES
-from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.processes.system import give
 
 RUN_BYTES = 16 << 20  # of the source are copied at once; progress is reported between

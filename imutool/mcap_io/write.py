@@ -21,8 +21,8 @@ from imutool.errors import DataError
 from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.encode import encode_float, encode_image, encode_imu, encode_pose, encode_transform, encode_vector3
+from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import UNIT_KEY, VELOCITY_KEY
-from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording import Frames, Poses, Recording, Scalars
 
 CHUNK_BYTES = 1 << 20  # compression gains nothing beyond, memory grows tenfold by 32 MiB (mcap#1658)

@@ -50,9 +50,9 @@ from msgspec import Meta
 from imutool.config import Settings, build, toml
 from imutool.errors import ConfigError, ImutoolError, did_you_mean
 from imutool.mcap_io.storage.target import Target
-from imutool.sensor import catalogue, unnamed_effects
+from imutool.sensor import catalogue, physics_file_terms
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.unnamed_effects import DRIVEN, VARIABLES
+from imutool.sensor.physics_file_terms import DRIVEN, VARIABLES
 from imutool.units import SENSORS, Sensor, Three
 
 SCHEMA = "imutool.physics/1"
@@ -142,7 +142,7 @@ class PhysicsFile(Settings, frozen=True, kw_only=True):
         for k, term in enumerate(self.term):
             found.append((_term(term, k, where), np.zeros(0)))
         if self.bias is not None:
-            found.append((unnamed_effects.constant_bias(self.bias.gyro, self.bias.accel), np.zeros(0)))
+            found.append((physics_file_terms.constant_bias(self.bias.gyro, self.bias.accel), np.zeros(0)))
         return found
 
 
@@ -276,18 +276,18 @@ def _driven(entry: Entry, where: str | Path, place: str) -> Effect:
         raise ConfigError(f"{place}.signal is {entry.signal!r}", where=where, expected="gyro or accel for what is driven")
     if not entry.driver:
         raise ConfigError(f"{place}.driver is missing", where=where, expected="the channel that drives it, as TOPIC or TOPIC.x")
-    return unnamed_effects.driven("gyro" if entry.signal == "gyro" else "accel", entry.driver)
+    return physics_file_terms.driven("gyro" if entry.signal == "gyro" else "accel", entry.driver)
 
 
 def _curve(curve: Curve, k: int, where: str | Path) -> Effect:
     if not curve.variable.startswith("/") and curve.variable not in VARIABLES:
         raise _unknown(f"unknown[{k}].variable", curve.variable, [*VARIABLES, "/TOPIC"], where)
-    return unnamed_effects.curve(str(k), curve.signal, curve.variable, np.array(curve.x), np.array(curve.y))
+    return physics_file_terms.curve(str(k), curve.signal, curve.variable, np.array(curve.x), np.array(curve.y))
 
 
 def _term(term: Term, k: int, where: str | Path) -> Effect:
     """Effect of a product of variables, |variable|, variable^n or sign(variable)."""
-    effect = unnamed_effects.product(f"term {k}", term.signal, term.term, term.value)
+    effect = physics_file_terms.product(f"term {k}", term.signal, term.term, term.value)
     if effect is None:
         raise _unknown(f"term[{k}].term", term.term, [f"products of {', '.join(VARIABLES)}"], where)
     return effect

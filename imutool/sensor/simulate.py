@@ -29,9 +29,9 @@ from imutool.sensor import physics_file
 from imutool.sensor.channels import channels_at, with_channels
 from imutool.sensor.effect import Acting, Effect, Stage, Theta, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
+from imutool.sensor.physics_file_terms import DRIVEN
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
-from imutool.sensor.unnamed_effects import DRIVEN
 
 SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU

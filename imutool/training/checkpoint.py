@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from imutool.bias.io import read_tensors, write_tensors
+from imutool.bias.model_file import read_tensors, write_tensors
 from imutool.config import plain
 from imutool.errors import ConfigError, ModelError
 from imutool.training.fit import Stage, Training

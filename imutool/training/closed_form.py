@@ -24,7 +24,7 @@ from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
-from imutool.training.segments import Part, Pool, Windows
+from imutool.training.training_windows import Part, Pool, Windows
 from imutool.units import SENSORS, Sensor
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these

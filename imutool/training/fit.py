@@ -27,11 +27,11 @@ from imutool.bias.networks.threads import of_each
 from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
-from imutool.training import closed_form, statistics
+from imutool.training import bias_spread, closed_form
 from imutool.training.objectives.increments import IncrementObjective
 from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective, RestBiases, WindowEndObjective, error
-from imutool.training.segments import Pool, corrected, sensors_up_to
 from imutool.training.settings import TrainSettings, settings_for
+from imutool.training.training_windows import Pool, corrected, sensors_up_to
 from imutool.units import SENSORS, Sensor
 
 __all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
@@ -121,7 +121,7 @@ class Training:
         self.generator = torch.Generator().manual_seed(self.settings.seed)
         self.done: dict[Sensor, float] = {}  # held-out error of each finished stage
         self.stage: Stage | None = None
-        self.turn_on: statistics.TurnOn | None = None
+        self.turn_on: bias_spread.TurnOn | None = None
 
     def epochs(self, *, statistics: bool = True) -> Iterator[Epoch]:
         """Train and yield progress; a caller may stop and resume between two yields.
@@ -146,7 +146,7 @@ class Training:
         """Store priors, spreads and noise in the model, which is final then."""
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        self.turn_on = statistics.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        self.turn_on = bias_spread.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:

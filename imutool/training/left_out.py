@@ -35,9 +35,9 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds
-from imutool.training.calibration import LINEAR, Calibration, effects_beyond_chance, parameter_columns
-from imutool.training.segments import Pool
-from imutool.training.statistics import speed_of, turn_on_prior
+from imutool.training.bias_spread import speed_of, turn_on_prior
+from imutool.training.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
 logger = logging.getLogger(__name__)

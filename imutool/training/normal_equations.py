@@ -26,8 +26,8 @@ from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rot
 from imutool.sensor.linear_form import LinearForm, patterns
 from imutool.sensor.signals import Signals
 from imutool.training.closed_form import median_per_log, nuisance_jacobian, shown_by_logs, widest
-from imutool.training.segments import Part, Pool, Windows
 from imutool.training.settings import SensorPrior
+from imutool.training.training_windows import Part, Pool, Windows
 from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}

@@ -14,7 +14,7 @@ import msgspec
 import torch
 
 from imutool import __version__, registry
-from imutool.bias import hybrid, io, linear, neural_ode, static
+from imutool.bias import hybrid, linear, model_file, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode as neural_ode_network
 from imutool.bias.networks.network import BiasNetwork
@@ -22,18 +22,18 @@ from imutool.bias.networks.threads import side_by_side
 from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
 from imutool.errors import ConfigError
-from imutool.log_info.conventions import warn_of_recordings
+from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.sensor import catalogue, physics_file
 from imutool.training import checkpoint
-from imutool.training.calibration import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
+from imutool.training.bias_spread import speed_of
+from imutool.training.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import compare, simpler_effects
 from imutool.training.paper_scheme import PaperTraining
-from imutool.training.segments import Pool, check_trainable
 from imutool.training.settings import TrainSettings, settings_for
-from imutool.training.statistics import speed_of
+from imutool.training.training_windows import Pool, check_trainable
 from imutool.units import SENSORS, Sensor
 
 UNITS = {"gyro": "rad", "accel": "m/s"}
@@ -102,9 +102,9 @@ def train(
     model.card = (
         _card(method, chosen, parts) | about | speed_of(pool) | {key: _shared(recordings, key) for key in ("sensor", "dataset")}
     )
-    io.save(model.frozen(), out, overwrite=overwrite)
+    model_file.save(model.frozen(), out, overwrite=overwrite)
     kept.unlink(missing_ok=True)
-    return io.load(out)
+    return model_file.load(out)
 
 
 @dataclass(frozen=True)

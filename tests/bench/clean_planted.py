@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from imu_defects import late, messages, repeated, with_values, without
 
 from imutool.cleaning import survey
-from imutool.cleaning.first_pass import examine
+from imutool.cleaning.survey import examine
 from imutool.cleaning.truth import read_truth
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log

@@ -46,8 +46,8 @@ from support.error_growth import Judged, Motion
 from support.nees import consistency
 from support.switchings_on import Switchings, log
 
-from imutool.bias.io import load
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import load
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory

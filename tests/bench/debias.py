@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from imutool.bias import io
+from imutool.bias import model_file
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode
 from imutool.bias_start.correction import OnlineDebiaser
@@ -51,7 +51,7 @@ def write_random_model(path: Path, rate_hz: float) -> None:
         for weight in network.parameters():
             weight.add_(0.01 * torch.randn_like(weight))
         network.prior_std += 0.1
-    io.save(network.frozen(), path)
+    model_file.save(network.frozen(), path)
 
 
 def in_blocks(model: BiasModel, start: InitialBias, imu: Imu) -> np.ndarray:
@@ -113,7 +113,7 @@ def in_memory(names: Iterable[str], imu: Imu, rounds: int) -> None:
     for first, row in (("", heads), (f"least of {rounds} rounds", units)):
         print(f"{first:30}" + "".join(f"{word:>12}" for word in row))
     for name in names:
-        model = io.find_model(name)
+        model = model_file.find_model(name)
         start, followed = prior(model), tracked_from_prior(model)
         apart = float(np.abs(in_blocks(model, start, imu) - one_by_one(model, start, imu)).max())
         assert apart < SAME, apart
@@ -169,7 +169,7 @@ def main() -> None:
     imu = flight(5, duration_s=args.seconds).imu
     print(f"torch {torch.__version__}, {torch.get_num_threads()} thread of {os.cpu_count()} cores", end="")
     print(f", load {os.getloadavg()[0]:.1f}; {args.seconds:g} s at {1 / imu.period_s:.0f} Hz, {len(imu)} samples")
-    in_memory(args.models or sorted(path.stem for path in io.library().glob("*.safetensors")), imu, args.rounds)
+    in_memory(args.models or sorted(path.stem for path in model_file.library().glob("*.safetensors")), imu, args.rounds)
     if not args.in_memory:
         as_a_command(args.seconds, args.rounds)
 

@@ -32,8 +32,8 @@ import numpy as np
 
 from imutool.blind_cases import OPENED, conceal, open_case
 from imutool.blind_cases.catalogue import CATALOGUE, FORMS
-from imutool.blind_cases.draw import SIZES
 from imutool.blind_cases.envelope import to_truth
+from imutool.blind_cases.random_case import SIZES
 from imutool.errors import DataError, ImutoolError
 
 PAIRS, DRIVEN, NOTHING = 36, 15, 20  # in the deck, beside one of each effect and form at each size

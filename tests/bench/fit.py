@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.bias.io import find_model
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import find_model
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import relative_samples

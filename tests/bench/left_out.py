@@ -26,7 +26,7 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Recording, nanoseconds
-from imutool.training.calibration import PhysicsFirst
+from imutool.training.effect_selection import PhysicsFirst
 from imutool.training.fit import Training
 from imutool.training.settings import settings_of
 

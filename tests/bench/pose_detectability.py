@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.blind_cases import LONGEST_S, POSE_NOISE, draw, plan
+from imutool.blind_cases import LONGEST_S, POSE_NOISE, plan, random_case
 from imutool.blind_cases.detectability import DECIMATION, Detectability, with_catalogue
 from imutool.blind_cases.effects import Six, Stage
 from imutool.blind_cases.envelope import ConcealedTruth
@@ -21,7 +21,7 @@ from imutool.errors import DataError
 from imutool.mcap_io.read import read
 from imutool.recording import GRAVITY_M_S2
 
-CLOSE = 0.9  # as near to the wanted misfit as `draw.sized` comes
+CLOSE = 0.9  # as near to the wanted misfit as `random_case.sized` comes
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +52,14 @@ def beside_poses(scene: Scene, pose_noise: tuple[float, float] = POSE_NOISE) -> 
     return with_catalogue(PoseDetectability(scene, scene.t_s[::DECIMATION], {}, pose_noise))
 
 
-def is_detectable(seen: Detectability, concealed: draw.Concealed) -> bool:
+def is_detectable(seen: Detectability, concealed: random_case.Concealed) -> bool:
     """Whether everything in a case is as clear as `draw` asks; stamps, digits and lost poses always are."""
-    effects = [(m, theta) for m, theta in concealed.acting if m.stage != Stage.STAMPS and m.name not in draw.FIXED_SMALL]
+    effects = [(m, theta) for m, theta in concealed.acting if m.stage != Stage.STAMPS and m.name not in random_case.FIXED_SMALL]
     for model, theta in effects:
-        clear = seen.distinct_misfit(model, theta)[0] >= draw.wanted_misfit(model) * CLOSE
-        if not clear or (concealed.kind == "unknown" and not draw.has_no_name(seen, model, theta)):
+        clear = seen.distinct_misfit(model, theta)[0] >= random_case.wanted_misfit(model) * CLOSE
+        if not clear or (concealed.kind == "unknown" and not random_case.has_no_name(seen, model, theta)):
             return False
-    return len(effects) < 2 or draw.distinct(seen, effects[0], effects[1])
+    return len(effects) < 2 or random_case.distinct(seen, effects[0], effects[1])
 
 
 def detectable_from_poses(trajectory: Path, truth: ConcealedTruth, effects: Sequence[str] = ()) -> bool:

@@ -37,10 +37,10 @@ from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.codec.messages import message_record, message_rows
 from imutool.mcap_io.codec.records import crc32
+from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
-from imutool.mcap_io.writer import Chunk, LogWriter
 
 IMU, CAMERA, MONO = "/imu0", "/cam0/image_raw/compressed", "/cam1/image_raw"
 IMAGE = "sensor_msgs/msg/Image"

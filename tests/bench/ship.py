@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.bias.io import header_of
+from imutool.bias.model_file import header_of
 
 PREFIX = {"euroc": "euroc-adis16448", "tumvi": "tum_vi-bmi160", "fetch": "fetch"}
 METHODS = ("linear", "conv", "neural_ode", "hybrid")

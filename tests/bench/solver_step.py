@@ -14,7 +14,7 @@ import msgspec
 import torch
 from thawed import thawed
 
-from imutool.bias.io import load
+from imutool.bias.model_file import load
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.neural_ode import Model
 from imutool.bias_start.bias_from_truth import from_truth

@@ -24,8 +24,8 @@ from jaxtyping import Float64
 from scipy.optimize import nnls
 from starts import aoe, own_bias, samples, with_best_truth
 
-from imutool.bias.io import load
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import load
 from imutool.bias_start import bias_from_truth, initial_bias
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.geometry import quaternion

@@ -24,8 +24,8 @@ import torch
 import vqf
 from thawed import thawed
 
-from imutool.bias.io import load
 from imutool.bias.model import BiasModel, Vector6
+from imutool.bias.model_file import load
 from imutool.bias_start import bias_at_rest, bias_from_truth, initial_bias
 from imutool.bias_start.bias_tracking import BiasTrajectory, Samples, filter_blocks
 from imutool.bias_start.initial_bias import InitialBias
@@ -35,7 +35,7 @@ from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
 from imutool.training import closed_form
-from imutool.training.segments import Pool, corrected
+from imutool.training.training_windows import Pool, corrected
 
 CLIP_DEG_S = 20.0
 WINDOW_S = {"gyro": (15.0,), "accel": (2.0,)}

@@ -20,7 +20,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from imutool import file_location as places
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.debiasing import debias
 from imutool.file_location import to_location
 from imutool.mcap_io.codec import schemas

@@ -49,8 +49,8 @@ from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Training, TrainSettings
 from imutool.training.objectives.objective import RobustLoss, error
 from imutool.training.paper_scheme import PaperTraining
-from imutool.training.segments import Windows
 from imutool.training.settings import PaperSettings
+from imutool.training.training_windows import Windows
 from imutool.units import Sensor
 
 STAGES: tuple[Sensor, Sensor] = ("gyro", "accel")

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from imutool.bias.io import load
+from imutool.bias.model_file import load
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.inertial.strapdown import GRAVITY_W, StartPose, along_truth, dead_reckon, drift, with_velocity

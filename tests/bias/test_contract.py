@@ -19,9 +19,9 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from imutool import registry
-from imutool.bias import io
-from imutool.bias.io import MAX_BYTES, check_rate, find_model, header_of, load, save
+from imutool.bias import model_file
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import MAX_BYTES, check_rate, find_model, header_of, load, save
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.errors import ConfigError, ModelError
 from imutool.units import SENSORS
@@ -186,7 +186,7 @@ def test_it_comes_back_from_its_file_in_single_precision(model: BiasModel, saved
         kept = back.tensors[name]
         assert kept.dtype == np.float64
         assert np.array_equal(kept, value.astype(np.float32).astype(np.float64)), name
-    assert (back.card["name"], back.card["sha256"]) == (model.method, io.digest(saved))
+    assert (back.card["name"], back.card["sha256"]) == (model.method, model_file.digest(saved))
     seen = segment(11, 2, 300)
     np.testing.assert_allclose(streamed(back, seen, []), streamed(model, seen, []), rtol=1e-5, atol=1e-6)  # seven digits
 
@@ -363,9 +363,9 @@ def test_a_header_cannot_name_a_module_outside_the_models(saved: Path) -> None:
 
 
 def test_models_that_ship_are_found_by_name(saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(io, "library", lambda: saved.parent)
+    monkeypatch.setattr(model_file, "library", lambda: saved.parent)
     monkeypatch.chdir("/")
-    assert find_model(saved.stem).card["sha256"] == io.digest(saved)
+    assert find_model(saved.stem).card["sha256"] == model_file.digest(saved)
     assert find_model(saved).card["name"] == saved.stem
     with pytest.raises(ModelError, match=f"no model '{saved.stem}x'.*Did you mean '{saved.stem}'"):
         find_model(f"{saved.stem}x")

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from imutool.array_types import Float64
 from imutool.bias.conv import BLOCK, Config
-from imutool.bias.io import load, save
 from imutool.bias.model import COLUMNS
+from imutool.bias.model_file import load, save
 from imutool.bias.networks.conv import LEAST_SCALE, Layer, Net, Network
 from imutool.bias.networks.network import BiasNetwork, Segment
 from imutool.bias.neural_stream import gelu

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from imutool.bias import linear
-from imutool.bias.io import MAX_SETTINGS, find_model, header_of, library, load, save
+from imutool.bias.model_file import MAX_SETTINGS, find_model, header_of, library, load, save
 from imutool.bias_start.initial_bias import training_source
 from imutool.errors import ModelError
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from imutool.bias import hybrid
-from imutool.bias.io import load, save
 from imutool.bias.model import COLUMNS, BiasModel, SampleStream
+from imutool.bias.model_file import load, save
 from imutool.bias.networks import hybrid as network
 from imutool.bias.networks import neural_ode
 from imutool.bias.networks.network import BiasNetwork, Segment

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imutool.bias.io import find_model
+from imutool.bias.model_file import find_model
 from imutool.bias.physics import MOST_TAU_S, Model
 from imutool.bias_start.correction import apply
 from imutool.bias_start.initial_bias import prior

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from imutool.bias.io import find_model, header_of, library, load, shared_model, shipped_for
+from imutool.bias.model_file import find_model, header_of, library, load, shared_model, shipped_for
 from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ModelError

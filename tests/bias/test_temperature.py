@@ -19,8 +19,8 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from support.robot_cases.log import DEFINITIONS
 
 import imutool
-from imutool.bias.io import load, save
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import load, save
 from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_scale, temperature_tensors

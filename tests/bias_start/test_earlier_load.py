@@ -13,7 +13,7 @@ from support.drifting import Drifting, log
 
 import imutool
 from imutool.bias import hybrid
-from imutool.bias.io import save
+from imutool.bias.model_file import save
 from imutool.bias_start.bias_tracking import BiasFilter
 from imutool.bias_start.earlier_load import switched_on_before, with_earlier_load
 from imutool.bias_start.initial_bias import model_samples

@@ -10,8 +10,8 @@ import pytest
 
 import imutool
 from imutool.bias import linear, static
-from imutool.bias.io import save
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import save
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.fitness import judge

@@ -14,8 +14,8 @@ from mcap.writer import Writer
 from support.imu_defects import batch_of, with_values, write_log
 
 from imutool.bias import static
-from imutool.bias.io import load
 from imutool.bias.model import BiasModel
+from imutool.bias.model_file import load
 from imutool.bias_start.correction import OnlineDebiaser, apply_with_std
 from imutool.bias_start.initial_bias import tracked_from_prior
 from imutool.bias_start.stretches import Sieve, StretchClock, measured, measured_recording, read_stretches

@@ -20,13 +20,13 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from support.report_schema import assert_valid
 
-from imutool.blind_cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, catalogue, conceal, draw, open_case
+from imutool.blind_cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, catalogue, conceal, open_case, random_case
 from imutool.blind_cases.catalogue import CATALOGUE, NO_LIMIT
 from imutool.blind_cases.detectability import FALSE_ALARM, cramer_rao_bounds, detectability, detectable_misfit
-from imutool.blind_cases.draw import draw_parameters
 from imutool.blind_cases.effects import ACCEL, EARTH_RAD_S, GYRO, Reading, first_order, spring_mount
 from imutool.blind_cases.envelope import to_truth, unseal
 from imutool.blind_cases.motion import Kinematics, smoother
+from imutool.blind_cases.random_case import draw_parameters
 from imutool.blind_cases.scene import POSE_RATE_HZ, RATE_HZ, SIM_SHARE, Scene, place_scene
 from imutool.blind_cases.score import score
 from imutool.errors import ConfigError, DataError
@@ -118,7 +118,7 @@ def circle() -> Poses:
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A made-up flight."""
-    return place_scene(smoother(flight(3, duration_s=FLIGHT_S).truth), draw.GRADES["bmi160"], default_rng(0), 60.0)
+    return place_scene(smoother(flight(3, duration_s=FLIGHT_S).truth), random_case.GRADES["bmi160"], default_rng(0), 60.0)
 
 
 def test_a_circle_is_felt_as_mechanics_says(circle: Poses) -> None:
@@ -322,7 +322,7 @@ def test_the_bound_of_a_scale_is_that_of_a_straight_line(scene: Scene) -> None:
 
 
 def test_what_a_motion_cannot_show_has_no_bound(circle: Poses) -> None:
-    planar = place_scene(smoother(circle), draw.GRADES["bmi160"], default_rng(0), 30.0)
+    planar = place_scene(smoother(circle), random_case.GRADES["bmi160"], default_rng(0), 30.0)
     turning = replace(planar, noise=np.ones(6))
     (std,) = cramer_rao_bounds(turning, [(CATALOGUE["gyro_scale"], np.full(3, 0.01))])
     assert std is not None
@@ -337,19 +337,19 @@ def test_sizes_are_what_they_say(scene: Scene, name: str) -> None:
     amounts = model.amounts
     used = theta[amounts] / model.plausible[amounts]
     assert np.sqrt(np.mean(used[used != 0.0] ** 2)) == pytest.approx(1.0)
-    middle = draw.sized(seen, model, theta, "middle")
-    small = draw.sized(seen, model, theta, "small")
+    middle = random_case.sized(seen, model, theta, "middle")
+    small = random_case.sized(seen, model, theta, "small")
     assert middle is not None
     assert small is not None
     assert middle[0][amounts] == pytest.approx(0.25 * theta[amounts])
     left, _ = seen.distinct_misfit(model, small[0])
-    assert left == pytest.approx(draw.CLEAR**2 * detectable_misfit(int(amounts.sum())), rel=0.2)
+    assert left == pytest.approx(random_case.CLEAR**2 * detectable_misfit(int(amounts.sum())), rel=0.2)
     assert small[1] < 0.25
 
 
 def test_what_cannot_be_seen_is_not_drawn(scene: Scene) -> None:
     with pytest.raises(DataError, match="earth_rotation"):
-        draw.draw_effects(detectability(scene), default_rng(0), "single", "large", ["earth_rotation"])
+        random_case.draw_effects(detectability(scene), default_rng(0), "single", "large", ["earth_rotation"])
 
 
 def test_poses_without_noise_show_what_a_simulation_shows_and_noisy_ones_less(scene: Scene) -> None:
@@ -376,20 +376,20 @@ def test_power_of_poses_is_that_of_their_derivatives(scene: Scene) -> None:
 
 
 def test_a_case_drawn_beside_a_simulation_is_shown_by_good_poses_and_not_by_bad_ones(scene: Scene) -> None:
-    what = draw.draw_effects(detectability(scene), default_rng(0), "single", "small", ["accel_scale"])
+    what = random_case.draw_effects(detectability(scene), default_rng(0), "single", "small", ["accel_scale"])
     assert POSES.is_detectable(POSES.beside_poses(scene, (1e-6, 1e-7)), what)
     assert not POSES.is_detectable(POSES.beside_poses(scene, (5e-3, 1e-1)), what)
-    assert POSES.is_detectable(POSES.beside_poses(scene, (5e-3, 1e-1)), draw.Concealed("null", "middle"))
+    assert POSES.is_detectable(POSES.beside_poses(scene, (5e-3, 1e-1)), random_case.Concealed("null", "middle"))
 
 
-@pytest.mark.parametrize(("kind", "count"), [("pair", 2), ("uncalibrated", draw.MANY)])
-def test_several_effects_are_different_things(scene: Scene, kind: draw.Kind, count: int) -> None:
+@pytest.mark.parametrize(("kind", "count"), [("pair", 2), ("uncalibrated", random_case.MANY)])
+def test_several_effects_are_different_things(scene: Scene, kind: random_case.Kind, count: int) -> None:
     seen = detectability(scene)
     for seed in range(5):
-        names = {model.name for model, _ in draw.draw_effects(seen, default_rng(seed), kind, "large").acting}
+        names = {model.name for model, _ in random_case.draw_effects(seen, default_rng(seed), kind, "large").acting}
         assert len(names) == count
-        assert all(len(names & row) <= 1 for row in draw.ALIKE)
-        assert kind == "pair" or names <= {*draw.UNCALIBRATED}
+        assert all(len(names & row) <= 1 for row in random_case.ALIKE)
+        assert kind == "pair" or names <= {*random_case.UNCALIBRATED}
 
 
 # ── the seal ──
@@ -605,7 +605,7 @@ def test_cases_are_dealt_in_proportion_whatever_their_number() -> None:
     for count in (40, len(deck), 200):
         tasks = bench.dealt(count, 1)
         assert len(tasks) == count
-        for kind in draw.KINDS:
+        for kind in random_case.KINDS:
             share = sum(task.kind == kind for task in deck) / len(deck)
             assert abs(sum(task.kind == kind for task in tasks) - share * count) <= 2.0
     assert sorted(bench.dealt(len(deck), 5)) == sorted(deck)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from support.imu_defects import batch_of, cut, late, pick, repeated, with_values
 
 from imutool.cleaning import Cleaner
-from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.rule import CleaningSettings, every
 from imutool.cleaning.samples import BLOCK, blocks, padded
+from imutool.cleaning.survey import Survey, examine
 from imutool.errors import LogError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.report import json_values

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from support.imu_defects import batch_of
 
 from imutool.cleaning.conventions import Conventions, judge, signed_permutations
-from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.rules.axes import TO_Z_UP
 from imutool.cleaning.samples import Motion, Samples
+from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth, of_poses
 from imutool.cleaning.unit_evidence import FORCES, RATES
 from imutool.recording import GRAVITY_M_S2, Imu, Poses

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.imu_defects import batch_of, late, repeated, with_values, without
 
-from imutool.cleaning.first_pass import Survey, examine
+from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth
 from imutool.converters import euroc, fetch, tum_vi
 from imutool.mcap_io.codec.decode import ImuBatch

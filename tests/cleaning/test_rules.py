@@ -10,8 +10,8 @@ import pytest
 from support.imu_defects import batch_of, late, pick, repeated, with_values, without
 
 from imutool.cleaning.finding import Finding
-from imutool.cleaning.first_pass import Survey, examine
 from imutool.cleaning.rule import CleaningSettings
+from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.recording import GRAVITY_M_S2, Poses

@@ -14,7 +14,7 @@ import pytest
 from support.imu_defects import messages, repeated, with_values, without, write_log
 
 from imutool.cleaning import CleaningSettings, survey
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import LogError
 from imutool.mcap_io.codec.decode import ImuBatch

@@ -30,9 +30,9 @@ from imutool.file_location import to_location
 from imutool.fleet import engine as engines
 from imutool.fleet.engine import Engine, ProcessEngine, RayEngine
 from imutool.fleet.journal import NAME
+from imutool.fleet.one_log import work
 from imutool.fleet.run import Progress, run
 from imutool.fleet.task import Result, Settings, Task, with_model_hash
-from imutool.fleet.work import work
 from imutool.mcap_io.storage.source import sha256
 from imutool.processes import system
 from imutool.report import json_values

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imutool.fleet.one_log import work
 from imutool.fleet.robots import FALSE_DISCOVERY, FEWEST, compare
 from imutool.fleet.robots import _robust as robust
 from imutool.fleet.sources import find
 from imutool.fleet.task import Parameter, Result, Settings, Task
-from imutool.fleet.work import work
 
 ROBOTS, PARAMETERS, STD = 20, 12, 0.2
 FALSE_FLEETS = 0.03  # of 200 with nothing to find: three standard deviations above FALSE_DISCOVERY

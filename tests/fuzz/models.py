@@ -14,7 +14,7 @@ import numpy as np
 
 from fuzz import command, outside_contract
 from fuzz._inputs import finite_log, only_below
-from imutool.bias.io import library
+from imutool.bias.model_file import library
 from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 

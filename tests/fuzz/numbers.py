@@ -13,7 +13,7 @@ from mcap.writer import Writer
 
 from fuzz import command, outside_contract
 from fuzz._inputs import finite_log, only_below
-from imutool.bias.io import library
+from imutool.bias.model_file import library
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.recording import Poses, Recording

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_imu
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose, encode_vector3
+from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
 from imutool.mcap_io.write import Series, chunks, write
-from imutool.mcap_io.writer import LogWriter
 from imutool.recording import Imu, Recording
 
 START_NS = 1_403_638_128_245_096_960

@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas as schema

@@ -29,6 +29,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import message_rows
+from imutool.mcap_io.file_writer import Chunk, LogWriter, free_id
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
@@ -36,7 +37,6 @@ from imutool.mcap_io.storage import local
 from imutool.mcap_io.storage.source import Digest, Source, sha256
 from imutool.mcap_io.verify import Verified, verify
 from imutool.mcap_io.write import write
-from imutool.mcap_io.writer import Chunk, LogWriter, free_id
 from imutool.recording import Recording
 
 Message = tuple[str, int, int, int, bytes]  # topic, log time, publish time, sequence, payload

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_pose
+from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
-from imutool.mcap_io.writer import LogWriter
 from imutool.noise import datasheet as noises
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording, Scalars, seconds
 from imutool.sensor import catalogue

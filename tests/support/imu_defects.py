@@ -9,7 +9,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu

@@ -12,7 +12,7 @@ from imutool.errors import DataError
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
-from imutool.training.segments import Pool, check_trainable
+from imutool.training.training_windows import Pool, check_trainable
 
 
 def checked(*recordings: Recording) -> None:

@@ -15,7 +15,7 @@ from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Recording
 from imutool.training import closed_form
 from imutool.training.closed_form import CLOCK, NUISANCE_STD, ROTATION, Solution, shown_by_logs, solve
-from imutool.training.segments import Pool
+from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
 Make = Callable[..., Recording]

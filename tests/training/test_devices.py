@@ -17,7 +17,7 @@ from support.fake_gpu import OnGpu, simulated_gpu
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from imutool.bias import io
+from imutool.bias import model_file
 from imutool.bias.networks import neural_ode
 from imutool.bias.networks.network import Segment
 from imutool.bias.neural_ode import Config
@@ -220,7 +220,7 @@ def test_a_training_on_a_gpu_is_the_one_on_the_cpu(
         train(logs, out, method=method, settings=settings(method, model), device="cuda")
     assert out.read_bytes() == on_the_cpu(name)
     assert {one.dtype for one in load_file(out).values()} == {torch.float32}
-    assert io.load(out).method == method
+    assert model_file.load(out).method == method
 
 
 @pytest.mark.parametrize("name", ["neural_ode", "conv"])

@@ -15,11 +15,11 @@ from imutool.cli.demo import made_up
 from imutool.config import load
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
-from imutool.training.calibration import DRIFTS
-from imutool.training.earlier_load import loaded_signals
+from imutool.training.effect_selection import DRIFTS
+from imutool.training.log_signals import loaded_signals
 from imutool.training.run import train
-from imutool.training.segments import Pool
 from imutool.training.settings import TrainSettings, settings_of
+from imutool.training.training_windows import Pool
 
 TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen

@@ -13,7 +13,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from imutool.bias.io import load
+from imutool.bias.model_file import load
 from imutool.bias.networks.threads import of_each, side_by_side
 from imutool.bias_start.bias_from_truth import from_truth
 from imutool.bias_start.correction import apply

@@ -14,11 +14,11 @@ from imutool.config import load
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
-from imutool.training.calibration import LINEAR, calibrate
+from imutool.training.effect_selection import LINEAR, calibrate
 from imutool.training.left_out import Contradiction, Score, beaten, contradicting, keep
 from imutool.training.run import train
-from imutool.training.segments import Pool
 from imutool.training.settings import settings_of
+from imutool.training.training_windows import Pool
 
 KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0)
 TRAINING, TESTS = 4, 4  # tests/bench/never_worse.py has many sensors, six and eight logs of each

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import imutool
-from imutool.bias import io
+from imutool.bias import model_file
 from imutool.bias_start import initial_bias
 from imutool.bias_start.correction import apply
 from imutool.recording import Imu, Recording
@@ -49,8 +49,8 @@ def test_it_lowers_the_held_out_error_and_its_file_debiases_a_log(perfect: Make,
     made = training(perfect)
     errors = gyro_errors(list(made.epochs()))
     assert errors[-1] < 0.5 * errors[0]
-    io.save(made.model.frozen(), tmp_path / "paper.safetensors")
-    model, unseen = io.load(tmp_path / "paper.safetensors"), scaled(perfect, 3)
+    model_file.save(made.model.frozen(), tmp_path / "paper.safetensors")
+    model, unseen = model_file.load(tmp_path / "paper.safetensors"), scaled(perfect, 3)
     assert np.isfinite(apply(model, initial_bias.prior(model), unseen.imu).imu.gyro).all()
     assert (model.noise_std > 0).all()
     assert np.isfinite(model.prior_std).all()

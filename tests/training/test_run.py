@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from imutool.bias import hybrid
-from imutool.bias.io import load
+from imutool.bias.model_file import load
 from imutool.config import build
 from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
@@ -22,12 +22,12 @@ from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import flight
-from imutool.training.calibration import config_of
+from imutool.training.bias_spread import TURN_ON_STD
+from imutool.training.effect_selection import config_of
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objectives.objective import AdamW, WindowEndObjective
 from imutool.training.run import checkpoint_path, helps, settings_from_physics, train
 from imutool.training.settings import settings_of
-from imutool.training.statistics import TURN_ON_STD
 from imutool.units import Sensor
 
 pytestmark = pytest.mark.usefixtures("one_start")

@@ -24,9 +24,9 @@ from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.physics_file_terms import VARIABLES, Variable, product_of
+from imutool.sensor.physics_file_terms import driven as channel_effect
 from imutool.sensor.samples import Recent, SensorSamples
-from imutool.sensor.unnamed_effects import VARIABLES, Variable, product_of
-from imutool.sensor.unnamed_effects import driven as channel_effect
 from imutool.units import AXES, SENSORS, UNITS
 
 LAGS_S = (-0.5, -0.2, -0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.5)

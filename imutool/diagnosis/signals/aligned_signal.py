@@ -26,8 +26,8 @@ from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
 from imutool.sensor.effect import SignalState
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics
-from imutool.sensor.robot_effects.scale import Scale, moved
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
+from imutool.sensor.robot_effects.signal_sizes import Scale, moved
 
 MOVES = 1e-9  # of its largest value, below which a signal is constant
 Column = Float64[np.ndarray, "_"]

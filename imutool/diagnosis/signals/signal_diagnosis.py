@@ -22,9 +22,8 @@ from imutool.diagnosis.held_out import held_out_rms, noise_floor, unexplained_re
 from imutool.diagnosis.localization import locate_findings
 from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, SignalTraces, Unexplained
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals import common_effects as common
+from imutool.diagnosis.signals import scalar_effects as common
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
-from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.joints import current_remark
 from imutool.diagnosis.signals.noise import (
@@ -35,6 +34,7 @@ from imutool.diagnosis.signals.noise import (
     rich_residual,
     whitened,
 )
+from imutool.diagnosis.signals.sparsest_equation import python, terms
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect

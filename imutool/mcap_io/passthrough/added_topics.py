@@ -15,10 +15,10 @@ from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import as_ros1
 from imutool.mcap_io.codec.reflection import Reflected
+from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.passthrough.chunk_check import Part
 from imutool.mcap_io.topics import DERIVED_KEY, REFLECTED, Topic
-from imutool.mcap_io.writer import Chunk, LogWriter
 from imutool.recording.message_log import MessageTopic
 
 Translate = Callable[[UInt8[np.ndarray, "..."]], UInt8[np.ndarray, "..."] | list[bytes]]  # from CDR

@@ -18,8 +18,8 @@ from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages, records
 from imutool.mcap_io.codec.records import HEAD
 from imutool.mcap_io.codec.ros2_definition import decodes
+from imutool.mcap_io.file_writer import free_id
 from imutool.mcap_io.recovery.losses import LATEST_NS, Losses, reason
-from imutool.mcap_io.writer import free_id
 
 SCHEMA = int(Opcode.SCHEMA)
 ChunkKey = tuple[int, int, int]  # start and end in ns, unpacked bytes: what a summary says of a chunk wherever it lies

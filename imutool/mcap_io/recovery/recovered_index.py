@@ -23,9 +23,9 @@ from imutool.mcap_io.codec.records import CHUNK_HEAD, HEAD, MAGIC
 from imutool.mcap_io.index import CONVERT, LogIndex
 from imutool.mcap_io.recovery.chunk_repair import find_definitions
 from imutool.mcap_io.recovery.definitions import map_channels, parsed, remap, renumber, renumber_counts, unproven_topics
-from imutool.mcap_io.recovery.gaps import counts_by_size, really_lost
 from imutool.mcap_io.recovery.losses import LATEST_NS, Loss, Losses, reason
-from imutool.mcap_io.recovery.recordings import Recordings
+from imutool.mcap_io.recovery.lost_messages import counts_by_size, really_lost
+from imutool.mcap_io.recovery.recording_of_block import Recordings
 from imutool.mcap_io.recovery.scan import Scan
 from imutool.mcap_io.recovery.scan_events import Gap, ScannedBlock
 from imutool.mcap_io.recovery.summary import proven_summary

@@ -17,8 +17,8 @@ import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics
-from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import Columns, Samples, SignalSamples, State
+from imutool.sensor.robot_effects.signal_sizes import Scale
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0

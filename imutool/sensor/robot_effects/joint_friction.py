@@ -14,8 +14,8 @@ from scipy.ndimage import binary_opening
 
 from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Theta
-from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
+from imutool.sensor.robot_effects.signal_sizes import Scale
 
 STEEP, LEAST_STEEP = 3.0, 1e-3  # of the velocity's noise and size, within which its sign turns
 AT_REST, LEAST_REST = 4.0, 3  # of that velocity, and samples: a joint that turns round is faster

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
+from imutool.sensor.robot_effects.signal_sizes import Scale
 
 MOST_TEETH, LEAST_TURNS = 120.0, 3.0  # ripples a turn that are tried, and how many of them the motion has to show
 STARTS = 2

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.robot_effects.scale import Scale, delay_of_all
 from imutool.sensor.robot_effects.signal_samples import Columns, IdealSignal, SignalSamples, State
+from imutool.sensor.robot_effects.signal_sizes import Scale, delay_of_all
 
 FORWARD, TURN = 0, 1
 PLAUSIBLE = 0.1

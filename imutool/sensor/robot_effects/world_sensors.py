@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Theta
-from imutool.sensor.robot_effects.scale import Scale, delay_of_all
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
+from imutool.sensor.robot_effects.signal_sizes import Scale, delay_of_all
 from imutool.units import AXES
 
 AIR_KG_M3 = 1.225

@@ -26,7 +26,7 @@ from imutool.inertial.windows import step_means
 from imutool.training import closed_form
 from imutool.training.closed_form import median_per_log
 from imutool.training.objectives.objective import USUAL_SAMPLES, Objective, length
-from imutool.training.segments import corrected, sensors_up_to
+from imutool.training.training_windows import corrected, sensors_up_to
 
 USUAL_BATCH = 4  # stretches at a time
 

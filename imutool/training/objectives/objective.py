@@ -28,8 +28,8 @@ from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
 from imutool.training.closed_form import median_per_log
-from imutool.training.segments import Pool, Windows
 from imutool.training.settings import TrainSettings
+from imutool.training.training_windows import Pool, Windows
 from imutool.units import SENSORS, Sensor
 
 TRACK_UNIT = {"gyro": 1e-1, "accel": 1.0}  # one unit of a track's parameter, rad/s and m/s²

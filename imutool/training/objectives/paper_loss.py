@@ -23,7 +23,7 @@ from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import step_means
 from imutool.training.objectives.objective import BATCH_SAMPLES, Objective
-from imutool.training.segments import Part, Pool
+from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
 
 LOSS_UNITS = 1e6  # mrad² and mm², as in the released code: in rad² gradients would be as small as Adam's epsilon

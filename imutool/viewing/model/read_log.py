@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.cleaning import Cleaner, CleaningSettings, Survey
-from imutool.cleaning.first_pass import examine
+from imutool.cleaning.survey import examine
 from imutool.cleaning.truth import truth_of
 from imutool.errors import DataError, LogError
 from imutool.file_location import Location

@@ -116,7 +116,7 @@ def load_first_imu(path: Location, findings: Path | None = None) -> RunData | No
 
 def _imu_and_model(log: Log) -> tuple[str | None, str | None]:
     """First IMU topic, and the model that ships for its sensor where the log holds no debiased channel of it."""
-    from imutool.bias.io import shipped_for
+    from imutool.bias.model_file import shipped_for
     from imutool.mcap_io.codec import schemas
     from imutool.mcap_io.topics import DERIVED_KEY
 

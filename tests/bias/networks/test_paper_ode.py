@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from imutool.bias import io
+from imutool.bias import model_file
 from imutool.bias.networks import ode as chart
 from imutool.bias.networks.network import Segment
 from imutool.bias.networks.neural_ode import PAPER_WEIGHTS, Network
@@ -127,8 +127,8 @@ def test_the_sample_before_gives_the_first_slope(seen: Segment) -> None:
 
 
 def test_the_default_scheme_stands_in_no_file() -> None:
-    assert "scheme" not in io.plain(Config())
-    assert io.plain(Config(scheme="paper"))["scheme"] == "paper"
+    assert "scheme" not in model_file.plain(Config())
+    assert model_file.plain(Config(scheme="paper"))["scheme"] == "paper"
 
 
 def test_its_file_holds_two_fields_and_no_curve() -> None:

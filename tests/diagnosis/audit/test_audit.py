@@ -26,8 +26,8 @@ from imutool.diagnosis.audit.spectral_lines import spectral_lines
 from imutool.diagnosis.diagnose import diagnose
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_transform
+from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.write import Series, chunks, write
-from imutool.mcap_io.writer import LogWriter
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses, Recording
 

@@ -14,10 +14,10 @@ from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_vector3
 from imutool.mcap_io.codec.joined_imu import pairs_by_name, parse_parts
+from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import Series, chunks
-from imutool.mcap_io.writer import LogWriter
 
 START_NS = 1_600_000_000_000_000_123
 RNG = np.random.default_rng(8)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from imutool.sensor.robot_effects.joint_actuator_and_load import actuator_effects
-from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
+from imutool.sensor.robot_effects.signal_sizes import Scale
 
 T = np.arange(2000) / 100.0
 NAME = "/x.effort[0]"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from imutool.sensor.robot_effects.joint_transmission import effects, play, position_effects
-from imutool.sensor.robot_effects.scale import Scale
 from imutool.sensor.robot_effects.signal_samples import IdealSignal
+from imutool.sensor.robot_effects.signal_sizes import Scale
 
 RATE_HZ = 100.0
 T = np.arange(6000) / RATE_HZ

@@ -22,8 +22,8 @@ from imutool.training import checkpoint
 from imutool.training.fit import Training, TrainSettings
 from imutool.training.objectives.increments import IncrementObjective, products
 from imutool.training.objectives.objective import RestBiases, orientation_error
-from imutool.training.segments import Pool, corrected
 from imutool.training.settings import IncrementSettings, settings_for, settings_of
+from imutool.training.training_windows import Pool, corrected
 
 Make = Callable[..., Recording]
 PERIOD_S = 0.005

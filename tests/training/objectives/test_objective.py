@@ -13,7 +13,7 @@ from imutool.bias.networks import static
 from imutool.bias.networks.network import Segment
 from imutool.recording import Recording
 from imutool.training.objectives.objective import AdamW, error, motion_error, orientation_error
-from imutool.training.segments import Pool, Windows
+from imutool.training.training_windows import Pool, Windows
 
 N, PERIOD_S = 100, 0.005
 # Exact samples and poses: the rule's second order over half a second, here of at most 6 rad/s² and 30 m/s³.

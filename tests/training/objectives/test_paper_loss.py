@@ -15,8 +15,8 @@ from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Recording
 from imutool.training.objectives.objective import RestBiases
 from imutool.training.objectives.paper_loss import PaperLoss, biases_from_poses
-from imutool.training.segments import Pool
 from imutool.training.settings import PaperSettings, TrainSettings
+from imutool.training.training_windows import Pool
 
 Make = Callable[..., Recording]
 BIAS = np.array([0.01, -0.02, 0.02, 0.1, -0.2, 0.2])

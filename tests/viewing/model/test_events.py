@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.imu_defects import batch_of, late, repeated, with_values, without
 
-from imutool.cleaning.first_pass import examine
+from imutool.cleaning.survey import examine
 from imutool.diagnosis_output import FINDINGS as WRITTEN
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.codec.decode import ImuBatch

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
 from imutool.bias_start.correction import apply, apply_with_std
-from imutool.cleaning.first_pass import raw_batches
+from imutool.cleaning.survey import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import evaluate, started

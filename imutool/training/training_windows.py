@@ -23,7 +23,7 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import GAP_PERIODS
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.windows import rotation_residual
-from imutool.log_info.conventions import check_one_sensor
+from imutool.log_info.convention_report import check_one_sensor
 from imutool.recording import Recording, seconds
 from imutool.training.settings import PoseFloors
 from imutool.units import SENSORS, Sensor

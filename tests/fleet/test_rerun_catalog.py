@@ -15,11 +15,11 @@ from support.report_schema import assert_valid
 
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
-from imutool.fleet import catalog, results
-from imutool.fleet.catalog import Catalog
-from imutool.fleet.layers import FleetLog, build, layer_of, logs_of
+from imutool.fleet import rerun_catalog, results
+from imutool.fleet.one_log import UnitReport, write_json
+from imutool.fleet.rerun_catalog import Catalog
+from imutool.fleet.rerun_layers import FleetLog, build, layer_of, logs_of
 from imutool.fleet.task import Imu, Parameter, Result
-from imutool.fleet.work import UnitReport, write_json
 
 Imutool = Callable[..., subprocess.CompletedProcess[str]]
 FINDING = {"effect": "lever_arm", "signal": "accel"}
@@ -134,7 +134,7 @@ def test_the_command_lists_the_worst_and_serves_until_it_is_interrupted(out: Pat
         assert url is not None
         from rerun.catalog import CatalogClient
 
-        assert sorted(CatalogClient(url[0]).get_dataset(catalog.DATASET).segment_ids()) == ["flight_1", "flight_2"]
+        assert sorted(CatalogClient(url[0]).get_dataset(rerun_catalog.DATASET).segment_ids()) == ["flight_1", "flight_2"]
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
 

@@ -17,7 +17,7 @@ from imutool.recording import Imu, Recording
 from imutool.recording.columns import MOST_GAP_S
 from imutool.sensor.made_up_flight import flight
 from imutool.training.objectives.objective import RestBiases
-from imutool.training.segments import HELD_OUT, Pool
+from imutool.training.training_windows import HELD_OUT, Pool
 
 RATE_HZ = 200.0
 Make = Callable[..., Recording]

@@ -24,7 +24,7 @@ from imutool.inertial.inertial_filter import FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
 from imutool.training import closed_form
-from imutool.training.segments import Pool, corrected
+from imutool.training.training_windows import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
 MAD_TO_STD = 1.4826

@@ -17,7 +17,7 @@ from imutool import __version__
 from imutool.errors import ConfigError, ImutoolError, LogError
 from imutool.file_location import to_location
 from imutool.fleet import results
-from imutool.fleet.work import UnitReport
+from imutool.fleet.one_log import UnitReport
 from imutool.processes.system import processors
 from imutool.processes.worker_pool import WorkerPool
 

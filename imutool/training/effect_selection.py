@@ -32,11 +32,11 @@ from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.closed_form import widest
-from imutool.training.earlier_load import loaded_signals, signals_of
 from imutool.training.fit import Epoch, note
+from imutool.training.log_signals import loaded_signals, signals_of
 from imutool.training.normal_equations import Problem, Seen, linearise
-from imutool.training.segments import Part, Pool
 from imutool.training.settings import SensorPrior, TrainSettings
+from imutool.training.training_windows import Part, Pool
 from imutool.units import SENSORS, Sensor
 
 BY_CHANCE = 0.01  # probability of finding any effect where there is none

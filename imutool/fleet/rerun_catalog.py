@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from imutool.errors import ConfigError, not_installed
-from imutool.fleet.layers import APPLICATION, LAYERS, PROPERTIES, Layers
+from imutool.fleet.rerun_layers import APPLICATION, LAYERS, PROPERTIES, Layers
 
 if TYPE_CHECKING:
     from rerun.catalog import DatasetEntry

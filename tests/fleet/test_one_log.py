@@ -18,10 +18,10 @@ from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
+from imutool.fleet.one_log import target_name, work
 from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
-from imutool.fleet.work import target_name, work
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
 from imutool.mcap_io.write import write

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from imutool.bias_start.initial_bias import AT_REST_STD
 from imutool.recording import Imu, Poses, Recording
-from imutool.training.segments import Pool
-from imutool.training.statistics import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, speed_of, turn_on_prior
+from imutool.training.bias_spread import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, speed_of, turn_on_prior
+from imutool.training.training_windows import Pool
 
 HOUR_NS = 3600 * 10**9
 USUAL = np.array([USUAL_STD["gyro"]] * 3 + [USUAL_STD["accel"]] * 3)

@@ -30,8 +30,8 @@ from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
 from imutool.training.closed_form import Integrated, integrated, minus_log_likelihood
 from imutool.training.normal_equations import Problem, Seen, linearise
-from imutool.training.segments import Pool
 from imutool.training.settings import SensorPrior
+from imutool.training.training_windows import Pool
 from imutool.units import AXES
 
 COLD = 0  # index of the time zero
