@@ -13,6 +13,7 @@ import numpy as np
 from imutool.errors import DataError, not_installed
 
 from ._archive import refusing
+from ._table_headerless import name_headerless
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
@@ -66,6 +67,7 @@ def _load_csv(path: Path, columns: Columns) -> None:
     text = text_of(path.read_bytes())
     if not read_rows(text, columns, path):
         read_csv(text, columns, path)
+        name_headerless(columns)
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:

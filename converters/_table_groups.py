@@ -15,7 +15,7 @@ from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
 QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
-POSITION = r"((p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
+POSITION = r"((t|p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.recording import GRAVITY_M_S2, Imu
 
 from ._table_text import Columns
@@ -31,7 +32,7 @@ USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
 
 def gravity_units(columns: Columns, chosen: Sequence[str]) -> tuple[float, list[str]]:
     """Median length of the vectors in three columns, and the units in which it is gravity."""
-    level = float(np.nanmedian(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0)))
+    level = _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
     return level, [u for u, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND]
 
 
@@ -40,16 +41,22 @@ def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
     if not len(imu):
         return []
     doubts = []
-    level = float(np.nanmedian(np.linalg.norm(imu.accel, axis=1)))
-    if not 1.0 / MOST_OF_GRAVITY < level / GRAVITY_M_S2 < MOST_OF_GRAVITY:
+    level = _usual(np.linalg.norm(imu.accel, axis=1), 0.5)
+    if np.isfinite(level) and not 1.0 / MOST_OF_GRAVITY < level / GRAVITY_M_S2 < MOST_OF_GRAVITY:
         doubts.append(
             f"the median acceleration is {level:.3g} m/s^2 with accel_unit {accel_unit!r}, and gravity is {GRAVITY_M_S2}:"
             " is the unit right, and are these the columns of the accelerometer?"
         )
-    rate = float(np.nanquantile(np.abs(imu.gyro), USUAL_SHARE))
+    rate = _usual(np.abs(imu.gyro), USUAL_SHARE)
     if rate > FULL_SCALE_RAD_S:
         doubts.append(
             f"the gyro reaches {rate:.3g} rad/s with gyro_unit {gyro_unit!r}, and common gyros measure up to"
             f" {FULL_SCALE_RAD_S:g} rad/s: is the unit right?"
         )
     return doubts
+
+
+def _usual(values: Float64[np.ndarray, "*n"], share: float) -> float:
+    """Quantile of the finite values; nan without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.quantile(finite, share)) if len(finite) else float("nan")

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from imutool.noise_identification import IdentifiedNoise
 
 
+MANY = 3  # conventions that poses leave open: more than two are named together
 EARLIEST_DATE_NS = 365 * 86400 * 10**9  # of 1971: an earlier first stamp counts from a start
 
 
@@ -171,7 +172,7 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         for entry in imu.get("conventions", []):
             alike.setdefault(entry["evidence"], []).append(entry["subject"])
         for evidence, subjects in alike.items():  # only what the poses leave open has a reason in common
-            rows.append((imu["topic"], subjects[0] if len(subjects) == 1 else "against poses", evidence))
+            rows.append((imu["topic"], ", ".join(subjects) if len(subjects) < MANY else "against poses", evidence))
         for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
             noise = imu["noise"]
             if noise is not None:

@@ -26,10 +26,10 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
-NO_TURN = (
-    "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or clocks that differ by "
-    f"more than {LONGEST_DELAY_S:g} s"
-)
+FAR_CLOCKS = f"or clocks that differ by more than {LONGEST_DELAY_S:g} s"
+NO_TURN = f"no order of the axes fits clearly: little motion, turns about one axis only, a turned body, {FAR_CLOCKS}"
+TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
+NO_DELAY = f"the sizes of the turns show no single delay: few poses, turns that hardly change, {FAR_CLOCKS}"
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
 
@@ -87,21 +87,21 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     if level is not None:
         size = f"reads {level:.4g} {'when calm' if at_rest else 'in the median'}"
         yield "unit of accel", bool(unit), f"{unit}: it {size}" if unit else f"cannot be judged: it {size}"
-    why = NO_GRAVITY if whole.truth is None else NO_TURN
+    turned = found.gyro is not None and found.gyro.sole
     by_gravity = _gyro(found.relative, "gravity as accel reads it")
     yield "gyro against accel", *(by_gravity or (False, f"cannot be judged: {NO_GRAVITY}"))
-    yield "gyro against poses", *(_gyro(found.gyro, found.topic) or _unknown(whole, why))
+    yield "gyro against poses", *(_gyro(found.gyro, found.topic) or _unknown(whole, NO_TURN))
     if found.accel is not None:
         yield "accel against poses", True, f"{found.accel.names}, {_ratio(found.accel)}"
     else:
-        yield "accel against poses", *_unknown(whole, "the motion is too slow to tell it from its negative")
-    yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, why))
+        yield "accel against poses", *_unknown(whole, TOO_SLOW)
+    yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, TOO_SLOW if turned else NO_TURN))
     if found.delay is not None:
         side = "late" if found.delay.seconds > 0 else "early"
         late = f"{abs(1e3 * found.delay.seconds):.1f} ms {side}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
         yield "clock of poses", True, late
     else:
-        yield "clock of poses", *_unknown(whole, why)
+        yield "clock of poses", *_unknown(whole, NO_DELAY if turned else NO_TURN)
 
 
 def _gyro(reading: Reading | None, against: str) -> tuple[bool, str] | None:

@@ -30,7 +30,7 @@ BLOCK = 64  # samples of a matrix product in `low_pass`
 
 # columns of the signals: the samples, the filters' whole state, and derivatives
 GYRO, ACCEL, SAMPLES = slice(0, 3), slice(3, 6), slice(0, 6)
-GYRO_SLOW, ACCEL_SLOW, SLOW, TURN, VIBRATION = slice(6, 9), slice(9, 12), slice(6, 12), slice(12, 15), slice(15, 18)
+GYRO_SLOW, SLOW, TURN, VIBRATION = slice(6, 9), slice(6, 12), slice(12, 15), slice(15, 18)
 FILTERED = slice(6, 18)
 GYRO_DOT, ACCEL_DOT, DOTS, ALPHA = slice(18, 21), slice(21, 24), slice(18, 24), slice(24, 27)
 

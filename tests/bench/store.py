@@ -20,6 +20,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from imutool import file_location as places
+from imutool.cleaning.first_pass import raw_batches
 from imutool.debiasing import debias
 from imutool.file_location import to_location
 from imutool.mcap_io.codec import schemas
@@ -65,7 +66,7 @@ def main() -> None:
         passes: dict[str, Callable[[], object]] = {
             "open": lambda: Log(to_location(url)).__exit__(None, None, None),
             "sha256": lambda: sha256(to_location(url)),
-            "imu": lambda: [len(batch.gyro) for batch in Log(to_location(url)).imu_batches("/imu0")],
+            "imu": lambda: [len(batch.gyro) for batch in raw_batches(Log(to_location(url)), "/imu0")],
             "copy": lambda: rewrite(to_location(url), to_location("s3://fleet/out.mcap"), [], metadata={}, overwrite=True),
             "debias": lambda: debias(to_location(url), to_location("s3://fleet/out.mcap"), model="static", overwrite=True),
         }

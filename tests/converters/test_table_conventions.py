@@ -311,6 +311,12 @@ def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
     np.testing.assert_allclose(imus["/imu2/imu"].gyro, GYRO[::-1])
 
 
+def test_an_acceleration_without_a_number_does_not_stand_for_one_with_them(tmp_path):
+    names = ["t_ns", *(f"accel_{a} [m/s^2]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz"), *IMU_NAMES[:3]]
+    path = written(tmp_path / "phone.csv", names, [T_NS, *(np.nan * ACCEL).T, *ACCEL.T, *GYRO.T])
+    np.testing.assert_allclose(table.read_sequence(table.sequences(path)[0]).imus["/imu0"].accel, ACCEL)
+
+
 @pytest.mark.parametrize("without", ["lin_acc", "user_acceleration", "LinearAcceleration", "ac"])
 def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path, without):
     names = [
@@ -392,3 +398,39 @@ def test_a_time_that_a_program_has_rounded_is_named(tmp_path):
     path = written(tmp_path / "excel.csv", names, [np.repeat([1.7e12, 1.70001e12], COUNT // 2), *GYRO.T, *ACCEL.T])
     with pytest.raises(ConfigError, match=f"'timestamp' is named as a time and does not rise: 2 different values in {COUNT}"):
         table.read_sequence(table.sequences(path)[0])
+
+
+def test_what_ros_echoes_of_an_imu_is_one(tmp_path):
+    nothing = [np.zeros(COUNT)] * 9
+    columns = [
+        T_NS // 10**9,
+        T_NS % 10**9,
+        *np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1)).T,
+        *nothing,
+        *GYRO.T,
+        *nothing,
+        *ACCEL.T,
+        *nothing,
+    ]
+    text = [
+        ",".join([*map(repr, row[:2]), "imu_link", *map(repr, row[2:])])
+        for row in zip(*(c.tolist() for c in columns), strict=True)
+    ]
+    (tmp_path / "echo.csv").write_text("\n".join(text) + "\n")
+    imu = table.read_sequence(table.sequences(tmp_path / "echo.csv")[0]).imus["/imu0"]
+    assert np.array_equal(imu.t_ns, T_NS)
+    assert np.array_equal(imu.gyro, GYRO)
+    assert np.array_equal(imu.accel, ACCEL)
+
+
+@pytest.mark.parametrize("first", ["gyro", "accel"])
+def test_a_time_and_six_axes_without_a_header_are_an_imu_by_its_gravity(tmp_path, first):
+    sides = [GYRO, ACCEL] if first == "gyro" else [ACCEL, GYRO]
+    path = written(tmp_path / "raw.csv", [], [T_NS, *sides[0].T, *sides[1].T])
+    with pytest.raises(ConfigError, match="no unit of the gyro") as asked:  # which at rest nothing shows
+        table.read_sequence(table.sequences(path)[0])
+    assert 'accel = ["accel_x", "accel_y", "accel_z"]\naccel_unit = "m/s^2"' in str(asked.value)
+    (tmp_path / "map.toml").write_text(str(asked.value.fix).partition("\n\n")[2].replace('"?"', '"rad/s"'))
+    imu = table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml").imus["/imu0"]
+    assert np.array_equal(imu.gyro, GYRO)
+    assert np.array_equal(imu.accel, ACCEL)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imutool.converters import sensor_tables, table
 from imutool.errors import ConfigError
@@ -50,6 +51,32 @@ def answered(error: ConfigError, path: Path, **answers: str) -> Path:
         text = re.sub(rf'^{name} = "\?".*$', f'{name} = "{answer}"', text, flags=re.MULTILINE)
     path.write_text(text)
     return path
+
+
+@pytest.mark.parametrize("header", ["# timestamp tx ty tz qx qy qz qw\n", ""])
+@pytest.mark.parametrize("names", [("imu.txt", "groundtruth.txt"), ("run_imu0.txt", "stamped_groundtruth_imu.txt")])
+def test_a_folder_with_an_imu_beside_true_poses_is_one_recording(tmp_path, names, header):
+    source = tmp_path / "flight"
+    source.mkdir()
+    t_s = np.arange(10 * COUNT) / 100.0
+    pitch, zero = Rotation.from_rotvec(np.outer(3.0 * np.sin(2.0 * t_s), [0.0, 1.0, 0.0])), 0.0 * t_s
+    rotation = Rotation.from_rotvec(np.outer(2.0 * np.sin(1.1 * t_s), [1.0, 0.0, 0.0])) * pitch
+    gyro = pitch.inv().apply(np.stack([2.2 * np.cos(1.1 * t_s), zero, zero], axis=1)) + np.outer(
+        6.0 * np.cos(2.0 * t_s), [0, 1, 0]
+    )
+    accel = rotation.inv().apply([0.0, 0.0, 9.81])
+    position = RNG.normal(size=(len(t_s), 3))
+    (source / names[0]).write_text(
+        "# timestamp ang_vel_x ang_vel_y ang_vel_z lin_acc_x lin_acc_y lin_acc_z\n" + rows(T_S[0] + t_s, gyro, accel, mark=" ")
+    )
+    (source / names[1]).write_text(header + rows(T_S[0] + t_s, position, rotation.as_quat(), mark=" "))
+    (source / "left_images.txt").write_text("# id timestamp image_name\n0 1600000000.0 img/image_0_0.png\n")
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, accel)
+    poses = log.poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.p_wb, position)
+    assert (rotation.inv() * Rotation.from_quat(poses.q_wb_wxyz[:, [1, 2, 3, 0]])).magnitude().max() < 1e-6
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -18,6 +18,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.cleaning.first_pass import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
 from imutool.mcap_io.codec import schemas as schema
@@ -28,7 +29,7 @@ from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.read import read
 from imutool.mcap_io.rewrite import rewrite
 from imutool.mcap_io.storage.source import sha256
-from imutool.mcap_io.topics import DERIVED_KEY, StampCheck
+from imutool.mcap_io.topics import DERIVED_KEY, StampCheck, check_finite
 from imutool.mcap_io.verify import verify
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
@@ -53,7 +54,8 @@ class Debias:
         self.clock = StampCheck()
 
     def __call__(self, batch: ImuBatch) -> DerivedBatch:
-        self.clock.check_imu(batch)
+        check_finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+        self.clock.check(batch.stamp_ns, batch.sequence)
         self.stamps += batch.stamp_ns.tolist()
         bias = np.tile(BIAS, (len(batch.stamp_ns), 1))
         imu = encode_imu(batch.stamp_ns, batch.gyro - bias, batch.accel, batch.frame_id)
@@ -154,7 +156,7 @@ def test_derived_messages_carry_times_and_sequence_of_their_source(source: Path,
     target, make = tmp_path / "out.mcap", Debias("/imu/data")
     rewrite(source, target, [make], metadata={})
     with Log(target) as log:
-        raw, clean = list(log.imu_batches("/imu/data")), list(log.imu_batches("/imu/data/debiased"))
+        raw, clean = list(raw_batches(log, "/imu/data")), list(raw_batches(log, "/imu/data/debiased"))
         topic = log.topics["/imu/data/bias/gyro"]
         bias = [batch for _, rows in log.rows([topic.name]) for batch in topic.decode_scalars(rows)]
         assert log.topics["/imu/data/debiased"].metadata[DERIVED_KEY] == "/imu/data"

@@ -9,6 +9,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from imutool.cleaning.first_pass import raw_batches
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
@@ -28,7 +29,7 @@ def batch_of(imu: Imu, delay_ns: int = 3_000_000) -> ImuBatch:
 def messages(log: Path, topic: str = "/imu0") -> ImuBatch:
     """The messages of a log as one batch."""
     with Log(log) as opened:
-        parts = list(opened.imu_batches(topic))
+        parts = list(raw_batches(opened, topic))
     return ImuBatch(
         *(np.concatenate(columns) for columns in zip(*(part[:6] for part in parts), strict=True)), parts[0].frame_id
     )

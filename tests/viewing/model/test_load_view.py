@@ -13,6 +13,7 @@ from mcap.writer import Writer
 from support.imu_defects import batch_of, late, pick, repeated, with_values, write_log
 
 from imutool.bias_start.correction import apply, apply_with_std
+from imutool.cleaning.first_pass import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import evaluate, started
@@ -96,7 +97,7 @@ def test_what_debias_left_in_the_log_is_shown_with_its_certainty(made: Recording
 def test_a_channel_without_its_bias_in_the_log_is_subtracted_at_equal_stamps(debiased: Path, tmp_path: Path) -> None:
     only = tmp_path / "only.mcap"
     with Log(debiased) as opened:
-        (imu,) = list(opened.imu_batches("/imu0/debiased"))[:1]
+        (imu,) = list(raw_batches(opened, "/imu0/debiased"))[:1]
     raw = batch_of(load(debiased).traces[0].run.imu)
     fewer = pick(imu, np.arange(0, len(imu.stamp_ns), 2))
     write_both(raw, fewer, only)
