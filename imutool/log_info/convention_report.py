@@ -26,20 +26,12 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
-<<<<<<< HEAD:imutool/log_info/convention_report.py
-TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
-NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns that hardly change"
-=======
->>>>>>> words:imutool/log_info/conventions.py
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or clocks that differ by "
     f"more than {LONGEST_DELAY_S:g} s"
 )
-<<<<<<< HEAD:imutool/log_info/convention_report.py
-=======
 TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
 NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns that hardly change"
->>>>>>> words:imutool/log_info/conventions.py
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
 
