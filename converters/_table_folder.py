@@ -13,12 +13,13 @@ from imutool.errors import DataError
 from ._source import head
 from ._table_files import kind_of, load
 from ._table_groups import TRUE_GROUPS
+from ._table_map import propose
 from ._table_sensors import SENSORS, name_columns, sensors_among
-from ._table_text import Columns
+from ._table_text import Columns, read_csv, text_of
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40
-IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt
+IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
 ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".mat", ".npz"
 
@@ -67,6 +68,17 @@ def _groups(tables: list[Path]) -> dict[Path, str]:
     sensors = sensors_among(path.stem for path in tables)
     if {*sensors.values()} == {*SENSORS}:
         return {path: sensors[path.stem] for path in tables if path.stem in sensors}
-    imus, poses = ([path for path in tables if re.fullmatch(of, path.stem.lower())] for of in (IMU, POSES))
-    imus = [path for path in imus if path not in poses]
-    return {imus[0]: "imu", poses[0]: "ground_truth"} if len(imus) == len(poses) == 1 else {}
+    poses = [path for path in tables if re.fullmatch(POSES, path.stem.lower())]
+    others = [path for path in tables if path not in poses] if len(poses) == 1 else []
+    imus = [path for path in others if re.fullmatch(IMU, path.stem.lower())] or [path for path in others if _shows_imu(path)]
+    return {imus[0]: "imu", poses[0]: "ground_truth"} if len(imus) == 1 else {}
+
+
+def _shows_imu(table: Path) -> bool:
+    """Whether the first rows of a text have columns of a gyroscope and of an accelerometer."""
+    start = head(table)
+    if kind_of(start, table) != "csv":
+        return False
+    columns = Columns()
+    read_csv(text_of(start).rpartition("\n")[0], columns, table)
+    return bool(propose(columns).entries.keys() >= {"gyro", "accel"})

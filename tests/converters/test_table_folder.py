@@ -54,7 +54,9 @@ def answered(error: ConfigError, path: Path, **answers: str) -> Path:
 
 
 @pytest.mark.parametrize("header", ["# timestamp tx ty tz qx qy qz qw\n", ""])
-@pytest.mark.parametrize("names", [("imu.txt", "groundtruth.txt"), ("run_imu0.txt", "stamped_groundtruth_imu.txt")])
+@pytest.mark.parametrize(
+    "names", [("imu.txt", "groundtruth.txt"), ("run_imu0.txt", "stamped_groundtruth_imu.txt"), ("phone.txt", "mocap.txt")]
+)
 def test_a_folder_with_an_imu_beside_true_poses_is_one_recording(tmp_path, names, header):
     source = tmp_path / "flight"
     source.mkdir()
