@@ -18,7 +18,7 @@ from imutool.cleaning.samples import Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
-from imutool.log_info.pose_imu_rotation import agreement, body_warnings
+from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
@@ -53,8 +53,9 @@ def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
     """Log the warnings about units, axes and frames of samples that are used uncorrected."""
     warnings = convention_warnings(convention_summary(imu, truth)) if len(imu) else []
     found = agreement(truth, imu) if truth is not None and not warnings else None
-    if truth is not None and found is not None and found.turned is not None:
-        warnings = body_warnings(truth.topic, found.turned.deg.tolist())
+    if truth is not None and found is not None:
+        turned_deg = [] if found.turned is None else found.turned.deg.tolist()
+        warnings = [*body_warnings(truth.topic, turned_deg), *motion_warnings(truth.topic, found.explained, found.rms_rad_s)]
     for warning in warnings:
         logger.warning("%s: %s", where, warning)
 

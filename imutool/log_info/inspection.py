@@ -28,7 +28,7 @@ from imutool.log_info.convention_report import (
     coverage,
     transforms,
 )
-from imutool.log_info.pose_imu_rotation import agreement, body_warnings
+from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
@@ -294,4 +294,6 @@ def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
     warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
     for truth in usable:
         warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
+        if isinstance(truth.gyro_explained, float) and isinstance(truth.gyro_rms_rad_s, float):
+            warnings += motion_warnings(truth.topic, truth.gyro_explained, truth.gyro_rms_rad_s)
     return warnings

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.truth import Truth, read_truth, turning
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
@@ -19,6 +20,7 @@ LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
 ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
+UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 UNSURE_DEG = 3.0  # standard deviation of a rotation that is not reported
 TURNED_DEG = 10.0  # more than a mount that was meant to be straight
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
@@ -73,6 +75,14 @@ def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
     deg = float(np.linalg.norm(turned_deg))
     fix = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; imutool convert LOG OUT --fix corrects it"
     return [fix] if deg > TURNED_DEG else []
+
+
+def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]:
+    """Warning of poses that do not turn as the gyro does."""
+    if explained > LEAST_EXPLAINED or rms_rad_s < UNLIKE_RAD_S:
+        return []
+    causes = f"clocks that differ by more than {LONGEST_DELAY_S:g} s, poses of another recording or body, or noise of the poses"
+    return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
 
 
 class Body(NamedTuple):

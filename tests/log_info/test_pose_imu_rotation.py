@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.truth import Truth
-from imutool.log_info.pose_imu_rotation import agreement
+from imutool.log_info.pose_imu_rotation import agreement, motion_warnings
 from imutool.recording import Imu
 
 RNG = np.random.default_rng(6)
@@ -48,6 +48,7 @@ def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias()
     turned_deg, std_deg = found.turned
     assert np.abs(turned_deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * std_deg.max()
     assert 0.001 < std_deg.max() < 0.5
+    assert motion_warnings("/mocap", found.explained, found.rms_rad_s) == []
 
 
 def test_poses_of_another_motion_do_not():
@@ -55,6 +56,9 @@ def test_poses_of_another_motion_do_not():
     assert found is not None
     assert found.explained < 0.3
     assert found.turned is None
+    (warning,) = motion_warnings("/mocap", found.explained, found.rms_rad_s)
+    assert warning.startswith("the poses /mocap explain ")
+    assert "another recording" in warning
 
 
 def test_a_gyro_at_rest_or_poses_of_another_time_show_nothing():
