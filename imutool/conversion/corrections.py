@@ -6,6 +6,7 @@ the judged poses' frame turn with it. The record `imutool_corrections` says what
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,8 +19,9 @@ from imutool.array_types import Float64, Int64
 from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
 from imutool.cleaning.conventions import axis_names
 from imutool.cleaning.stamp_line import WRAPS, read_stamps, restamped
+from imutool.conversion.message_patch import MessagePatch
 from imutool.conversion.message_writer import write_log
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.log_info.inspection import sound_samples
 from imutool.log_info.pose_imu_rotation import Body, turned_body
@@ -71,7 +73,17 @@ class Corrections:
         earlier = content.metadata.get(RECORD, {})  # of another round, or of an earlier command
         record = {topic: "; ".join(filter(None, (earlier.get(topic), note))) for topic, note in self.notes.items()}
         metadata = {**content.metadata, RECORD: {**earlier, **record}}
-        return replace(content, messages=lambda: self._each(content.messages()), metadata=metadata)
+        return replace(content, messages=lambda: self._in_order(content), metadata=metadata)
+
+    def _in_order(self, content: MessageLog) -> Iterator[Message]:
+        """Corrected messages; where the poses come from another clock, they are sorted in by the corrected one."""
+        if abs(self.late_ns) < SAME_CLOCK_NS:
+            return self._each(content.messages())
+        others, poses = (self._where(content, is_pose) for is_pose in (False, True))
+        return heapq.merge(others, poses, key=lambda message: message.log_time)
+
+    def _where(self, content: MessageLog, is_pose: bool) -> Iterator[Message]:
+        return (message for message in self._each(content.messages()) if _is_pose(message.topic) is is_pose)
 
     def _each(self, messages: Iterator[Message]) -> Iterator[Message]:
         seen = Counter[str]()
@@ -80,7 +92,7 @@ class Corrections:
             if stamps is None:
                 yield self._corrected(message)
                 continue
-            patch = _Patch(message.topic, bytes(message.payload))
+            patch = MessagePatch(message.topic, bytes(message.payload))
             patch.move_stamp(int(stamps[seen[name]]) - patch.stamp_ns())
             seen[name] += 1
             yield self._corrected(message._replace(payload=bytes(patch.data)))
@@ -93,16 +105,21 @@ class Corrections:
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         turned = bool((self.world != np.eye(3)).any())
-        if (turned or self.late_ns or self.body is not NOT_TURNED) and name in (*MESSAGE_POSES, schemas.TF):
+        if not _is_pose(topic) or not (turned or self.late_ns or self.body is not NOT_TURNED):
+            return message
+        if abs(self.late_ns) > SAME_CLOCK_NS:
+            message = message._replace(
+                log_time=message.log_time - self.late_ns, publish_time=message.publish_time - self.late_ns
+            )
+        if name != schemas.VECTOR3:
             return message._replace(payload=self._poses(topic, bytes(message.payload)))
-        if turned and name == schemas.VECTOR3 and VELOCITY_KEY in dict(topic.metadata):
-            patch = _Patch(topic, bytes(message.payload))
-            patch.numbers()[:] = self.world @ patch.numbers()
-            return message._replace(payload=bytes(patch.data))
-        return message
+        patch = MessagePatch(topic, bytes(message.payload))
+        patch.numbers()[:] = self.world @ patch.numbers()
+        patch.move_stamp(-self.late_ns)
+        return message._replace(payload=bytes(patch.data))
 
     def _poses(self, topic: MessageTopic, payload: bytes) -> bytes:
-        patch = _Patch(topic, payload)
+        patch = MessagePatch(topic, payload)
         named = 2 if "text" in schemas.SHAPES[patch.schema_name] else 1
         turn, body = quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
         for which in range(len(patch.layout.stamps)):
@@ -118,40 +135,15 @@ class Corrections:
         return bytes(patch.data)
 
 
-class _Patch:
-    """Payload whose numbers and stamps are written in place."""
-
-    def __init__(self, topic: MessageTopic, payload: bytes) -> None:
-        self.schema_name = schemas.canonical(topic.schema_name)
-        self.layout = schemas.layout_of(self.schema_name, topic.message_encoding, message=payload)
-        self.data = bytearray(payload)
-
-    def numbers(self, which: int = 0) -> np.ndarray:
-        """Numbers of one element: a view."""
-        at, count = self.layout.numbers[which]
-        return np.frombuffer(self.data, f"{self.layout.order}f8", count, at)
-
-    def stamp_ns(self, which: int = 0) -> int:
-        """Stamp of one element."""
-        at, order = self.layout.stamps[which], self.layout.order
-        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
-        return int(seconds[0]) * schemas.NS_PER_S + int(np.frombuffer(self.data, f"{order}u4", 1, at + 4)[0])
-
-    def move_stamp(self, by_ns: int, which: int = 0) -> None:
-        """Shift a stamp."""
-        at, order = self.layout.stamps[which], self.layout.order
-        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
-        nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
-        moved_ns = self.stamp_ns(which) + by_ns
-        if moved_ns < 0 and self.layout.seconds == "u4":
-            what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, lies before 0"
-            raise DataError(what, expected="stamps that ROS 1 can store", fix="Cut the log there, or convert it to ROS 2 first")
-        seconds[0], nanos[0] = divmod(moved_ns, schemas.NS_PER_S)
+def _is_pose(topic: MessageTopic) -> bool:
+    """Whether a topic holds poses, or their velocities."""
+    name = schemas.canonical(topic.schema_name)
+    return name in (*MESSAGE_POSES, schemas.TF) or (name == schemas.VECTOR3 and VELOCITY_KEY in dict(topic.metadata))
 
 
 def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:
     """Message of an IMU with both vectors, their covariances and its own orientation in right units and axes."""
-    patch = _Patch(topic, payload)
+    patch = MessagePatch(topic, payload)
     numbers = patch.numbers()
     for matrix, vector, covariance in (
         (gyro, schemas.GYRO, schemas.GYRO_COVARIANCE),

@@ -101,7 +101,9 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, TOO_SLOW if turned else NO_TURN))
     if found.delay is not None:
         side = "late" if found.delay.seconds > 0 else "early"
-        late = f"{abs(1e3 * found.delay.seconds):.1f} ms {side}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
+        late_s = abs(found.delay.seconds)
+        late = f"{late_s:.3f} s" if late_s > LONGEST_DELAY_S else f"{1e3 * late_s:.1f} ms"
+        late = f"{late} {side}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
         yield "clock of poses", True, late
     else:
         yield "clock of poses", *_unknown(whole, NO_DELAY if turned else NO_TURN)

@@ -13,6 +13,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.cleaning.conventions import Conventions, Reading, axis_names
 from imutool.cleaning.finding import Finding
+from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.rule import Rule, TopicSummary
 
 DISTRUST = "the axes of {} contradict {}"
@@ -55,7 +56,9 @@ class Axes(Rule):
         if found.delay is not None and abs(found.delay.seconds) > max(LATE_S, LATE_STDS * found.delay.std_s):
             whole.pose_delay_ns = round(found.delay.seconds * 1e9)
             side = "late" if found.delay.seconds > 0 else "early"
-            size = f"{1e3 * abs(found.delay.seconds):.0f} ms {side} (standard deviation {1e3 * found.delay.std_s:.0f} ms)"
+            late_s = abs(found.delay.seconds)
+            late = f"{late_s:.3f} s" if late_s > LONGEST_DELAY_S else f"{1e3 * late_s:.0f} ms"
+            size = f"{late} {side} (standard deviation {1e3 * found.delay.std_s:.0f} ms)"
             what = f"the stamps of the poses {found.topic} are {size} by the gyro"
             yield Finding("axes", "warning", what, 1, values={"fix": "move the stamps of the poses"}, confidence=0.9)
 

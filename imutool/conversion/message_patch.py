@@ -1,0 +1,40 @@
+"""Numbers and stamps of an encoded message, written in place."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imutool.errors import DataError
+from imutool.mcap_io.codec import schemas
+from imutool.recording.message_log import MessageTopic
+
+
+class MessagePatch:
+    """Payload whose numbers and stamps are written in place."""
+
+    def __init__(self, topic: MessageTopic, payload: bytes) -> None:
+        self.schema_name = schemas.canonical(topic.schema_name)
+        self.layout = schemas.layout_of(self.schema_name, topic.message_encoding, message=payload)
+        self.data = bytearray(payload)
+
+    def numbers(self, which: int = 0) -> np.ndarray:
+        """Numbers of one element: a view."""
+        at, count = self.layout.numbers[which]
+        return np.frombuffer(self.data, f"{self.layout.order}f8", count, at)
+
+    def stamp_ns(self, which: int = 0) -> int:
+        """Stamp of one element."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        return int(seconds[0]) * schemas.NS_PER_S + int(np.frombuffer(self.data, f"{order}u4", 1, at + 4)[0])
+
+    def move_stamp(self, by_ns: int, which: int = 0) -> None:
+        """Shift a stamp."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
+        moved_ns = self.stamp_ns(which) + by_ns
+        if moved_ns < 0 and self.layout.seconds == "u4":
+            what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, lies before 0"
+            raise DataError(what, expected="stamps that ROS 1 can store", fix="Cut the log there, or convert it to ROS 2 first")
+        seconds[0], nanos[0] = divmod(moved_ns, schemas.NS_PER_S)
