@@ -258,7 +258,7 @@ def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
     parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
     if survey.pose_delay_ns:
         side = "earlier" if survey.pose_delay_ns > 0 else "later"
-        parts.append(f"stamps are {abs(survey.pose_delay_ns) * 1e-6:.3f} ms {side} now")
+        parts.append(f"stamps are {abs(survey.pose_delay_ns) * 1e-9:.6f} s {side} now")
     if turned is not None:
         deg = ", ".join(f"{angle:.4f}" for angle in np.degrees(quaternion.log(quaternion.of_matrix(turned.turn))[0]))
         parts.append(f"the body is now that of the IMU, turned by ({deg})° from that recorded")

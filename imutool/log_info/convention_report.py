@@ -27,8 +27,7 @@ logger = logging.getLogger(__name__)
 
 NO_POSES = "the log has no true poses"
 NO_TURN = (
-    "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or clocks that differ by "
-    f"more than {LONGEST_DELAY_S:g} s"
+    "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
 )
 TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
 NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns that hardly change"

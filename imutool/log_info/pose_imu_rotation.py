@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.truth import Truth, read_truth, turning
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
@@ -81,7 +80,7 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]
     """Warning of poses that do not turn as the gyro does."""
     if explained > LEAST_EXPLAINED or rms_rad_s < UNLIKE_RAD_S:
         return []
-    causes = f"clocks that differ by more than {LONGEST_DELAY_S:g} s, poses of another recording or body, or noise of the poses"
+    causes = "clocks that differ, poses of another recording or body, or noise of the poses"
     return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
 
 

@@ -93,6 +93,29 @@ def test_units_and_axes_of_the_gyro_are_named_by_gravity(number: int) -> None:
     assert found.unit == unit
 
 
+@pytest.mark.parametrize("late_s", [-7.0, 1e9])
+@pytest.mark.parametrize("rotation", [np.eye(3), PERMUTATIONS[17]])
+def test_the_clock_of_poses_is_found_however_far_it_is_off(rotation: np.ndarray, late_s: float) -> None:
+    imu, poses = turned(waves(90.0, (0.5, 0.4, 0.6), 5))
+    truth = of_poses("/mocap", poses)
+    assert truth is not None
+    other = truth._replace(t_ns=truth.t_ns + round(late_s * 1e9))
+    found = judge(motion_of(Imu(imu.t_ns, imu.gyro @ rotation, imu.accel)), other, 1.0)
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(late_s, abs=0.005)
+    assert found.gyro is not None
+    assert (found.gyro.axes == rotation).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_poses_of_another_motion_have_no_clock_in_common(seed: int) -> None:
+    imu, _ = turned(waves(90.0, (0.5, 0.4, 0.6), seed))
+    _, poses = turned(waves(70.0, (0.5, 0.4, 0.6), 100 + seed))
+    truth = of_poses("/mocap", poses)
+    assert truth is not None
+    assert judge(motion_of(imu), truth._replace(t_ns=truth.t_ns + 10**12), 1.0).delay is None
+
+
 NULLS = {
     "rest": (waves(60.0, (0.0, 0.0, 0.0)), None),
     "planar": (waves(60.0, (0.0, 0.0, 0.4)), 1.5 * waves(60.0, (1.0, 1.0, 0.0), 2)),

@@ -80,20 +80,32 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
 
 
-def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("late_s", [1.2, -45.0, 3_600.0, -1_600_000_000.0])
+def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_path: Path, late_s: float) -> None:
     """As a motion capture gives them: a clock of its own, markers mounted askew, y up. Each error hides the next."""
     made = flight(3, duration_s=60.0, rate_hz=100.0, truth_rate_hz=50.0)
     turn = Rotation.from_rotvec([42.0, 20.0, 110.0], degrees=True)
     y_up = Rotation.from_euler("x", -90.0, degrees=True)
     true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
     q_wxyz = (y_up * true * turn).as_quat(scalar_first=True)
-    late = Poses(made.truth.t_ns + 1_200_000_000, made.truth.p_wb @ y_up.as_matrix().T, q_wxyz)
+    late = Poses(made.truth.t_ns + round(late_s * 1e9), made.truth.p_wb @ y_up.as_matrix().T, q_wxyz)
     write(replace(made, truths={"/vicon/pose": late}), tmp_path / "late.mcap")
     convert(tmp_path / "late.mcap", tmp_path / "right.mcap", correct=["conventions"])
     assert inspect(tmp_path / "right.mcap").warnings == []
+    fixed = read(tmp_path / "right.mcap")
+    assert np.abs(fixed.truth.t_ns - made.truth.t_ns).max() < 5_000_000
     with Log(tmp_path / "right.mcap") as log:
         said = log.metadata()[RECORD]["/vicon/pose"]
-    assert all(part in said for part in ("earlier now", "the body is now that of the IMU", "the world's x, y, z are now"))
+        times_ns = np.concatenate([part for topic in ("/imu0", "/vicon/pose") for part in log.stamps(topic)])
+    assert np.ptp(times_ns) < 61e9  # log times have moved with the stamps
+    assert all(
+        part in said
+        for part in (
+            "earlier now" if late_s > 0 else "later now",
+            "the body is now that of the IMU",
+            "the world's x, y, z are now",
+        )
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "right.mcap"]
 
 
