@@ -26,7 +26,6 @@ from imutool.diagnosis.signals import common_effects as common
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
 from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.joints import current_remark
 from imutool.diagnosis.signals.noise import (
     LEARNT_ERROR,
     SMALL_GAIN,
@@ -34,6 +33,14 @@ from imutool.diagnosis.signals.noise import (
     lsb_of,
     rich_residual,
     whitened,
+)
+from imutool.diagnosis.signals.torque_constants import (
+    CERTAIN,
+    GAIN,
+    as_torques,
+    constant_findings,
+    current_remark,
+    torque_constants,
 )
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
@@ -43,7 +50,6 @@ from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction
 EXACT = 1e-3
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
-CERTAIN = 6.0  # deviations from which a constant is a finding
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signals ({:+.3f} s), so that a delay between them cannot be seen"
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
@@ -104,6 +110,13 @@ def diagnose_signal(
         candidates = [effect for effect in candidates if effect.name not in DELAYS]
     columns = range(signal.columns)
     log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
+    if (constants := torque_constants(log, candidates, always)) is not None:
+        signal, pair = as_torques(signal, constants), replace(pair, real=constants * pair.real)
+        gains = [effect for effect in catalogue(signal) if effect.name == GAIN]
+        always = (*always, *((effect, np.ones(1)) for effect in gains))
+        candidates = [effect for effect in catalogue(signal) if effect.name != GAIN]
+        lsb = lsb_of(pair, settings)
+        log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
     selection = _selected(log, candidates, always)
     rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), lsb)
     if (noise_std(rewhitened.whiten) < settings.signal.better_noise * noise_std(log.whiten)).any():
@@ -191,7 +204,7 @@ def _summarized(
             findings.append(finding)
             floor[k] = np.hypot(level[k], lsb[k] / np.sqrt(12.0))
     offsets = dict(_offsets(pair, selection))
-    findings += _constants(pair, offsets, level)
+    findings += [*_constants(pair, offsets, level), *constant_findings(log, selection, after, level)]
     if pair.band_hz is not None:
         floor = level = np.hypot(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])

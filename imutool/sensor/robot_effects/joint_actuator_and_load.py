@@ -11,7 +11,7 @@ Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ OFFSET_M = 0.1  # of two axes of a wrist
 UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
-LIMITS = (0.5, 1.0, 1.5, 2.0)
+BEYOND = (0.003, 0.01, 0.03, 0.1, 0.3)  # of the commands, that a limit to start from cuts
 OFFSETS = "; offsets: lengths before it, which the simulated arm's own weight does not show"
 AXES = {2: "whose axes are level and up", 3: "whose third axis is up"}
 
@@ -133,16 +133,26 @@ def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
         "the effort varies",
         starts=[np.ones(1)],
     )
-    for name, limits, shares, text in (
-        ("actuator_dead_band", False, WIDTHS, "a command within +-width does nothing, and beyond it loses as much"),
-        ("torque_saturation", True, LIMITS, "a command beyond +-limit acts as the limit"),
-    ):
-        yield scale.effect(
-            name,
-            (k,),
-            text,
-            (Parameter("limit" if limits else "width", unit, size, positive=True, step=0.01),),
-            _Kept(k, scale.names[k], limits),
-            "the effort goes beyond the limit" if limits else "the effort goes through zero",
-            starts=[np.array([share * size]) for share in shares],
-        )
+    dead_band = scale.effect(
+        "actuator_dead_band",
+        (k,),
+        "a command within +-width does nothing, and beyond it loses as much",
+        (Parameter("width", unit, size, positive=True, step=0.01),),
+        _Kept(k, scale.names[k], limits=False),
+        "the effort goes through zero",
+        starts=[np.array([share * size]) for share in WIDTHS],
+    )
+    limit = scale.effect(
+        "torque_saturation",
+        (k,),
+        "a command beyond +-limit acts as the limit",
+        (Parameter("limit", unit, size, positive=True, step=0.01),),
+        _Kept(k, scale.names[k], limits=True),
+        "the effort goes beyond the limit",
+    )
+    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k])))
+
+
+def _limits(commands: Samples) -> list[Theta]:
+    """Limits to start from: a motion may go beyond its own for a moment only."""
+    return [np.array([limit]) for limit in np.quantile(np.abs(commands), 1.0 - np.array(BEYOND))]

@@ -1,0 +1,101 @@
+"""Torque constants where efforts are motor currents: a gain of each joint in every fit.
+
+Currents differ from torques by a large factor of their own at each joint. Beside such a misfit all else is small, so that the
+factors have to be known before effects are searched for. A heavy load makes efforts larger as well: the two are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.diagnosis.estimation.candidate_score import Selection
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.significance import bic, scatter
+from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.diagnosis.held_out import held_out_rms
+from imutool.diagnosis.result import Estimate, Finding
+from imutool.diagnosis.signals.aligned_signal import AlignedSignal
+from imutool.diagnosis.signals.noise import LEARNT_ERROR
+from imutool.sensor.effect import Effect
+from imutool.sensor.robot_effects.joint_dynamics import own_columns
+
+FAR_GAIN = 2.0  # of an actuator: no motor loses or gains as much, so that its effort is in another unit
+CERTAIN = 6.0  # deviations from which a constant is a finding
+GAIN, LOAD = "actuator_gain", "payload"
+Constants = Float64[np.ndarray, " k"]
+
+
+def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Constants | None:
+    """Torque (N m) of a unit of each recorded effort; None where they are torques, as far as one sees."""
+    signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    gains = [effect for effect in candidates if effect.name == GAIN]
+    if not gains or not _far(first := _at_first_sight(signal)):
+        return None
+    currents = (*always, *((effect, np.array([one])) for effect, one in zip(gains, first.values(), strict=True)))
+    torques = (*always, *((effect, np.ones(1)) for effect in gains))
+    loads = [(load, start) for load in candidates if load.name == LOAD for start in signal.starts(load)]
+    beside = (currents, torques) if signal.columns > 1 else (always,)  # of one joint, a load is a gain and a rotor
+    trials = [fit([log], currents), *(fit([log], (*base, load)) for base in beside for load in loads)]
+    best = {effect.key: float(theta[0]) for effect, theta in min(trials, key=bic).chosen}
+    constants = {name: best.get(effect.key, 1.0) for name, effect in zip(first, gains, strict=True)}
+    return np.array(list(constants.values())) if _far(constants) else None
+
+
+def current_remark(gains: Mapping[str, float]) -> list[str]:
+    """Remark on efforts that are motor currents (A) in one log; `gains` by joint."""
+    if not (far := _far(gains)):
+        return []
+    each = ", ".join(f"{name}: {gain:.4g}" for name, gain in sorted(far.items()))
+    return [f"The simulated efforts are a multiple of the recorded ones, as if those were motor currents (N m/A): {each}"]
+
+
+def as_torques(signal: AlignedSignal, constants: Constants) -> AlignedSignal:
+    """The signal with its recorded efforts, which are also its commands, as torques."""
+    channels = dict(signal.ideal.channels)
+    for name, constant in zip(signal.names, constants.tolist(), strict=True):
+        t_s, values = channels[name]
+        channels[name] = t_s, constant * values
+    ideal = replace(signal.ideal, channels=channels)
+    return replace(signal, real=constants * signal.real, ideal=ideal, constants=tuple(constants.tolist()))
+
+
+def constant_findings(
+    log: WhitenedLog, selection: Selection, after: Float64[np.ndarray, "n k"], level: Float64[np.ndarray, " k"]
+) -> Iterator[Finding]:
+    """Gain of each joint whose efforts were converted, but for those that are 1."""
+    signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    if not signal.constants:
+        return
+    stds = scatter([log], selection.whole, "all", signal.settings.search.robust_block_s).std
+    gains = [(effect, float(theta[0])) for effect, theta in selection.whole.chosen if effect.name == GAIN]
+    before = after + signal.real - signal.real / np.array(signal.constants)  # what leaves the log's numbers, taken as torques
+    for k, ((effect, factor), constant) in enumerate(zip(gains, signal.constants, strict=True)):
+        gain, name = constant * factor, signal.names[k]
+        std = float(np.hypot(constant * stds[effect.key][0], LEARNT_ERROR * gain))
+        if abs(gain - 1.0) > CERTAIN * std:
+            held_out = held_out_rms([log], [before], [after], name)
+            share = 1.0 - (held_out.rms_after**2 - level[k] ** 2) / max(held_out.rms_before**2 - level[k] ** 2, 1e-300)
+            numbers = {"gain": Estimate(gain, std, effect.parameters[0].unit)}
+            yield Finding(GAIN, name, float(np.clip(share, 0.0, 1.0)), 0.0, 0.0, numbers, effect.equation, held_out)
+
+
+def _far(gains: Mapping[str, float]) -> dict[str, float]:
+    """Gains that no actuator has."""
+    return {name: gain for name, gain in gains.items() if not 1.0 / FAR_GAIN < gain < FAR_GAIN}
+
+
+def _at_first_sight(signal: AlignedSignal) -> dict[str, float]:
+    """Gains by regression of recorded efforts on expected ones, with friction, a rotor and a constant of each joint."""
+    rows, sampled, out = signal.usable[:, 0], signal.sampled, dict[str, float]()
+    own = own_columns(sampled.state, signal.columns)[rows]
+    for k, (name, needed) in enumerate(zip(signal.names, sampled.x[rows].T, strict=True)):
+        columns = np.column_stack([needed, own[:, k, 4 * k : 4 * k + 4]])
+        length = np.linalg.norm(columns, axis=0)
+        share = float(np.linalg.lstsq(columns / length, signal.real[rows, k], rcond=None)[0][0] / length[0])
+        out[name] = 1.0 / share if share else 1.0
+    return out
