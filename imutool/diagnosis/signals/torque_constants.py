@@ -31,7 +31,7 @@ Constants = Float64[np.ndarray, " k"]
 
 
 def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Constants | None:
-    """Torque (N m) of a unit of each recorded effort; None where they are torques, as far as one sees."""
+    """Torque (N m) of a unit of each recorded effort; None where they are torques."""
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     gains = [effect for effect in candidates if effect.name == GAIN]
     if not gains or not _far(first := _at_first_sight(signal)):

@@ -1,8 +1,8 @@
 """Actuator and load of a joint: delay, gain, dead band, limit; payload, rotor.
 
-A point mass m at (x, y) of the last link adds m |P|², m conj(P_i) P_j and m P_i to the coefficients of the chain
-(`joint_dynamics`); a rotor behind a gear adds J (rad/s²) to its own joint (Spong, Hutchinson, Vidyasagar, Robot Modeling and
-Control, eq. 7.41).
+A mass m about (x, y) of the last link, of inertia I about its own centre, adds m |P|², m conj(P_i) P_j and m P_i to the
+coefficients of the chain (`joint_dynamics`), and I to that of its link; a rotor behind a gear adds J (rad/s²) to its own joint
+(Spong, Hutchinson, Vidyasagar, Robot Modeling and Control, eq. 7.41).
 
 The log holds the commanded effort u; what acts is u some time later, less and limited (Slotine and Li, Applied Nonlinear
 Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over the gain, plus what the actuator kept back.
@@ -22,11 +22,13 @@ from imutool.sensor.robot_effects.signal_samples import Columns, Samples, Signal
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
+SPREAD_M = 0.1  # of a payload about its centre
 OFFSET_M = 0.1  # of two axes of a wrist
 UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
 BEYOND = (0.003, 0.01, 0.03, 0.1, 0.3)  # of the commands, that a limit to start from cuts
+EXTENT = "; inertia: about its own centre, alike about all axes"
 OFFSETS = "; offsets: lengths before it, which the simulated arm's own weight does not show"
 AXES = {2: "whose axes are level and up", 3: "whose third axis is up"}
 
@@ -57,12 +59,14 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
         arm, letters = reach or USUAL_ARM_M, "xy" if dynamics.spatial is None else "xyz"
         place = tuple(Parameter(letter, "m", max(arm, 0.1)) for letter in letters)
         offsets = tuple(Parameter(f"offset_{k + 1}", "m", OFFSET_M) for k in range(dynamics.offsets))
-        axes, more = np.eye(len(letters), len(letters) + len(offsets)), OFFSETS if offsets else ""
+        extent = (Parameter("inertia", "kg m²", PLAUSIBLE_KG * SPREAD_M**2),) if dynamics.joints > 1 else ()  # else a rotor's
+        axes = np.eye(len(letters), len(letters) + len(extent) + len(offsets))
         yield scale.effect(
             "payload",
             scale.columns,
-            f"a point mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero{more}",
-            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place, *offsets),
+            f"a mass about ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero"
+            f"{EXTENT if extent else ''}{OFFSETS if offsets else ''}",
+            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place, *extent, *offsets),
             _Payload(dynamics),
             "the arm moves against gravity, and fast enough for its inertia to show",
             starts=[np.array([0.3, *(arm * at)]) for axis in axes for at in (axis, -axis)],

@@ -66,17 +66,22 @@ class Dynamics:
         return np.asarray(efforts[:, np.argsort(self.order)])
 
     def loaded(self, state: State) -> Callable[[Theta], Columns]:
-        """Efforts that a point mass on the last link adds, by its mass and place, and the `offsets` of the joints before."""
+        """Efforts that a mass on the last link adds, by its mass, place and own inertia.
+
+        Behind them come the `offsets` of the joints before. One joint tells no such inertia from its rotor's: it has none.
+        """
         in_order, sorted_ = _in_order(state, self.order), np.argsort(self.order)
         if self.spatial is None:
             columns, links = chain_columns(in_order, self.signs)[:, sorted_], self.links
-            return lambda theta: columns @ mass_coefficients(theta[0], [*links, complex(theta[1], theta[2])])
+            return lambda theta: columns @ mass_coefficients(theta[0], [*links, complex(theta[1], theta[2])], sum(theta[3:]))
         chain, moved = self.spatial, self.spatial.moved(in_order)
         origin, unknown = chain.origin(self.coefficients[0])
+        about = np.stack([chain.of_link(axis) for axis in np.eye(3)], axis=1)
+        spread = 0.5 * about @ about.T  # an inertia alike about all axes is that of half of it along each
 
         def added(theta: Theta) -> Columns:
-            at = origin + chain.of_link(theta[1:4]) + unknown @ theta[4:]
-            return chain.efforts(moved, theta[0] * np.outer(at, at), theta[0] * at)[:, sorted_]
+            at = origin + chain.of_link(theta[1:4]) + unknown @ theta[5:]
+            return chain.efforts(moved, theta[0] * np.outer(at, at) + theta[4] * spread, theta[0] * at)[:, sorted_]
 
         return added
 

@@ -47,10 +47,10 @@ class _Friction:
 
 
 def with_stiction(effect: Effect) -> Effect:
-    """Dry friction that holds a joint at rest, by Coulomb's and Stribeck's level together; any other effect as it is.
+    """Dry friction that holds a joint at rest; any other effect as it is.
 
-    At rest the force is what the command leaves over, up to the level (eq. 3 of the survey): sliding alone shows the level. It
-    follows the recording there, and can therefore not be searched for.
+    At rest the force is what the command leaves over, up to Coulomb's and Stribeck's level together (eq. 3 of the survey):
+    sliding alone shows the levels. It follows the recording there, and can therefore not be searched for.
     """
     forward = effect.forward
     if not isinstance(forward, _Friction) or forward.kind == "viscous":
