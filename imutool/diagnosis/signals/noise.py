@@ -128,7 +128,7 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
     kept, small = list[SelectedEffect](), list[SelectedEffect]()
     for selected, own in zip(selection.selected, sizes, strict=True):
         (kept if selected.gain >= least and (own >= enough).any() else small).append(selected)
-    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
+    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors or pair.names)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names
 
 

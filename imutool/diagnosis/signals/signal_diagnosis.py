@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64
 from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
@@ -24,6 +24,17 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut, Located, Signal
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import common_effects as common
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
+from imutool.diagnosis.signals.constants import (
+    GAIN,
+    as_torques,
+    constant_findings,
+    current_remark,
+    digits,
+    gains_of,
+    offsets_of,
+    torque_constants,
+    torque_findings,
+)
 from imutool.diagnosis.signals.equations import python, terms
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.noise import (
@@ -34,20 +45,12 @@ from imutool.diagnosis.signals.noise import (
     rich_residual,
     whitened,
 )
-from imutool.diagnosis.signals.torque_constants import (
-    CERTAIN,
-    GAIN,
-    as_torques,
-    constant_findings,
-    current_remark,
-    torque_constants,
-)
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
 from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction, joint_transmission, wheel, world_sensors
 
-EXACT = 1e-3
+CONVERTED = 2  # times that currents are made torques: a limit or dead band in amperes shows once all else is known
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signals ({:+.3f} s), so that a delay between them cannot be seen"
@@ -66,12 +69,6 @@ CATALOGUE = {
     "gnss": (world_sensors.gnss_effects,),
 }
 """Effects by the kind of a signal; a single column has those of any signal too."""
-CONSTANTS = {
-    "magnetic": ("hard_iron", "field += hard iron"),
-    "range": ("offset", "y += offset"),
-    "positions": ("encoder_offset", "the angle read = angle + offset"),
-}
-"""Name and equation of a constant, where it is physics and no news of a sensor's zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,29 +97,45 @@ def diagnose_signal(
     Raises:
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
-    signal = _with_own_search(aligned(pair, others, settings or DiagnoseSettings()))
-    settings = signal.settings
-    lsb = lsb_of(pair, settings)
-    always: Chosen = tuple((common.offset(signal, k), np.zeros(1)) for k in range(signal.columns))
-    candidates = catalogue(signal)
-    if not signal.shares_epoch:
-        always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
-        candidates = [effect for effect in candidates if effect.name not in DELAYS]
-    columns = range(signal.columns)
-    log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
-    if (constants := torque_constants(log, candidates, always)) is not None:
+    signal, selection = _with_own_search(aligned(pair, others, settings or DiagnoseSettings())), None
+    now = _Prepared.of(signal, pair)
+    constants = torque_constants(now.log, now.candidates, now.always)
+    for _ in range(CONVERTED):
+        if constants is None:
+            break
         signal, pair = as_torques(signal, constants), replace(pair, real=constants * pair.real)
-        gains = [effect for effect in catalogue(signal) if effect.name == GAIN]
-        always = (*always, *((effect, np.ones(1)) for effect in gains))
-        candidates = [effect for effect in catalogue(signal) if effect.name != GAIN]
-        lsb = lsb_of(pair, settings)
+        now = _Prepared.of(signal, pair)
+        selection = _selected(now)
+        constants = gains_of(selection)
+    selection = selection or _selected(now)
+    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), now.lsb)
+    if (noise_std(rewhitened.whiten) < signal.settings.signal.better_noise * noise_std(now.log.whiten)).any():
+        now = now._replace(log=rewhitened)  # the effects' own high frequencies were taken for noise
+        selection = _selected(now)
+    return _summarized(now.log, now.candidates, selection, now.lsb, signal.settings)
+
+
+class _Prepared(NamedTuple):
+    """A signal to be searched: with the noise of nothing found, effects that may be, those that always are, and its digits."""
+
+    log: WhitenedLog
+    candidates: list[Effect]
+    always: Chosen
+    lsb: list[float]
+
+    @classmethod
+    def of(cls, signal: AlignedSignal, pair: SignalPair) -> _Prepared:
+        """A signal that was aligned from columns."""
+        columns, lsb, candidates = range(signal.columns), lsb_of(pair, signal.settings), catalogue(signal)
+        always: Chosen = tuple((common.offset(signal, k), np.zeros(1)) for k in columns)
+        if signal.constants:
+            always = (*always, *((effect, np.ones(1)) for effect in candidates if effect.name == GAIN))
+            candidates = [effect for effect in candidates if effect.name != GAIN]
+        if not signal.shares_epoch:
+            always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
+            candidates = [effect for effect in candidates if effect.name not in DELAYS]
         log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
-    selection = _selected(log, candidates, always)
-    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), lsb)
-    if (noise_std(rewhitened.whiten) < settings.signal.better_noise * noise_std(log.whiten)).any():
-        log = rewhitened  # the effects' own high frequencies were taken for noise
-        selection = _selected(log, candidates, always)
-    return _summarized(log, candidates, selection, lsb, settings)
+        return cls(log, candidates, always, lsb)
 
 
 def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
@@ -152,8 +165,9 @@ def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSet
     return replace(selection, selected=tuple(selected), fitted=fitted, whole=whole)
 
 
-def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Selection:
+def _selected(now: _Prepared) -> Selection:
     """Effects of the catalogue, channels that drive and terms of equations; a curve where none of them stands out."""
+    log, candidates, always = now.log, now.candidates, now.always
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
@@ -199,12 +213,12 @@ def _summarized(
     floor = level.copy()
     for k in range(pair.columns):
         if lsb[k] > settings.timestamps.least_digits * float(level[k]):
-            finding, rounded = _quantization(log, after, k, lsb[k])
+            finding, rounded = digits(log, after, k, lsb[k])
             after = rounded if finding.held_out.rms_after < finding.held_out.rms_before else after
             findings.append(finding)
             floor[k] = np.hypot(level[k], lsb[k] / np.sqrt(12.0))
-    offsets = dict(_offsets(pair, selection))
-    findings += [*_constants(pair, offsets, level), *constant_findings(log, selection, after, level)]
+    offsets = dict(offsets_of(pair, selection))
+    findings += [*constant_findings(pair, offsets, level), *torque_findings(log, selection, after, level)]
     if pair.band_hz is not None:
         floor = level = np.hypot(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
@@ -214,7 +228,7 @@ def _summarized(
     beyond = any(not left.white and left.rms > most * left.noise_floor for left in unexplained.values())
     gains = {f.signal: f.parameters["gain"].value for f in findings if f.effect == "actuator_gain"}
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
-    unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
+    unseen = [*small, *(_unseen(log, candidates, selection, settings) if pair.columns > 1 else ())]
     return SignalDiagnosis(
         located=tuple(place() if findings or beyond else ()),  # what nothing explains has a place
         findings=tuple(findings),
@@ -258,38 +272,3 @@ def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection
         if effect.key not in found:
             columns = f" of {', '.join(effect.sensors)}" if 0 < len(effect.sensors) < log.pair.columns else ""
             yield from (f"{name}{columns}" for name in unobservable([log], [effect], settings.search))
-
-
-def _offsets(pair: AlignedSignal, selection: Selection) -> Iterator[tuple[str, Estimate]]:
-    stds = selection.whole.stds()
-    for effect, theta in selection.whole.chosen:
-        if effect.name == "offset":
-            k = pair.names.index(effect.sensors[0]) if effect.sensors else 0
-            yield pair.names[k], Estimate(float(theta[0]), float(stds[effect.key][0]), pair.units[k])
-
-
-def _constants(pair: AlignedSignal, offsets: Mapping[str, Estimate], level: Float64[np.ndarray, " k"]) -> Iterator[Finding]:
-    """Finding of a constant where it is physics: hard iron, an encoder's zero, a range's offset."""
-    name, equation = CONSTANTS.get(pair.kind, ("", ""))
-    values, stds = (np.array([getattr(estimate, part) for estimate in offsets.values()]) for part in ("value", "std"))
-    if not name or not (np.abs(values) > CERTAIN * stds).any():
-        return
-    labels = [column.rpartition(".")[2] for column in pair.names] if pair.columns > 1 else [name.rpartition("_")[2]]
-    parameters = dict(zip(labels, offsets.values(), strict=True))
-    noise, size = float(np.sqrt((level**2).sum())), float(np.linalg.norm(values))
-    gain = HeldOut(float(np.hypot(size, noise)), noise, pair.units[0], 0.0)
-    yield Finding(name, pair.name, 1.0, 0.0, 0.0, parameters, equation, gain)
-
-
-def _quantization(
-    log: WhitenedLog, after: Float64[np.ndarray, "n k"], k: int, lsb: float
-) -> tuple[Finding, Float64[np.ndarray, "n k"]]:
-    """Finding of the digits, which no noise makes by chance, and the rounded expectation."""
-    name, real = list(log.pair.signals)[k], log.pair.real[:, k]
-    phase = float(np.median(np.mod(real + 0.5 * lsb, lsb))) - 0.5 * lsb
-    rounded = after.copy()
-    rounded[:, k] = np.rint((after[:, k] - phase) / lsb) * lsb + phase
-    gain = held_out_rms([log], [after], [rounded], name)
-    share = float(np.clip(1.0 - (gain.rms_after / max(gain.rms_before, 1e-300)) ** 2, 0.0, 1.0))
-    parameters = {"lsb": Estimate(lsb, EXACT * lsb, log.pair.unit_of(name))}
-    return Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", gain), rounded

@@ -64,6 +64,18 @@ def test_a_gripper_follows_from_no_motion_and_the_arm_does() -> None:
     assert following(own, every) == [0, 1, 2]
 
 
+def test_a_joint_about_an_upright_axis_feels_no_rounding_of_its_angle() -> None:
+    """Gravity about it is zero but for rounding errors, which are no column to fit with."""
+    own, arm = motion(5), SpatialChain(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]))
+    upper = arm.of_link(np.array([0.4, 0.0, 0.0]), 1)
+    tip = upper + arm.of_link(np.array([0.3, 0.0, 0.02]))
+    S, A = 2.0 * np.outer(upper, upper) + np.outer(tip, tip), 2.0 * upper + tip
+    found = identified(own, arm.efforts(arm.moved(own), S, A))
+    assert found is not None
+    turned = found({**own, "q0": own["q0"] + 1e-6}) - found(own)
+    assert np.abs(turned).max() < 1e-7
+
+
 def test_any_other_arm_is_the_sum_of_its_factors() -> None:
     """Two hinges across each other: a centrifugal term and a pendulum."""
     own, other = motion(3, 2), motion(4, 2)

@@ -1,7 +1,8 @@
-"""Torque constants where efforts are motor currents: a gain of each joint in every fit.
+"""Constants of a signal in every fit: its zero, its digits, torque constants of currents.
 
-Currents differ from torques by a large factor of their own at each joint. Beside such a misfit all else is small, so that the
-factors have to be known before effects are searched for. A heavy load makes efforts larger as well: the two are compared.
+Where efforts are motor currents, each joint has a gain. Currents differ from torques by a large factor of their own at each
+joint. Beside such a misfit all else is small, so that the factors have to be known before effects are searched for. A heavy
+load makes efforts larger as well: the two are compared.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.significance import bic, scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import held_out_rms
-from imutool.diagnosis.result import Estimate, Finding
+from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.diagnosis.signals.noise import LEARNT_ERROR
 from imutool.sensor.effect import Effect
@@ -26,8 +27,18 @@ from imutool.sensor.robot_effects.joint_dynamics import own_columns
 
 FAR_GAIN = 2.0  # of an actuator: no motor loses or gains as much, so that its effort is in another unit
 CERTAIN = 6.0  # deviations from which a constant is a finding
+EXACT = 1e-3  # of an LSB, that its estimate may be off
 GAIN, LOAD = "actuator_gain", "payload"
 Constants = Float64[np.ndarray, " k"]
+CONSTANTS = {
+    "magnetic": ("hard_iron", "field += hard iron"),
+    "range": ("offset", "y += offset"),
+    "positions": ("encoder_offset", "the angle read = angle + offset"),
+}
+"""Name and equation of a constant, where it is physics and no news of a sensor's zero."""
+
+
+# ── torque constants ──
 
 
 def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Constants | None:
@@ -61,10 +72,11 @@ def as_torques(signal: AlignedSignal, constants: Constants) -> AlignedSignal:
         t_s, values = channels[name]
         channels[name] = t_s, constant * values
     ideal = replace(signal.ideal, channels=channels)
-    return replace(signal, real=constants * signal.real, ideal=ideal, constants=tuple(constants.tolist()))
+    so_far = constants * np.array(signal.constants or 1.0)
+    return replace(signal, real=constants * signal.real, ideal=ideal, constants=tuple(so_far.tolist()))
 
 
-def constant_findings(
+def torque_findings(
     log: WhitenedLog, selection: Selection, after: Float64[np.ndarray, "n k"], level: Float64[np.ndarray, " k"]
 ) -> Iterator[Finding]:
     """Gain of each joint whose efforts were converted, but for those that are 1."""
@@ -99,3 +111,49 @@ def _at_first_sight(signal: AlignedSignal) -> dict[str, float]:
         share = float(np.linalg.lstsq(columns / length, signal.real[rows, k], rcond=None)[0][0] / length[0])
         out[name] = 1.0 / share if share else 1.0
     return out
+
+
+def gains_of(selection: Selection) -> Constants:
+    """Gains of all joints as fitted."""
+    return np.array([float(theta[0]) for effect, theta in selection.whole.chosen if effect.name == GAIN])
+
+
+# ── zeros and digits ──
+
+
+def offsets_of(pair: AlignedSignal, selection: Selection) -> Iterator[tuple[str, Estimate]]:
+    """Constant of each column, by its name."""
+    stds = selection.whole.stds()
+    for effect, theta in selection.whole.chosen:
+        if effect.name == "offset":
+            k = pair.names.index(effect.sensors[0]) if effect.sensors else 0
+            yield pair.names[k], Estimate(float(theta[0]), float(stds[effect.key][0]), pair.units[k])
+
+
+def constant_findings(
+    pair: AlignedSignal, offsets: Mapping[str, Estimate], level: Float64[np.ndarray, " k"]
+) -> Iterator[Finding]:
+    """Finding of a constant where it is physics: hard iron, an encoder's zero, a range's offset."""
+    name, equation = CONSTANTS.get(pair.kind, ("", ""))
+    values, stds = (np.array([getattr(estimate, part) for estimate in offsets.values()]) for part in ("value", "std"))
+    if not name or not (np.abs(values) > CERTAIN * stds).any():
+        return
+    labels = [column.rpartition(".")[2] for column in pair.names] if pair.columns > 1 else [name.rpartition("_")[2]]
+    parameters = dict(zip(labels, offsets.values(), strict=True))
+    noise, size = float(np.sqrt((level**2).sum())), float(np.linalg.norm(values))
+    gain = HeldOut(float(np.hypot(size, noise)), noise, pair.units[0], 0.0)
+    yield Finding(name, pair.name, 1.0, 0.0, 0.0, parameters, equation, gain)
+
+
+def digits(
+    log: WhitenedLog, after: Float64[np.ndarray, "n k"], k: int, lsb: float
+) -> tuple[Finding, Float64[np.ndarray, "n k"]]:
+    """Finding of the digits, which no noise makes by chance, and the rounded expectation."""
+    name, real = list(log.pair.signals)[k], log.pair.real[:, k]
+    phase = float(np.median(np.mod(real + 0.5 * lsb, lsb))) - 0.5 * lsb
+    rounded = after.copy()
+    rounded[:, k] = np.rint((after[:, k] - phase) / lsb) * lsb + phase
+    gain = held_out_rms([log], [after], [rounded], name)
+    share = float(np.clip(1.0 - (gain.rms_after / max(gain.rms_before, 1e-300)) ** 2, 0.0, 1.0))
+    parameters = {"lsb": Estimate(lsb, EXACT * lsb, log.pair.unit_of(name))}
+    return Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", gain), rounded
