@@ -2,7 +2,7 @@
 
 Where efforts are motor currents, each joint has a gain. Currents differ from torques by a large factor of their own at each
 joint. Beside such a misfit all else is small, so that the factors have to be known before effects are searched for. A heavy
-load makes efforts larger as well: the two are compared.
+load makes efforts larger as well, and so does a controller that asks for what a limit keeps back: all three are compared.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ from imutool.sensor.robot_effects.joint_dynamics import own_columns
 
 FAR_GAIN = 2.0  # of an actuator: no motor loses or gains as much, so that its effort is in another unit
 CERTAIN = 6.0  # deviations from which a constant is a finding
+REWEIGHTED, SMALL_LEFT = 20, 0.01  # times that a regression is, and the least residual that it weighs by, over their mean
 EXACT = 1e-3  # of an LSB, that its estimate may be off
-GAIN, LOAD = "actuator_gain", "payload"
+GAIN, LOAD, LIMIT = "actuator_gain", "payload", "torque_saturation"
 Constants = Float64[np.ndarray, " k"]
 CONSTANTS = {
     "magnetic": ("hard_iron", "field += hard iron"),
@@ -48,10 +49,14 @@ def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Cho
     if not gains or not _far(first := _at_first_sight(signal)):
         return None
     currents = (*always, *((effect, np.array([one])) for effect, one in zip(gains, first.values(), strict=True)))
-    torques = (*always, *((effect, np.ones(1)) for effect in gains))
+    torques, limited = (*always, *((effect, np.ones(1)) for effect in gains)), fit([log], always)
+    far = _far(first).keys()
+    for limit in (effect for effect in candidates if effect.name == LIMIT and far & {*(effect.sensors or signal.names)}):
+        limited = min((fit([log], (*limited.chosen, (limit, start))) for start in signal.starts(limit)), key=bic)
     loads = [(load, start) for load in candidates if load.name == LOAD for start in signal.starts(load)]
-    beside = (currents, torques) if signal.columns > 1 else (always,)  # of one joint, a load is a gain and a rotor
-    trials = [fit([log], currents), *(fit([log], (*base, load)) for base in beside for load in loads)]
+    one = signal.columns == 1  # whose load is a gain and a rotor
+    beside = (limited.chosen,) if one else (currents, torques, limited.chosen)
+    trials = [fit([log], currents), limited, *(fit([log], (*base, load)) for base in beside for load in loads)]
     best = {effect.key: float(theta[0]) for effect, theta in min(trials, key=bic).chosen}
     constants = {name: best.get(effect.key, 1.0) for name, effect in zip(first, gains, strict=True)}
     return np.array(list(constants.values())) if _far(constants) else None
@@ -102,14 +107,21 @@ def _far(gains: Mapping[str, float]) -> dict[str, float]:
 
 
 def _at_first_sight(signal: AlignedSignal) -> dict[str, float]:
-    """Gains by regression of recorded efforts on expected ones, with friction, a rotor and a constant of each joint."""
+    """Gains by regression of recorded efforts on expected ones, with friction, a rotor and a constant of each joint.
+
+    By least absolute deviations: a unit is that of all samples, while commands beyond a limit are of some alone.
+    """
     rows, sampled, out = signal.usable[:, 0], signal.sampled, dict[str, float]()
     own = own_columns(sampled.state, signal.columns)[rows]
-    for k, (name, needed) in enumerate(zip(signal.names, sampled.x[rows].T, strict=True)):
+    for k, (name, needed, efforts) in enumerate(zip(signal.names, sampled.x[rows].T, signal.real[rows].T, strict=True)):
         columns = np.column_stack([needed, own[:, k, 4 * k : 4 * k + 4]])
-        length = np.linalg.norm(columns, axis=0)
-        share = float(np.linalg.lstsq(columns / length, signal.real[rows, k], rcond=None)[0][0] / length[0])
-        out[name] = 1.0 / share if share else 1.0
+        columns, length = columns / np.linalg.norm(columns, axis=0), float(np.linalg.norm(needed))
+        weight = np.ones(len(efforts))
+        for _ in range(REWEIGHTED):
+            shares = np.linalg.lstsq(columns * weight[:, None], efforts * weight, rcond=None)[0]
+            left = np.abs(efforts - columns @ shares)
+            weight = 1.0 / np.sqrt(np.maximum(left, SMALL_LEFT * float(left.mean()) + 1e-300))
+        out[name] = length / float(shares[0]) if shares[0] else 1.0
     return out
 
 

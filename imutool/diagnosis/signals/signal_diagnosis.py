@@ -49,6 +49,7 @@ from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
 from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction, joint_transmission, wheel, world_sensors
+from imutool.sensor.robot_effects.joint_actuator_and_load import with_extent
 
 CONVERTED = 2  # times that currents are made torques: a limit or dead band in amperes shows once all else is known
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
@@ -147,12 +148,13 @@ def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
     return replace(signal, settings=msgspec.structs.replace(signal.settings, search=search))
 
 
-def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
-    """Selection with friction fitted where its joint slides, if any joint has some."""
-    if all(joint_friction.with_stiction(effect) is effect for effect, _ in selection.whole.chosen):
+def _refined(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
+    """Selection with friction fitted where its joint slides, and a payload with its own inertia, if there are some."""
+    finer = {effect.key: with_extent(joint_friction.with_stiction(effect)) for effect, _ in selection.whole.chosen}
+    if all(finer[effect.key] is effect for effect, _ in selection.whole.chosen):
         return selection
     chosen = [
-        tuple((joint_friction.with_stiction(effect), theta) for effect, theta in one.chosen)
+        tuple((of := finer[effect.key], np.append(theta, of.null_value[len(theta) :])) for effect, theta in one.chosen)
         for one in (selection.fitted, selection.whole)
     ]
     fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")
@@ -171,17 +173,17 @@ def _selected(now: _Prepared) -> Selection:
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
-    named = _with_stiction(log, select_effects([log], candidates, [driven], always=always), signal.settings)
+    named = _refined(log, select_effects([log], candidates, [driven], always=always), signal.settings)
     left, largest = named.whole.objective - named.whole.numbers, max((one.gain for one in named.selected), default=0.0)
     settings = signal.settings.search
     if named.whole.reduced_chi_square < settings.explained_chi_square or left < settings.negligible_share * largest:
         return named  # a term may fit as well as a name, and says less
     equations = [effect for k in columns for effect in terms(signal, k)]
-    selection = _with_stiction(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
+    selection = _refined(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
     if selection.whole.reduced_chi_square < settings.explained_chi_square:
         return selection
     curves = [effect for k in columns for effect in common.unknown(signal, k)]
-    curved = _with_stiction(log, select_effects([log], candidates, [driven, curves], always=always), signal.settings)
+    curved = _refined(log, select_effects([log], candidates, [driven, curves], always=always), signal.settings)
     before = fit([log], always, part="all").objective
     gain = selection.whole.objective - curved.whole.objective
     return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection

@@ -1,6 +1,6 @@
 """Actuator and load of a joint: delay, gain, dead band, limit; payload, rotor.
 
-A mass m about (x, y) of the last link, of inertia I about its own centre, adds m |P|², m conj(P_i) P_j and m P_i to the
+A mass m at (x, y) of the last link, of inertia I about its own centre, adds m |P|², m conj(P_i) P_j and m P_i to the
 coefficients of the chain (`joint_dynamics`), and I to that of its link; a rotor behind a gear adds J (rad/s²) to its own joint
 (Spong, Hutchinson, Vidyasagar, Robot Modeling and Control, eq. 7.41).
 
@@ -27,7 +27,8 @@ OFFSET_M = 0.1  # of two axes of a wrist
 UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
-BEYOND = (0.003, 0.01, 0.03, 0.1, 0.3)  # of the commands, that a limit to start from cuts
+LIMITS = (0.5, 1.0, 1.5, 2.0)  # to start from, likewise
+BEYOND = (0.003, 0.01, 0.03, 0.1)  # of the commands, that another limit to start from cuts
 EXTENT = "; inertia: about its own centre, alike about all axes"
 OFFSETS = "; offsets: lengths before it, which the simulated arm's own weight does not show"
 AXES = {2: "whose axes are level and up", 3: "whose third axis is up"}
@@ -52,6 +53,17 @@ class _Rotor:
         return s.with_added(self.joint, theta[0] * s.state[f"ddq{self.joint}"])
 
 
+def with_extent(effect: Effect) -> Effect:
+    """A payload with an inertia about its own centre; any other effect as it is.
+
+    One joint does not tell it from a rotor's. Beside what is not found yet, it takes what is no load's: it is fitted last.
+    """
+    if not isinstance(effect.forward, _Payload) or effect.forward.dynamics.joints == 1:
+        return effect
+    inertia = Parameter("inertia", "kg m²", PLAUSIBLE_KG * SPREAD_M**2)
+    return replace(effect, parameters=(*effect.parameters, inertia), equation=f"{effect.equation}{EXTENT}")
+
+
 def load_effects(scale: Scale) -> Iterator[Effect]:
     """Payload of a chain of hinges, and a rotor of each joint."""
     dynamics = scale.dynamics
@@ -59,14 +71,12 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
         arm, letters = reach or USUAL_ARM_M, "xy" if dynamics.spatial is None else "xyz"
         place = tuple(Parameter(letter, "m", max(arm, 0.1)) for letter in letters)
         offsets = tuple(Parameter(f"offset_{k + 1}", "m", OFFSET_M) for k in range(dynamics.offsets))
-        extent = (Parameter("inertia", "kg m²", PLAUSIBLE_KG * SPREAD_M**2),) if dynamics.joints > 1 else ()  # else a rotor's
-        axes = np.eye(len(letters), len(letters) + len(extent) + len(offsets))
+        axes, more = np.eye(len(letters), len(letters) + len(offsets)), OFFSETS if offsets else ""
         yield scale.effect(
             "payload",
             scale.columns,
-            f"a mass about ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero"
-            f"{EXTENT if extent else ''}{OFFSETS if offsets else ''}",
-            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place, *extent, *offsets),
+            f"a mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero{more}",
+            (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place, *offsets),
             _Payload(dynamics),
             "the arm moves against gravity, and fast enough for its inertia to show",
             starts=[np.array([0.3, *(arm * at)]) for axis in axes for at in (axis, -axis)],
@@ -154,9 +164,10 @@ def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
         _Kept(k, scale.names[k], limits=True),
         "the effort goes beyond the limit",
     )
-    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k])))
+    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k], size)))
 
 
-def _limits(commands: Samples) -> list[Theta]:
-    """Limits to start from: a motion may go beyond its own for a moment only."""
-    return [np.array([limit]) for limit in np.quantile(np.abs(commands), 1.0 - np.array(BEYOND))]
+def _limits(commands: Samples, size: float) -> list[Theta]:
+    """Limits to start from: a controller asks now for much more than acts, and now goes beyond a limit for a moment only."""
+    moments = np.quantile(np.abs(commands), 1.0 - np.array(BEYOND))
+    return [np.array([limit]) for limit in (*(share * size for share in LIMITS), *moments)]

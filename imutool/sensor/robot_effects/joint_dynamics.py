@@ -67,9 +67,9 @@ class Dynamics:
         return np.asarray(efforts[:, np.argsort(self.order)])
 
     def loaded(self, state: State) -> Callable[[Theta], Columns]:
-        """Efforts that a mass on the last link adds, by its mass, place and own inertia.
+        """Efforts that a mass on the last link adds, by its mass and place, the `offsets` of the joints before.
 
-        Behind them come the `offsets` of the joints before. One joint tells no such inertia from its rotor's: it has none.
+        Last comes its inertia about its own centre; a point has none.
         """
         in_order, sorted_ = _in_order(state, self.order), np.argsort(self.order)
         if self.spatial is None:
@@ -83,8 +83,9 @@ class Dynamics:
         spread = 0.5 * about @ about.T  # an inertia alike about all axes is that of half of it along each
 
         def added(theta: Theta) -> Columns:
-            at = origin + chain.of_link(theta[1:4]) + unknown @ theta[5:]
-            return chain.efforts(moved, theta[0] * np.outer(at, at) + theta[4] * spread, theta[0] * at)[:, sorted_]
+            offsets, inertia = np.split(theta[4:], [unknown.shape[1]])
+            at = origin + chain.of_link(theta[1:4]) + unknown @ offsets
+            return chain.efforts(moved, theta[0] * np.outer(at, at) + inertia.sum() * spread, theta[0] * at)[:, sorted_]
 
         return added
 
