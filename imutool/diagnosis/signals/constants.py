@@ -21,7 +21,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import held_out_rms
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
-from imutool.diagnosis.signals.noise import LEARNT_ERROR
+from imutool.diagnosis.signals.noise import LEARNT_ERROR, learnt_errors
 from imutool.sensor.effect import Effect
 from imutool.sensor.robot_effects.joint_dynamics import own_columns
 
@@ -89,11 +89,12 @@ def torque_findings(
     if not signal.constants:
         return
     stds = scatter([log], selection.whole, "all", signal.settings.search.robust_block_s).std
+    errors = learnt_errors(log, selection.whole)
     gains = [(effect, float(theta[0])) for effect, theta in selection.whole.chosen if effect.name == GAIN]
     before = after + signal.real - signal.real / np.array(signal.constants)  # what leaves the log's numbers, taken as torques
     for k, ((effect, factor), constant) in enumerate(zip(gains, signal.constants, strict=True)):
         gain, name = constant * factor, signal.names[k]
-        std = float(np.hypot(constant * stds[effect.key][0], LEARNT_ERROR * gain))
+        std = float(np.linalg.norm([constant * stds[effect.key][0], constant * errors[effect.key][0], LEARNT_ERROR * gain]))
         if abs(gain - 1.0) > CERTAIN * std:
             held_out = held_out_rms([log], [before], [after], name)
             share = 1.0 - (held_out.rms_after**2 - level[k] ** 2) / max(held_out.rms_before**2 - level[k] ** 2, 1e-300)

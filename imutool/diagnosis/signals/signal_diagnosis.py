@@ -10,6 +10,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
@@ -41,6 +42,7 @@ from imutool.diagnosis.signals.noise import (
     LEARNT_ERROR,
     SMALL_GAIN,
     above_model_error,
+    learnt_errors,
     lsb_of,
     rich_residual,
     whitened,
@@ -209,7 +211,9 @@ def _summarized(
     similar = selection.similar()
     findings = [_with_python(finding_of(logs, selection, selected, level, similar)) for selected in selection.selected]
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
-        findings = [_with_learnt_error(finding) for finding in findings]
+        errors = learnt_errors(log, selection.whole)
+        each = zip(findings, selection.selected, strict=True)
+        findings = [_with_learnt_error(finding, errors[selected.effect.key]) for finding, selected in each]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
     place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
@@ -256,11 +260,11 @@ def _with_python(finding: Finding) -> Finding:
     return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
 
 
-def _with_learnt_error(finding: Finding) -> Finding:
+def _with_learnt_error(finding: Finding, errors: Float64[np.ndarray, " _"]) -> Finding:
     """Finding with no parameter surer than the dynamics against which it was measured."""
     parameters = {
-        name: msgspec.structs.replace(one, std=float(np.hypot(one.std, LEARNT_ERROR * one.value)))
-        for name, one in finding.parameters.items()
+        name: msgspec.structs.replace(one, std=float(np.hypot(np.hypot(one.std, error), LEARNT_ERROR * one.value)))
+        for (name, one), error in zip(finding.parameters.items(), errors.tolist(), strict=True)
     }
     return msgspec.structs.replace(finding, parameters=parameters)
 

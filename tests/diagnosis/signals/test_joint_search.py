@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.diagnosis.signals import signal_diagnosis
 from imutool.diagnosis.signals.aligned_signal import aligned
 from imutool.diagnosis.signals.constants import as_torques
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.noise import SMALL_GAIN
+from imutool.diagnosis.signals.noise import LEARNT_ERROR, SMALL_GAIN, learnt_errors, whitened
 from imutool.diagnosis.signals.quantities import in_radians
 from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
 from imutool.mcap_io.fields import Fields
@@ -120,6 +121,17 @@ def test_currents_become_torques_in_steps_with_the_commands_that_a_limit_is_of()
     assert np.allclose(once.real, signal.real * (2.2, 2.7))
     for name, constant in zip(signal.names, once.constants, strict=True):
         assert np.allclose(once.ideal.channels[name][1], constant * signal.ideal.channels[name][1])
+
+
+def test_a_gain_is_as_unsure_as_the_dynamics_and_less_sure_beside_a_load() -> None:
+    signal = aligned(pair(), {}, DiagnoseSettings())
+    by_key = {effect.key: effect for effect in signal_diagnosis.catalogue(signal)}
+    gain, load = by_key["actuator_gain:/joints.effort[1]"], by_key["payload"]
+    log = whitened(signal, signal.real - signal.sampled.x, [0.0] * JOINTS)
+    alone = learnt_errors(log, fit([log], ((gain, np.ones(1)),)))[gain.key][0]
+    assert 0.5 * LEARNT_ERROR < alone < 1.5 * LEARNT_ERROR  # of two parts that move together
+    both = learnt_errors(log, fit([log], ((gain, np.ones(1)), (load, np.array([0.3, 0.3, 0.0])))))[gain.key][0]
+    assert both > alone
 
 
 def test_a_heavy_load_is_no_current() -> None:
