@@ -213,7 +213,7 @@ def _summarized(
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
         errors = learnt_errors(log, selection.whole)
         each = zip(findings, selection.selected, strict=True)
-        findings = [_with_learnt_error(finding, errors[selected.effect.key]) for finding, selected in each]
+        findings = [_with_learnt_error(finding, selected.effect, errors) for finding, selected in each]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
     place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
@@ -260,11 +260,12 @@ def _with_python(finding: Finding) -> Finding:
     return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
 
 
-def _with_learnt_error(finding: Finding, errors: Float64[np.ndarray, " _"]) -> Finding:
-    """Finding with no parameter surer than the dynamics against which it was measured."""
+def _with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Float64[np.ndarray, " _"]]) -> Finding:
+    """Finding with no parameter surer than the dynamics against which it was measured; a curve has none."""
+    by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
     parameters = {
-        name: msgspec.structs.replace(one, std=float(np.hypot(np.hypot(one.std, error), LEARNT_ERROR * one.value)))
-        for (name, one), error in zip(finding.parameters.items(), errors.tolist(), strict=True)
+        name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
+        for name, one in finding.parameters.items()
     }
     return msgspec.structs.replace(finding, parameters=parameters)
 

@@ -134,6 +134,14 @@ def test_a_gain_is_as_unsure_as_the_dynamics_and_less_sure_beside_a_load() -> No
     assert both > alone
 
 
+def test_a_shape_that_no_form_has_is_a_curve_without_parameters() -> None:
+    given = pair()
+    angle = given.state["q1"].values
+    steps = 1.5 * np.tanh((angle - 0.3) / 0.08) - 1.1 * np.tanh((angle + 0.5) / 0.05) + 0.9 * np.tanh((angle - 0.9) / 0.1)
+    findings = diagnose_signal(replace(given, real=given.real + np.stack([0.0 * steps, steps], axis=1)), {}).findings
+    assert any(finding.curve is not None and not finding.parameters for finding in findings)
+
+
 def test_a_heavy_load_is_no_current() -> None:
     """The load makes the efforts of the last joint three times as large."""
     given = pair(load=2.0)
