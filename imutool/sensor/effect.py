@@ -206,7 +206,8 @@ def residual(motion: IdealMotion, samples: SensorSamples) -> tuple[Float64[np.nd
 WITHIN_STAGE = {
     **{"declination": -4, "magnetometer_misalignment": -3, "soft_iron": -2},  # S R m_0 + h: the offset comes behind them
     **{"gain": -2, "dead_band": -1, "saturation": 1, "quantization": 2},
-    **{"actuator_gain": 1, "actuator_dead_band": 2, "torque_saturation": 2},  # between what the motion needs and the command
+    **{"coulomb_friction": 1, "stribeck_friction": 1},  # they hold what all else leaves of a command
+    **{"actuator_gain": 2, "actuator_dead_band": 3, "torque_saturation": 3},  # between what the motion needs and the command
 }
 Acting = Sequence[tuple[Effect, Theta]]
 

@@ -39,7 +39,7 @@ class AlignedSignal(AlignedLog):
     """Recorded columns with the ideal signal.
 
     `lag_s` is how much later the recording follows at first sight, `sim_density` the density of the simulation's own noise, by
-    column.
+    column. `constants` are the factors by which recorded currents were made torques.
     """
 
     ideal: IdealSignal
@@ -49,6 +49,7 @@ class AlignedSignal(AlignedLog):
     lag_s: float
     sim_density: Float64[np.ndarray, " k"]
     shares_epoch: bool
+    constants: tuple[float, ...] = ()
 
     exact, denoised = True, False
 

@@ -20,7 +20,6 @@ JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
 SPEEDS = ("twist.twist.linear.x", "twist.twist.angular.z")
 LEAST_MOVED = 1e-3  # rad or m: a joint that moves less shows nothing of its dynamics
 LEAST_EFFORTS = 0.5  # of the joints, that have efforts where efforts are compared
-FAR_GAIN = 2.0  # of an actuator: no motor loses or gains as much, so that its effort is in another unit
 DRIVES = 0.05  # of a vehicle's speed or turning, that a wheel makes
 
 
@@ -99,15 +98,6 @@ def _efforts(topic: str, moving: Sequence[str], mine: Mapping[str, Fields], othe
         states.append({name: known[path] for name, path in named.items() if path in known})
     efforts = tuple(f"effort{k}" for k in moving)
     return SignalPair.of_columns(topic, efforts, "efforts", (JOINT_UNITS["effort"],) * len(efforts), *sides, *states)
-
-
-def current_remark(gains: Mapping[str, float]) -> list[str]:
-    """Remark on efforts that are motor currents (A) in one log; `gains` by joint."""
-    far = {name: gain for name, gain in gains.items() if not 1.0 / FAR_GAIN < gain < FAR_GAIN}
-    if not far:
-        return []
-    each = ", ".join(f"{name}: {gain:.4g}" for name, gain in sorted(far.items()))
-    return [f"The simulated efforts are a multiple of the recorded ones, as if those were motor currents (N m/A): {each}"]
 
 
 def wheel_pair(

@@ -12,6 +12,7 @@ from scipy.signal import welch
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
+from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.noise_estimate import ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
@@ -128,7 +129,7 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
     kept, small = list[SelectedEffect](), list[SelectedEffect]()
     for selected, own in zip(selection.selected, sizes, strict=True):
         (kept if selected.gain >= least and (own >= enough).any() else small).append(selected)
-    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors)}" for selected in small]
+    names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors or pair.names)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names
 
 
@@ -146,3 +147,25 @@ def _sizes(log: WhitenedLog, selection: Selection, selected: SelectedEffect) -> 
     before, after = ([with_effects(log.pair, these)] for these in (without, chosen))
     gains = [held_out_rms([log], before, after, name) for name in log.pair.signals]
     return np.array([np.sqrt(max(gain.rms_before**2 - gain.rms_after**2, 0.0)) for gain in gains])
+
+
+def learnt_errors(log: WhitenedLog, found: Fit) -> dict[str, Float64[np.ndarray, " _"]]:
+    """Deviations of parameters, by effect, where the learnt dynamics are wrong by a share.
+
+    Each joint has a share of its own, for what it carries at rest and for what moves it. A small difference from an arm's own
+    efforts is less sure than that share.
+    """
+    pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
+    assert pair.ideal.relation is not None
+    state, rows, squares = pair.sampled.state, log.rows("all"), np.zeros(len(found.prior))
+    at_rest = pair.ideal.relation({name: values * name.startswith("q") for name, values in state.items()})
+    for k in range(pair.columns):
+        where, A = found.jacobians.on_axis(0, k, rows)
+        for part in (at_rest[:, k], pair.sampled.x[:, k] - at_rest[:, k]):
+            white = log.whiten.rows([LEARNT_ERROR * part], np.array([k]))[0][rows]
+            squares += (found.covariance[:, where] @ (A @ white)) ** 2
+    out = dict[str, Float64[np.ndarray, " _"]]()
+    for effect, theta in found.chosen:
+        positive = np.array([parameter.positive for parameter in effect.parameters])  # fitted by their logarithm
+        out[effect.key] = np.sqrt(squares[found.place(effect.key)]) * np.where(positive, theta, 1.0)
+    return out

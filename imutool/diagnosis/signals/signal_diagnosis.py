@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -25,25 +26,36 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import scalar_effects as common
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.joints import current_remark
 from imutool.diagnosis.signals.noise import (
     LEARNT_ERROR,
     SMALL_GAIN,
     above_model_error,
+    learnt_errors,
     lsb_of,
     rich_residual,
     whitened,
+)
+from imutool.diagnosis.signals.signal_constants import (
+    GAIN,
+    as_torques,
+    constant_findings,
+    current_remark,
+    digits,
+    gains_of,
+    offsets_of,
+    torque_constants,
+    torque_findings,
 )
 from imutool.diagnosis.signals.sparsest_equation import python, terms
 from imutool.diagnosis.summarize import finding_of
 from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
 from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction, joint_transmission, wheel, world_sensors
+from imutool.sensor.robot_effects.joint_actuator_and_load import with_extent
 
-EXACT = 1e-3
+CONVERTED = 2  # times that currents are made torques: a limit or dead band in amperes shows once all else is known
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
-CERTAIN = 6.0  # deviations from which a constant is a finding
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signals ({:+.3f} s), so that a delay between them cannot be seen"
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
@@ -60,12 +72,6 @@ CATALOGUE = {
     "gnss": (world_sensors.gnss_effects,),
 }
 """Effects by the kind of a signal; a single column has those of any signal too."""
-CONSTANTS = {
-    "magnetic": ("hard_iron", "field += hard iron"),
-    "range": ("offset", "y += offset"),
-    "positions": ("encoder_offset", "the angle read = angle + offset"),
-}
-"""Name and equation of a constant, where it is physics and no news of a sensor's zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,22 +100,45 @@ def diagnose_signal(
     Raises:
         DataError: constant, too short, or not of one motion; the message says what to do.
     """
-    signal = _with_own_search(aligned(pair, others, settings or DiagnoseSettings()))
-    settings = signal.settings
-    lsb = lsb_of(pair, settings)
-    always: Chosen = tuple((common.offset(signal, k), np.zeros(1)) for k in range(signal.columns))
-    candidates = catalogue(signal)
-    if not signal.shares_epoch:
-        always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
-        candidates = [effect for effect in candidates if effect.name not in DELAYS]
-    columns = range(signal.columns)
-    log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
-    selection = _selected(log, candidates, always)
-    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), lsb)
-    if (noise_std(rewhitened.whiten) < settings.signal.better_noise * noise_std(log.whiten)).any():
-        log = rewhitened  # the effects' own high frequencies were taken for noise
-        selection = _selected(log, candidates, always)
-    return _summarized(log, candidates, selection, lsb, settings)
+    signal, selection = _with_own_search(aligned(pair, others, settings or DiagnoseSettings())), None
+    now = _Prepared.of(signal, pair)
+    constants = torque_constants(now.log, now.candidates, now.always)
+    for _ in range(CONVERTED):
+        if constants is None:
+            break
+        signal, pair = as_torques(signal, constants), replace(pair, real=constants * pair.real)
+        now = _Prepared.of(signal, pair)
+        selection = _selected(now)
+        constants = gains_of(selection)
+    selection = selection or _selected(now)
+    rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), now.lsb)
+    if (noise_std(rewhitened.whiten) < signal.settings.signal.better_noise * noise_std(now.log.whiten)).any():
+        now = now._replace(log=rewhitened)  # the effects' own high frequencies were taken for noise
+        selection = _selected(now)
+    return _summarized(now.log, now.candidates, selection, now.lsb, signal.settings)
+
+
+class _Prepared(NamedTuple):
+    """A signal to be searched: with the noise of nothing found, effects that may be, those that always are, and its digits."""
+
+    log: WhitenedLog
+    candidates: list[Effect]
+    always: Chosen
+    lsb: list[float]
+
+    @classmethod
+    def of(cls, signal: AlignedSignal, pair: SignalPair) -> _Prepared:
+        """A signal that was aligned from columns."""
+        columns, lsb, candidates = range(signal.columns), lsb_of(pair, signal.settings), catalogue(signal)
+        always: Chosen = tuple((common.offset(signal, k), np.zeros(1)) for k in columns)
+        if signal.constants:
+            always = (*always, *((effect, np.ones(1)) for effect in candidates if effect.name == GAIN))
+            candidates = [effect for effect in candidates if effect.name != GAIN]
+        if not signal.shares_epoch:
+            always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
+            candidates = [effect for effect in candidates if effect.name not in DELAYS]
+        log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
+        return cls(log, candidates, always, lsb)
 
 
 def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
@@ -121,12 +150,13 @@ def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
     return replace(signal, settings=msgspec.structs.replace(signal.settings, search=search))
 
 
-def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
-    """Selection with friction fitted where its joint slides, if any joint has some."""
-    if all(joint_friction.with_stiction(effect) is effect for effect, _ in selection.whole.chosen):
+def _refined(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
+    """Selection with friction fitted where its joint slides, and a payload with its own inertia, if there are some."""
+    finer = {effect.key: with_extent(joint_friction.with_stiction(effect)) for effect, _ in selection.whole.chosen}
+    if all(finer[effect.key] is effect for effect, _ in selection.whole.chosen):
         return selection
     chosen = [
-        tuple((joint_friction.with_stiction(effect), theta) for effect, theta in one.chosen)
+        tuple((of := finer[effect.key], np.append(theta, of.null_value[len(theta) :])) for effect, theta in one.chosen)
         for one in (selection.fitted, selection.whole)
     ]
     fitted, whole = fit([log], chosen[0]), fit([log], chosen[1], part="all")
@@ -139,22 +169,23 @@ def _with_stiction(log: WhitenedLog, selection: Selection, settings: DiagnoseSet
     return replace(selection, selected=tuple(selected), fitted=fitted, whole=whole)
 
 
-def _selected(log: WhitenedLog, candidates: Sequence[Effect], always: Chosen) -> Selection:
+def _selected(now: _Prepared) -> Selection:
     """Effects of the catalogue, channels that drive and terms of equations; a curve where none of them stands out."""
+    log, candidates, always = now.log, now.candidates, now.always
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
-    named = _with_stiction(log, select_effects([log], candidates, [driven], always=always), signal.settings)
+    named = _refined(log, select_effects([log], candidates, [driven], always=always), signal.settings)
     left, largest = named.whole.objective - named.whole.numbers, max((one.gain for one in named.selected), default=0.0)
     settings = signal.settings.search
     if named.whole.reduced_chi_square < settings.explained_chi_square or left < settings.negligible_share * largest:
         return named  # a term may fit as well as a name, and says less
     equations = [effect for k in columns for effect in terms(signal, k)]
-    selection = _with_stiction(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
+    selection = _refined(log, select_effects([log], candidates, [driven, equations], always=always), signal.settings)
     if selection.whole.reduced_chi_square < settings.explained_chi_square:
         return selection
     curves = [effect for k in columns for effect in common.unknown(signal, k)]
-    curved = _with_stiction(log, select_effects([log], candidates, [driven, curves], always=always), signal.settings)
+    curved = _refined(log, select_effects([log], candidates, [driven, curves], always=always), signal.settings)
     before = fit([log], always, part="all").objective
     gain = selection.whole.objective - curved.whole.objective
     return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection
@@ -180,18 +211,20 @@ def _summarized(
     similar = selection.similar()
     findings = [_with_python(finding_of(logs, selection, selected, level, similar)) for selected in selection.selected]
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
-        findings = [_with_learnt_error(finding) for finding in findings]
+        errors = learnt_errors(log, selection.whole)
+        each = zip(findings, selection.selected, strict=True)
+        findings = [_with_learnt_error(finding, selected.effect, errors) for finding, selected in each]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
     place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
     for k in range(pair.columns):
         if lsb[k] > settings.timestamps.least_digits * float(level[k]):
-            finding, rounded = _quantization(log, after, k, lsb[k])
+            finding, rounded = digits(log, after, k, lsb[k])
             after = rounded if finding.held_out.rms_after < finding.held_out.rms_before else after
             findings.append(finding)
             floor[k] = np.hypot(level[k], lsb[k] / np.sqrt(12.0))
-    offsets = dict(_offsets(pair, selection))
-    findings += _constants(pair, offsets, level)
+    offsets = dict(offsets_of(pair, selection))
+    findings += [*constant_findings(pair, offsets, level), *torque_findings(log, selection, after, level)]
     if pair.band_hz is not None:
         floor = level = np.hypot(
             level, MODEL_ERROR * np.array([held_out_rms(logs, [before], [before], n).rms_before for n in names])
@@ -201,7 +234,7 @@ def _summarized(
     beyond = any(not left.white and left.rms > most * left.noise_floor for left in unexplained.values())
     gains = {f.signal: f.parameters["gain"].value for f in findings if f.effect == "actuator_gain"}
     hidden = () if pair.shares_epoch else tuple(f"{name}.delay" for name in names)
-    unseen = [] if pair.columns == 1 else [*small, *_unseen(log, candidates, selection, settings)]
+    unseen = [*small, *(_unseen(log, candidates, selection, settings) if pair.columns > 1 else ())]
     return SignalDiagnosis(
         located=tuple(place() if findings or beyond else ()),  # what nothing explains has a place
         findings=tuple(findings),
@@ -227,10 +260,11 @@ def _with_python(finding: Finding) -> Finding:
     return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
 
 
-def _with_learnt_error(finding: Finding) -> Finding:
-    """Finding with no parameter surer than the dynamics against which it was measured."""
+def _with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Float64[np.ndarray, " _"]]) -> Finding:
+    """Finding with no parameter surer than the dynamics against which it was measured; a curve has none."""
+    by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
     parameters = {
-        name: msgspec.structs.replace(one, std=float(np.hypot(one.std, LEARNT_ERROR * one.value)))
+        name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
         for name, one in finding.parameters.items()
     }
     return msgspec.structs.replace(finding, parameters=parameters)
@@ -245,38 +279,3 @@ def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection
         if effect.key not in found:
             columns = f" of {', '.join(effect.sensors)}" if 0 < len(effect.sensors) < log.pair.columns else ""
             yield from (f"{name}{columns}" for name in unobservable([log], [effect], settings.search))
-
-
-def _offsets(pair: AlignedSignal, selection: Selection) -> Iterator[tuple[str, Estimate]]:
-    stds = selection.whole.stds()
-    for effect, theta in selection.whole.chosen:
-        if effect.name == "offset":
-            k = pair.names.index(effect.sensors[0]) if effect.sensors else 0
-            yield pair.names[k], Estimate(float(theta[0]), float(stds[effect.key][0]), pair.units[k])
-
-
-def _constants(pair: AlignedSignal, offsets: Mapping[str, Estimate], level: Float64[np.ndarray, " k"]) -> Iterator[Finding]:
-    """Finding of a constant where it is physics: hard iron, an encoder's zero, a range's offset."""
-    name, equation = CONSTANTS.get(pair.kind, ("", ""))
-    values, stds = (np.array([getattr(estimate, part) for estimate in offsets.values()]) for part in ("value", "std"))
-    if not name or not (np.abs(values) > CERTAIN * stds).any():
-        return
-    labels = [column.rpartition(".")[2] for column in pair.names] if pair.columns > 1 else [name.rpartition("_")[2]]
-    parameters = dict(zip(labels, offsets.values(), strict=True))
-    noise, size = float(np.sqrt((level**2).sum())), float(np.linalg.norm(values))
-    gain = HeldOut(float(np.hypot(size, noise)), noise, pair.units[0], 0.0)
-    yield Finding(name, pair.name, 1.0, 0.0, 0.0, parameters, equation, gain)
-
-
-def _quantization(
-    log: WhitenedLog, after: Float64[np.ndarray, "n k"], k: int, lsb: float
-) -> tuple[Finding, Float64[np.ndarray, "n k"]]:
-    """Finding of the digits, which no noise makes by chance, and the rounded expectation."""
-    name, real = list(log.pair.signals)[k], log.pair.real[:, k]
-    phase = float(np.median(np.mod(real + 0.5 * lsb, lsb))) - 0.5 * lsb
-    rounded = after.copy()
-    rounded[:, k] = np.rint((after[:, k] - phase) / lsb) * lsb + phase
-    gain = held_out_rms([log], [after], [rounded], name)
-    share = float(np.clip(1.0 - (gain.rms_after / max(gain.rms_before, 1e-300)) ** 2, 0.0, 1.0))
-    parameters = {"lsb": Estimate(lsb, EXACT * lsb, log.pair.unit_of(name))}
-    return Finding("quantization", name, share, 0.0, 0.0, parameters, "y = lsb round(x / lsb)", gain), rounded

@@ -1,8 +1,8 @@
 """Actuator and load of a joint: delay, gain, dead band, limit; payload, rotor.
 
-A point mass m at (x, y) of the last link adds m |P|², m conj(P_i) P_j and m P_i to the coefficients of the chain
-(`joint_dynamics`); a rotor behind a gear adds J (rad/s²) to its own joint (Spong, Hutchinson, Vidyasagar, Robot Modeling and
-Control, eq. 7.41).
+A mass m at (x, y) of the last link, of inertia I about its own centre, adds m |P|², m conj(P_i) P_j and m P_i to the
+coefficients of the chain (`joint_dynamics`), and I to that of its link; a rotor behind a gear adds J (rad/s²) to its own joint
+(Spong, Hutchinson, Vidyasagar, Robot Modeling and Control, eq. 7.41).
 
 The log holds the commanded effort u; what acts is u some time later, less and limited (Slotine and Li, Applied Nonlinear
 Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over the gain, plus what the actuator kept back.
@@ -11,7 +11,7 @@ Control, section 5.2). So u(t) = effort that the motion needs at t + delay, over
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,11 +22,14 @@ from imutool.sensor.robot_effects.signal_sizes import Scale
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
+SPREAD_M = 0.1  # of a payload about its centre
 OFFSET_M = 0.1  # of two axes of a wrist
 UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
-LIMITS = (0.5, 1.0, 1.5, 2.0)
+LIMITS = (0.5, 1.0, 1.5, 2.0)  # to start from, likewise
+BEYOND = (0.003, 0.01, 0.03, 0.1)  # of the commands, that another limit to start from cuts
+EXTENT = "; inertia: about its own centre, alike about all axes"
 OFFSETS = "; offsets: lengths before it, which the simulated arm's own weight does not show"
 AXES = {2: "whose axes are level and up", 3: "whose third axis is up"}
 
@@ -50,6 +53,17 @@ class _Rotor:
         return s.with_added(self.joint, theta[0] * s.state[f"ddq{self.joint}"])
 
 
+def with_extent(effect: Effect) -> Effect:
+    """A payload with an inertia about its own centre; any other effect as it is.
+
+    One joint does not tell it from a rotor's. Beside what is not found yet, it takes what is no load's: it is fitted last.
+    """
+    if not isinstance(effect.forward, _Payload) or effect.forward.dynamics.joints == 1:
+        return effect
+    inertia = Parameter("inertia", "kg m²", PLAUSIBLE_KG * SPREAD_M**2)
+    return replace(effect, parameters=(*effect.parameters, inertia), equation=f"{effect.equation}{EXTENT}")
+
+
 def load_effects(scale: Scale) -> Iterator[Effect]:
     """Payload of a chain of hinges, and a rotor of each joint."""
     dynamics = scale.dynamics
@@ -61,7 +75,7 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
         yield scale.effect(
             "payload",
             scale.columns,
-            f"a point mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero{more}",
+            f"a mass at ({', '.join(letters)}) of the last link, {AXES[len(letters)]} where all angles are zero{more}",
             (Parameter("mass", "kg", PLAUSIBLE_KG, positive=True, step=0.01), *place, *offsets),
             _Payload(dynamics),
             "the arm moves against gravity, and fast enough for its inertia to show",
@@ -133,16 +147,27 @@ def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
         "the effort varies",
         starts=[np.ones(1)],
     )
-    for name, limits, shares, text in (
-        ("actuator_dead_band", False, WIDTHS, "a command within +-width does nothing, and beyond it loses as much"),
-        ("torque_saturation", True, LIMITS, "a command beyond +-limit acts as the limit"),
-    ):
-        yield scale.effect(
-            name,
-            (k,),
-            text,
-            (Parameter("limit" if limits else "width", unit, size, positive=True, step=0.01),),
-            _Kept(k, scale.names[k], limits),
-            "the effort goes beyond the limit" if limits else "the effort goes through zero",
-            starts=[np.array([share * size]) for share in shares],
-        )
+    dead_band = scale.effect(
+        "actuator_dead_band",
+        (k,),
+        "a command within +-width does nothing, and beyond it loses as much",
+        (Parameter("width", unit, size, positive=True, step=0.01),),
+        _Kept(k, scale.names[k], limits=False),
+        "the effort goes through zero",
+        starts=[np.array([share * size]) for share in WIDTHS],
+    )
+    limit = scale.effect(
+        "torque_saturation",
+        (k,),
+        "a command beyond +-limit acts as the limit",
+        (Parameter("limit", unit, size, positive=True, step=0.01),),
+        _Kept(k, scale.names[k], limits=True),
+        "the effort goes beyond the limit",
+    )
+    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k], size)))
+
+
+def _limits(commands: Samples, size: float) -> list[Theta]:
+    """Limits to start from: a controller asks now for much more than acts, and now goes beyond a limit for a moment only."""
+    moments = np.quantile(np.abs(commands), 1.0 - np.array(BEYOND))
+    return [np.array([limit]) for limit in (*(share * size for share in LIMITS), *moments)]

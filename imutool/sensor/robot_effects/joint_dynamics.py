@@ -23,6 +23,7 @@ from imutool.sensor.robot_effects.spatial_chain import Axes, SpatialChain, searc
 MOST_JOINTS = 7
 MOST_COMBINED = 3  # joints up to which all sums of angles are tried
 RIDGE = 1e-9
+ROUNDED = 1e-6  # of the longest column: one that ought to be zero, as gravity about an upright axis, holds rounding errors
 SCREENED = 1000  # samples that refute a wrong set of signs
 SEARCHED = 250  # samples that tell axes apart
 MOST_OFFSETS = 3  # lengths of an arm that a payload alone may show
@@ -66,17 +67,25 @@ class Dynamics:
         return np.asarray(efforts[:, np.argsort(self.order)])
 
     def loaded(self, state: State) -> Callable[[Theta], Columns]:
-        """Efforts that a point mass on the last link adds, by its mass and place, and the `offsets` of the joints before."""
+        """Efforts that a mass on the last link adds, by its mass and place, the `offsets` of the joints before.
+
+        Last comes its inertia about its own centre; a point has none.
+        """
         in_order, sorted_ = _in_order(state, self.order), np.argsort(self.order)
         if self.spatial is None:
             columns, links = chain_columns(in_order, self.signs)[:, sorted_], self.links
-            return lambda theta: columns @ mass_coefficients(theta[0], [*links, complex(theta[1], theta[2])])
+            return lambda theta: (
+                columns @ mass_coefficients(theta[0], [*links, complex(theta[1], theta[2])], float(theta[3:].sum()))
+            )
         chain, moved = self.spatial, self.spatial.moved(in_order)
         origin, unknown = chain.origin(self.coefficients[0])
+        about = np.stack([chain.of_link(axis) for axis in np.eye(3)], axis=1)
+        spread = 0.5 * about @ about.T  # an inertia alike about all axes is that of half of it along each
 
         def added(theta: Theta) -> Columns:
-            at = origin + chain.of_link(theta[1:4]) + unknown @ theta[4:]
-            return chain.efforts(moved, theta[0] * np.outer(at, at), theta[0] * at)[:, sorted_]
+            offsets, inertia = np.split(theta[4:], [unknown.shape[1]])
+            at = origin + chain.of_link(theta[1:4]) + unknown @ offsets
+            return chain.efforts(moved, theta[0] * np.outer(at, at) + inertia.sum() * spread, theta[0] * at)[:, sorted_]
 
         return added
 
@@ -275,7 +284,8 @@ def _solved_each(
     A: Float64[np.ndarray, "m p"], b: Float64[np.ndarray, "m k"], kept: Sequence[Int64[np.ndarray, " q"]]
 ) -> Float64[np.ndarray, "k q"]:
     """Least squares of each right side on some of the columns."""
-    length = np.maximum(np.linalg.norm(A, axis=0), 1e-12)
+    length = np.linalg.norm(A, axis=0)
+    length = np.maximum(length, max(ROUNDED * float(length.max()), 1e-300))
     gram, sides = A.T @ A / np.outer(length, length), A.T @ b / length[:, None]
     ridge = RIDGE * np.eye(len(kept[0]))
     solved = [np.linalg.solve(gram[np.ix_(k, k)] + ridge, side[k]) / length[k] for k, side in zip(kept, sides.T, strict=True)]

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import binary_opening
 
-from imutool.array_types import Float64
 from imutool.sensor.effect import Effect, Parameter, Theta
 from imutool.sensor.robot_effects.signal_samples import SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale
@@ -30,33 +29,33 @@ class _Friction:
     steep: float
     kind: str
     slowest: float
-    command: str = ""
+    command: str
+    holds: bool = False
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         if self.kind == "viscous":
             return s.with_added(self.joint, theta[0] * s.state[f"dq{self.joint}"])
         velocity = s.state[f"v{self.joint}"]
-        sign = np.clip(velocity / self.steep, -1.0, 1.0)
-        force = theta[0] * sign * (self._near_rest(velocity, theta) if len(theta) > 1 else 1.0)
-        if self.command:
+        force = theta[0] * np.clip(velocity / self.steep, -1.0, 1.0)
+        if len(theta) > 1:
+            force = force * np.exp(-((velocity / min(theta[1], self.slowest)) ** 2))
+        if self.holds:
             rests = binary_opening(np.abs(velocity) < AT_REST * self.steep, np.ones(LEAST_REST, bool))
             held = np.clip(s.channel(self.command) - s.y[:, self.joint], -np.abs(theta[0]), np.abs(theta[0]))
             force = np.where(rests, held, force)
         return s.with_added(self.joint, force)
 
-    def _near_rest(self, velocity: Float64[np.ndarray, " n"], theta: Theta) -> Float64[np.ndarray, " n"]:
-        return np.asarray(np.exp(-((velocity / min(theta[1], self.slowest)) ** 2)))
-
 
 def with_stiction(effect: Effect) -> Effect:
-    """Coulomb friction that holds a joint at rest; any other effect as it is.
+    """Dry friction that holds a joint at rest; any other effect as it is.
 
-    At rest the force is what the command leaves over, up to the level (eq. 3 of the survey): sliding alone shows the level. It
-    follows the recording there, and can therefore not be searched for.
+    At rest the force is what the command leaves over, up to Coulomb's and Stribeck's level together (eq. 3 of the survey):
+    sliding alone shows the levels. It follows the recording there, and can therefore not be searched for.
     """
-    if effect.name != "coulomb_friction" or not isinstance(effect.forward, _Friction):
+    forward = effect.forward
+    if not isinstance(forward, _Friction) or forward.kind == "viscous":
         return effect
-    return replace(effect, forward=replace(effect.forward, command=effect.sensors[0]), linear=False)
+    return replace(effect, forward=replace(forward, holds=True), linear=False)
 
 
 def friction_effects(scale: Scale) -> Iterator[Effect]:
@@ -70,7 +69,7 @@ def friction_effects(scale: Scale) -> Iterator[Effect]:
             (k,),
             "effort += level sign(velocity)",
             (level,),
-            _Friction(k, steep, "coulomb", slowest),
+            _Friction(k, steep, "coulomb", slowest, scale.names[k]),
             "the joint turns both ways",
         )
         yield scale.effect(
@@ -78,7 +77,7 @@ def friction_effects(scale: Scale) -> Iterator[Effect]:
             (k,),
             "effort += coefficient velocity",
             (Parameter("coefficient", f"{unit} s/rad".strip(), size / speed),),
-            _Friction(k, steep, "viscous", slowest),
+            _Friction(k, steep, "viscous", slowest, scale.names[k]),
             "the velocity varies",
         )
         yield scale.effect(
@@ -86,7 +85,7 @@ def friction_effects(scale: Scale) -> Iterator[Effect]:
             (k,),
             "effort += level exp(-(velocity / slow)^2) sign(velocity)",
             (level, Parameter("slow", "rad/s", speed, positive=True, step=0.02, least=4.0 * steep)),
-            _Friction(k, steep, "stribeck", slowest),
+            _Friction(k, steep, "stribeck", slowest, scale.names[k]),
             "the joint turns slowly and fast, both ways",
             starts=[np.array([0.1 * size, share * speed]) for share in STRIBECK],
         )

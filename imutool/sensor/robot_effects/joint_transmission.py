@@ -18,11 +18,12 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale
 
-MOST_TEETH, LEAST_TURNS = 120.0, 3.0  # ripples a turn that are tried, and how many of them the motion has to show
+MOST_TEETH, LEAST_TURNS = 120.0, 1.5  # ripples a turn that are tried, and how many of them the motion has to show
 STARTS = 2
 BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
 MOST_BINS, FINER = 2**19, 7  # some 500 turns; so much closer than they are told apart are ripples tried
 PLAUSIBLE_RAD = 0.05
+ROUNDS = 4  # to an angle from its reading: each leaves as much of the error as the disc is off its centre, of 0.1 rad 1e-5
 GAPS = (0.3, 1.0, 1.5)  # of a joint's play to start from, over twice the deviation of the misfit
 
 
@@ -71,8 +72,12 @@ class _Angle:
         q, dq, ddq = (ideal.state[f"{kind}{self.joint}"] for kind in ("q", "dq", "ddq"))
         if not self.eccentric:
             return ideal.with_state(**{f"q{self.joint}": q - theta[0]})
-        error, slope = theta[0] * np.sin(q) + theta[1] * np.cos(q), theta[0] * np.cos(q) - theta[1] * np.sin(q)
-        changed = {"q": q - error, "dq": dq * (1.0 - slope), "ddq": ddq * (1.0 - slope) + dq**2 * error}
+        angle = q  # that of the joint: where its disc reads q
+        for _ in range(ROUNDS):
+            angle = q - theta[0] * np.sin(angle) - theta[1] * np.cos(angle)
+        rate = 1.0 + theta[0] * np.cos(angle) - theta[1] * np.sin(angle)
+        bend = theta[0] * np.sin(angle) + theta[1] * np.cos(angle)
+        changed = {"q": angle, "dq": dq / rate, "ddq": (ddq + bend * (dq / rate) ** 2) / rate}
         return ideal.with_state(**{f"{kind}{self.joint}": values for kind, values in changed.items()})
 
 

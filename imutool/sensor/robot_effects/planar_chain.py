@@ -29,11 +29,12 @@ def unpacked(
     return theta[:n], H, A
 
 
-def mass_coefficients(mass: float, links: Sequence[complex]) -> Float64[np.ndarray, " _"]:
-    """Coefficients that a point mass adds at the end of some links."""
+def mass_coefficients(mass: float, links: Sequence[complex], inertia: float = 0.0) -> Float64[np.ndarray, " _"]:
+    """Coefficients that a mass adds at the end of some links, with its own inertia."""
     n = len(links)
     pairs = [mass * np.conj(links[i]) * links[j] for i in range(n) for j in range(i + 1, n)]
     out = [mass * abs(link) ** 2 for link in links]
+    out[-1] += inertia
     return np.array([*out, *(part for z in [*pairs, *(mass * link for link in links)] for part in (z.real, z.imag))])
 
 

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.diagnosis.signals import signal_diagnosis
 from imutool.diagnosis.signals.aligned_signal import aligned
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.noise import SMALL_GAIN
+from imutool.diagnosis.signals.noise import LEARNT_ERROR, SMALL_GAIN, learnt_errors, whitened
 from imutool.diagnosis.signals.quantities import in_radians
+from imutool.diagnosis.signals.signal_constants import as_torques
+from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
 from imutool.mcap_io.fields import Fields
 
 JOINTS, RATE_HZ, DURATION_S = 2, 100.0, 30.0
+SURE = 4.0  # standard deviations within which a planted value lies
 LENGTH, MASSES, G, DAMPING = 0.4, (2.0, 1.0), 9.81, 0.3
 
 
-def efforts(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+def efforts(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray, load: float = 0.0) -> np.ndarray:
     """Two links in a vertical plane with their masses at the ends (Craig, Introduction to Robotics, eq. 6.58)."""
-    (m1, m2), c, s = MASSES, np.cos(q[1]), np.sin(q[1])
+    (m1, m2), c, s = (MASSES[0], MASSES[1] + load), np.cos(q[1]), np.sin(q[1])
     square, both = LENGTH**2, np.cos(q[0] + q[1])
     second = m2 * square * (ddq[0] * (1.0 + c) + ddq[1] + s * dq[0] ** 2) + m2 * LENGTH * G * both
     first = m2 * square * (ddq.sum(0) + c * (2.0 * ddq[0] + ddq[1]) - s * (dq[1] ** 2 + 2.0 * dq[0] * dq[1]))
@@ -29,13 +35,15 @@ def efforts(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
     return np.stack([first, second], axis=1) + DAMPING * dq.T
 
 
-def moved(seed: int, *, unit: float = 1.0, friction: float = 0.0) -> tuple[np.ndarray, dict[str, Fields], np.ndarray]:
+def moved(
+    seed: int, *, unit: float = 1.0, friction: float = 0.0, load: float = 0.0
+) -> tuple[np.ndarray, dict[str, Fields], np.ndarray]:
     """Stamps, state and efforts, with angles in radians over `unit`."""
     rng, t = np.random.default_rng(seed), np.arange(round(DURATION_S * RATE_HZ)) / RATE_HZ
     w, phase = 2.0 * np.pi * rng.uniform(0.05, 0.8, (JOINTS, 5)), rng.uniform(0.0, 6.0, (JOINTS, 5, 1))
     waves = (((w**n)[:, :, None] * np.sin(w[:, :, None] * t + phase + 0.5 * np.pi * n)).sum(1) / 4.0 for n in range(3))
     q, dq, ddq = waves
-    tau = efforts(q, dq, ddq) + friction * np.tanh(dq.T / 0.005)
+    tau = efforts(q, dq, ddq, load) + friction * np.tanh(dq.T / 0.005)
     dq = dq + 5e-4 * rng.normal(size=dq.shape)
     t_ns, state = np.round(1e18 + t * 1e9).astype(np.int64), dict[str, Fields]()
     for k in range(JOINTS):
@@ -43,10 +51,20 @@ def moved(seed: int, *, unit: float = 1.0, friction: float = 0.0) -> tuple[np.nd
     return t_ns, state, tau + 0.02 * rng.normal(size=tau.shape)
 
 
-def pair(units: tuple[float, float] = (1.0, 1.0), friction: float = 0.0) -> SignalPair:
-    (real_ns, state, real), (sim_ns, sim_state, sim) = moved(1, unit=units[0], friction=friction), moved(2, unit=units[1])
+def pair(units: tuple[float, float] = (1.0, 1.0), friction: float = 0.0, load: float = 0.0) -> SignalPair:
+    real_ns, state, real = moved(1, unit=units[0], friction=friction, load=load)
+    sim_ns, sim_state, sim = moved(2, unit=units[1])
     names = tuple(f"/joints.effort[{k}]" for k in range(JOINTS))
     return SignalPair("/joints", names, ("N m",) * JOINTS, real_ns, real, sim_ns, sim, "efforts", state, sim_state)
+
+
+def pendulum(seed: int, friction: float) -> tuple[np.ndarray, dict[str, Fields], np.ndarray]:
+    """The second joint alone, as if the first stood level."""
+    t_ns, state, _ = moved(seed)
+    q, dq = state["q1"].values, state["dq1"].values
+    ddq = np.gradient(dq, 1.0 / RATE_HZ)
+    tau = MASSES[1] * LENGTH**2 * ddq + MASSES[1] * LENGTH * G * np.cos(q) + friction * np.tanh(dq / 0.005)
+    return t_ns, {"q0": state["q1"], "dq0": state["dq1"]}, tau[:, None]
 
 
 def test_an_arm_is_searched_for_two_effects_a_joint_and_not_beyond_the_error_of_its_dynamics(
@@ -74,6 +92,73 @@ def test_an_arm_is_searched_for_two_effects_a_joint_and_not_beyond_the_error_of_
 def test_friction_may_be_more_than_all_that_the_simulation_needs() -> None:
     scale = aligned(pair(friction=20.0), {}, DiagnoseSettings()).scale()
     assert min(scale.size) > 10.0
+
+
+CONSTANTS = np.array([0.06, 4.0])  # N m/A
+
+
+def found(given: SignalPair) -> dict[tuple[str, str], dict[str, Estimate]]:
+    """Parameters by effect and column, or topic."""
+    return {(f.effect, f.signal.removeprefix("/joints.")): dict(f.parameters) for f in diagnose_signal(given, {}).findings}
+
+
+def test_efforts_in_amperes_get_a_gain_of_each_joint_and_leave_a_friction_its_name() -> None:
+    """The friction is a two hundredth of the misfit that the amperes make."""
+    torques = pair(friction=0.4)
+    effects = found(replace(torques, real=torques.real / CONSTANTS))
+    gains = {("actuator_gain", f"effort[{k}]") for k in range(JOINTS)}
+    assert set(effects) == gains | {("coulomb_friction", f"effort[{k}]") for k in range(JOINTS)}
+    for (effect, column), parameters in effects.items():
+        (estimate,) = parameters.values()
+        wanted = CONSTANTS[int(column[-2])] if effect == "actuator_gain" else 0.4
+        assert abs(estimate.value - wanted) < SURE * estimate.std < 0.02 * wanted
+
+
+def test_currents_become_torques_in_steps_with_the_commands_that_a_limit_is_of() -> None:
+    signal = aligned(pair(), {}, DiagnoseSettings())
+    once = as_torques(as_torques(signal, np.array([2.0, 3.0])), np.array([1.1, 0.9]))
+    assert np.allclose(once.constants, (2.2, 2.7))
+    assert np.allclose(once.real, signal.real * (2.2, 2.7))
+    for name, constant in zip(signal.names, once.constants, strict=True):
+        assert np.allclose(once.ideal.channels[name][1], constant * signal.ideal.channels[name][1])
+
+
+def test_a_gain_is_as_unsure_as_the_dynamics_and_less_sure_beside_a_load() -> None:
+    signal = aligned(pair(), {}, DiagnoseSettings())
+    by_key = {effect.key: effect for effect in signal_diagnosis.catalogue(signal)}
+    gain, load = by_key["actuator_gain:/joints.effort[1]"], by_key["payload"]
+    log = whitened(signal, signal.real - signal.sampled.x, [0.0] * JOINTS)
+    alone = learnt_errors(log, fit([log], ((gain, np.ones(1)),)))[gain.key][0]
+    assert 0.5 * LEARNT_ERROR < alone < 1.5 * LEARNT_ERROR  # of two parts that move together
+    both = learnt_errors(log, fit([log], ((gain, np.ones(1)), (load, np.array([0.3, 0.3, 0.0])))))[gain.key][0]
+    assert both > alone
+
+
+def test_a_shape_that_no_form_has_is_a_curve_without_parameters() -> None:
+    given = pair()
+    angle = given.state["q1"].values
+    steps = 1.5 * np.tanh((angle - 0.3) / 0.08) - 1.1 * np.tanh((angle + 0.5) / 0.05) + 0.9 * np.tanh((angle - 0.9) / 0.1)
+    findings = diagnose_signal(replace(given, real=given.real + np.stack([0.0 * steps, steps], axis=1)), {}).findings
+    assert any(finding.curve is not None and not finding.parameters for finding in findings)
+
+
+def test_a_heavy_load_is_no_current() -> None:
+    """The load makes the efforts of the last joint three times as large."""
+    given = pair(load=2.0)
+    effects = found(given)
+    assert set(effects) == {("payload", "/joints")}
+    mass = effects["payload", "/joints"]["mass"]
+    assert abs(mass.value - 2.0) < SURE * mass.std < 0.1
+
+
+def test_friction_of_a_single_joint_has_a_name() -> None:
+    """A pendulum, whose findings name no joint among several."""
+    (real_ns, state, real), (sim_ns, sim_state, sim) = (pendulum(seed, friction) for seed, friction in ((1, 0.5), (2, 0.0)))
+    alone = SignalPair("/joint", ("/joint.effort[0]",), ("N m",), real_ns, real, sim_ns, sim, "efforts", state, sim_state)
+    effects = found(alone)
+    ((_, level),) = ((name, parameters["level"]) for name, parameters in effects.items())
+    assert next(iter(effects))[0] == "coulomb_friction"
+    assert abs(level.value - 0.5) < SURE * level.std
 
 
 @pytest.mark.parametrize("units", [(1.0, 1.0), (np.pi / 180.0, 1.0), (1.0, np.pi / 180.0), (np.pi / 180.0, np.pi / 180.0)])

@@ -14,10 +14,10 @@ from support.robot_cases.log import write
 
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.joints import current_remark
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.quantities import in_one_unit
+from imutool.diagnosis.signals.signal_constants import current_remark
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 

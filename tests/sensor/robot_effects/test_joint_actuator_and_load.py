@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -31,3 +33,13 @@ def test_a_limit_and_a_dead_band_give_their_commands() -> None:
     command = np.sin(T)
     assert np.allclose(behind("torque_saturation", 0.8, command, np.clip(command, -0.8, 0.8)), command)
     assert np.allclose(behind("actuator_dead_band", 0.1, command, command - np.clip(command, -0.1, 0.1)), command)
+
+
+def test_a_limit_that_a_motion_passes_for_a_moment_is_searched_for_near_it() -> None:
+    """Twice in a minute the command is thrice its own deviation."""
+    command = np.sin(T) + 4.0 * np.exp(-(((T - 7.0) / 0.1) ** 2)) + 4.0 * np.exp(-(((T - 15.0) / 0.1) ** 2))
+    scale = Scale((NAME,), ("N m",), (0.5,), (1.0,), 0.0, 20.0, {})
+    (effect,) = (e for e in actuator_effects(scale) if e.name == "torque_saturation")
+    assert effect.starts is not None
+    starts = effect.starts(None, SimpleNamespace(y=command[:, None]))
+    assert min(abs(np.log(float(start[0]) / 3.0)) for start in starts) < 0.3

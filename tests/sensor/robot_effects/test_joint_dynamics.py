@@ -64,6 +64,18 @@ def test_a_gripper_follows_from_no_motion_and_the_arm_does() -> None:
     assert following(own, every) == [0, 1, 2]
 
 
+def test_a_joint_about_an_upright_axis_feels_no_rounding_of_its_angle() -> None:
+    """Gravity about it is zero but for rounding errors, which are no column to fit with."""
+    own, arm = motion(5), SpatialChain(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]))
+    upper = arm.of_link(np.array([0.4, 0.0, 0.0]), 1)
+    tip = upper + arm.of_link(np.array([0.3, 0.0, 0.02]))
+    S, A = 2.0 * np.outer(upper, upper) + np.outer(tip, tip), 2.0 * upper + tip
+    found = identified(own, arm.efforts(arm.moved(own), S, A))
+    assert found is not None
+    turned = found({**own, "q0": own["q0"] + 1e-6}) - found(own)
+    assert np.abs(turned).max() < 1e-7
+
+
 def test_any_other_arm_is_the_sum_of_its_factors() -> None:
     """Two hinges across each other: a centrifugal term and a pendulum."""
     own, other = motion(3, 2), motion(4, 2)
@@ -111,7 +123,19 @@ def test_axes_that_point_anywhere_are_found_and_hold_at_another_motion(wrist: tu
     more, moved = upper + tip, arm.moved(other)
     added = arm.efforts(moved, 0.5 * np.outer(more, more), 0.5 * more)
     masses = Dynamics(3, (), theta[None], (0.0,) * 3, (0, 1, 2), arm).loaded(other)
-    assert np.allclose(masses(np.append(0.5, place)), added)
+    assert np.allclose(masses(np.array([0.5, *place])), added)
+    points = [masses(np.array([0.5 / 6.0, *(place + 0.06 * out), 0.0])) for out in (*np.eye(3), *-np.eye(3))]
+    assert np.allclose(masses(np.array([0.5, *place, 0.5 * 0.06**2 / 1.5])), sum(points))
+
+
+def test_a_load_on_a_chain_of_parallel_hinges_has_an_inertia_of_its_own() -> None:
+    """Four points about a centre are a mass there and its inertia."""
+    own = motion(1)
+    dynamics = identified(own, efforts(own))
+    assert dynamics is not None
+    masses, place = dynamics.loaded(own), np.array([0.1, 0.05])
+    points = [masses(np.array([0.2, *(place + out), 0.0])) for out in ([0.06, 0.0], [-0.06, 0.0], [0.0, 0.06], [0.0, -0.06])]
+    assert np.allclose(masses(np.array([0.8, *place, 0.8 * 0.06**2])), sum(points))
 
 
 def test_a_payload_shows_the_lengths_that_a_light_wrist_hides() -> None:
