@@ -1,0 +1,130 @@
+"""Tables as boards, phones and students write them: no units, slow clocks, raw counts, names of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.converters import table
+from imutool.converters._table_registers import raw_counts, unit_by_steps
+from imutool.errors import ConfigError
+
+COUNT = 300
+RNG = np.random.default_rng(23)
+T_S = np.arange(COUNT) * 0.01
+COUNTS = np.round(RNG.normal(0.0, 12.0, (COUNT, 3)))  # of a gyro at rest
+ACCEL_G = np.round(RNG.normal(0.0, 0.01, (COUNT, 3)) + np.array([0.1, -0.2, 0.97]), 4)
+NAMES = ["t", *(f"a{a}" for a in "xyz"), *(f"g{a}" for a in "xyz")]
+
+
+def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
+    rows = (",".join(map(repr, row)) for row in zip(*(np.asarray(column).tolist() for column in columns), strict=True))
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    return path
+
+
+def read(path: Path):
+    return table.read_sequence(table.sequences(path)[0])
+
+
+@pytest.mark.parametrize(
+    ("unit", "step", "places"),
+    [
+        ("deg/s", 2000 / 2**15, 2),
+        ("deg/s", 1 / 131, 4),
+        ("deg/s", 0.07, 2),
+        ("rad/s", np.deg2rad(500 / 2**15), 12),
+        ("rad/s", 1 / 900, 6),
+        ("mdeg/s", 8.75, 2),
+    ],
+)
+def test_the_steps_of_a_register_show_the_unit_of_the_gyro(tmp_path, unit, step, places):
+    gyro = np.round(COUNTS * step + 0.3 * step, places)
+    log = read(written(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *gyro.T]))
+    size = {"deg/s": np.pi / 180, "mdeg/s": np.pi / 180e3, "rad/s": 1.0}[unit]
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, gyro * size, rtol=1e-9)
+    assert any(f" {unit}, as a common sensor does" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize("grid", [1.0, 0.1, 0.125, 0.06, 0.03, 0.01, 0.0012, 0.0011, 0.001, 1 / 128, 1e-6, 9.80665 / 16384])
+@pytest.mark.parametrize("spread", [1.5, 5.0, 60.0])
+def test_other_steps_show_no_unit(grid, spread):
+    counts = np.round(np.random.default_rng(4).normal(0.0, spread, (2000, 3)))
+    assert unit_by_steps(counts * grid) is None
+    assert unit_by_steps(np.full((50, 3), np.nan)) is None
+    assert unit_by_steps(np.random.default_rng(4).normal(0.0, spread, (2000, 3)) * grid) is None
+
+
+def test_a_stated_unit_against_the_steps_is_asked(tmp_path):
+    names = ["time", *(f"angular_velocity_{a}" for a in "xyz"), *(f"linear_acceleration_{a}" for a in "xyz")]
+    path = written(tmp_path / "ros.csv", names, [T_S, *(COUNTS / 16).T, *(9.8 * ACCEL_G).T])
+    with pytest.raises(ConfigError, match=r"say rad/s, and the gyro counts in steps of 0.0625 deg/s") as caught:
+        read(path)
+    assert 'gyro_unit = "rad/s"  # please confirm: rad/s or deg/s or mdeg/s?' in str(caught.value)
+
+
+@pytest.mark.parametrize(("start", "step_s", "unit"), [(1.7e9, 0.4, "s"), (1.7e12, 0.4, "ms"), (1.7e18, 0.3, "ns")])
+def test_a_time_since_1970_may_be_slow(tmp_path, start, step_s, unit):
+    size = {"s": 1.0, "ms": 1e-3, "ns": 1e-9}[unit]
+    t = start + np.arange(COUNT) * round(step_s / size, 9)
+    log = read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T]))
+    assert np.allclose(np.diff(log.imus["/imu0"].t_ns) * 1e-9, step_s, atol=1e-4)
+
+
+@pytest.mark.parametrize("step", [1, 0.5])
+def test_a_step_of_a_second_or_of_a_millisecond_is_asked(tmp_path, step):
+    path = written(tmp_path / "imu.csv", ["timestamp", *NAMES[1:]], [np.arange(COUNT) * step, *ACCEL_G.T, *(COUNTS * 0.07).T])
+    with pytest.raises(ConfigError, match=r"a step of .* fits s and ms"):
+        read(path)
+
+
+def test_several_rows_with_one_stamp_propose_their_rate(tmp_path):
+    t = 1.7e9 + np.arange(COUNT) // 10 * 0.1
+    with pytest.raises(ConfigError) as caught:
+        read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
+    assert "# rate_hz = 103.1  in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
+
+
+def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
+    rows = [f"15:04:{n // 100:02d}.{n % 100:02d}0\t{x}\t{y}\t{z}\t1\t2\t3" for n, (x, y, z) in enumerate(ACCEL_G)]
+    names = ["Time(s)", *(f"a{a}(g)" for a in "xyz"), *(f"w{a}(deg/s)" for a in "xyz")]
+    (tmp_path / "wit.txt").write_text("\n".join(["StartTime: 2026-11-21 15:04:00.000\t\t", "\t".join(names), *rows]) + "\n")
+    imu = read(tmp_path / "wit.txt").imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel"),
+    [
+        ([f"Gyro{a}_deg_per_s" for a in "XYZ"], [f"Accel{a}_m_per_s2" for a in "XYZ"]),
+        ([f"EKF Raw {a} Gyro (deg/s)" for a in "XYZ"], [f"EKF Raw {a} Accel" for a in "XYZ"]),
+        ([f"角速度{a}(°/s)" for a in "XYZ"], [f"加速度{a}(m/s²)" for a in "XYZ"]),
+        ([f"giroscopio_{a}_dps" for a in "xyz"], [f"aceleracion_{a}" for a in "xyz"]),
+        ([f"w_{a} [deg/s]" for a in "xyz"], [f"f_{a}" for a in "xyz"]),
+        (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
+    ],
+)
+def test_names_of_other_programs(tmp_path, gyro, accel):
+    path = written(tmp_path / "imu.csv", ["time_s", *gyro, *accel], [T_S, *COUNTS.T, *(9.80665 * ACCEL_G).T])
+    imu = read(path).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_forces_are_no_accelerations(tmp_path):
+    names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"F{a}" for a in "xyz")]
+    with pytest.raises(ConfigError, match="no unit of the accel"):
+        read(written(tmp_path / "force.csv", names, [T_S, *COUNTS.T, *(55.0 * ACCEL_G).T]))
+
+
+@pytest.mark.parametrize(("counts", "full"), [(16384, 2), (8192, 4), (4096, 8), (2048, 16)])
+def test_raw_counts_are_asked_with_the_range_that_they_fit(tmp_path, counts, full):
+    raw = np.round(ACCEL_G * counts).astype(int)
+    path = written(tmp_path / "raw.csv", NAMES, [T_S, *raw.T, *COUNTS.astype(int).T])
+    with pytest.raises(ConfigError, match="raw counts of a range of") as caught:
+        read(path)
+    assert f'# if they are raw counts of ±{full} g ({counts} counts a g): accel_unit = "g"' in str(caught.value)
+    assert f"accel_scale = {1 / counts!r}" in str(caught.value)
+    assert raw_counts(ACCEL_G * counts + 0.5) is None
