@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
+from imutool.converters._table_labels import as_table
 from imutool.converters._table_registers import raw_counts, unit_by_steps
 from imutool.errors import ConfigError
 
@@ -128,3 +129,31 @@ def test_raw_counts_are_asked_with_the_range_that_they_fit(tmp_path, counts, ful
     assert f'# if they are raw counts of ±{full} g ({counts} counts a g): accel_unit = "g"' in str(caught.value)
     assert f"accel_scale = {1 / counts!r}" in str(caught.value)
     assert raw_counts(ACCEL_G * counts + 0.5) is None
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "{t}: |Acc X:{a[0]}, Acc Y:{a[1]}, Acc Z:{a[2]} |Gyr X:{g[0]} deg/s, Gyr Y:{g[1]} deg/s, Gyr Z:{g[2]} deg/s",
+        "{{'acc': {{'x': {a[0]}, 'y': {a[1]}, 'z': {a[2]}}}, 'gyro': {{'x': {g[0]}, 'y': {g[1]}, 'z': {g[2]}}}, 't': {t}}}",
+        '{{"time": {t}, "accel": [{a[0]}, {a[1]}, {a[2]}], "gyro": [{g[0]}, {g[1]}, {g[2]}], "temp_c": 25.5}}',
+        "t={t} ax={a[0]} ay={a[1]} az={a[2]} gx={g[0]} gy={g[1]} gz={g[2]}",
+        "[IMU] Time: {t} Accel: ({a[0]}, {a[1]}, {a[2]}), Gyroscope: ({g[0]}, {g[1]}, {g[2]})",
+        "Time: {t}, Acceleration X: {a[0]}, Y: {a[1]}, Z: {a[2]} g, Gyro X: {g[0]}, Y: {g[1]}, Z: {g[2]} deg/s",
+    ],
+)
+def test_rows_that_name_their_numbers(tmp_path, row):
+    gyro = np.round(COUNTS * 0.07, 2)
+    rows = [row.format(t=1000 + 10 * n, a=a, g=g) for n, (a, g) in enumerate(zip(ACCEL_G.tolist(), gyro.tolist(), strict=True))]
+    (tmp_path / "serial.log").write_text("\n".join(["MPU6050 ready", *rows]) + "\n")
+    log = read(tmp_path / "serial.log")
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro), rtol=1e-9)
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-9)
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+    assert "1 lines of other words are left out" in log.remarks.losses
+
+
+@pytest.mark.parametrize("row", ["a: 1 b: - 2 c: 3 d: 4 e: 5", "1.5,2.5,3.5,x: left,4.5", "level: 1, 2"])
+def test_other_rows_name_no_numbers(row):
+    assert as_table("\n".join([row] * 20)) == ("", 0)
