@@ -1,4 +1,4 @@
-"""Text whose rows name each number, as boards print them and JSON lines hold them, as a table.
+"""Text whose rows name each number, as a board prints them, as a table.
 
 `Acc X:-0.22, Acc Y:-0.11`; `ax=0.1 g ay=0.2 g`; `{'acc': {'x': 0.1, 'y': 0.2}, 't': 1}`; `Gyro: (0.1, 0.2, 0.3)`.
 """
@@ -25,7 +25,7 @@ AXIS = re.compile(r"[xyzw]", re.IGNORECASE)
 
 
 def as_table(text: str) -> tuple[str, int]:
-    """The text as a table with tabs and a header, and the lines left out; empty where most name no numbers alike."""
+    """The text as a table, and the number of lines left out; empty without such rows."""
     lines = [line for line in text.splitlines() if line.strip()]
     counts = Counter(words for line in lines[:LOOKED_AT] if (words := _words(line)))
     words, count = max(counts.items(), key=lambda each: each[1], default=((), 0))

@@ -10,6 +10,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.recording.joined_imu import in_order, unit_by_gravity
 
+from ._table_headerless import perhaps
 from ._table_map import NO_UNIT, Proposal
 from ._table_names import (
     CORE_MOTION,
@@ -43,6 +44,8 @@ def propose(columns: Columns) -> Proposal:
     _propose_time(proposal, names, columns)
     if "gyro" in proposal.entries and "gyro" not in proposal.open:
         _propose_gyro_unit(proposal, columns)
+    if not proposal.entries.keys() & {"gyro", "accel"}:
+        proposal.hints += perhaps(columns)
     accel = proposal.entries.get("accel", [""])
     if re.match(CORE_MOTION, spaced_name(accel[0])):
         proposal.entries["accel"] = [f"-{column}" for column in accel]
@@ -167,9 +170,14 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     counter = counter_of(columns, length or 0)
     measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
-    rising = [c for c, v in columns.values.items() if c not in measured and length in (None, len(v)) and rises(v)]
+    firsts = {c.rpartition("/")[0]: c for c in reversed(columns.values)}  # of each table; others may rise as a temperature does
+    rising = [
+        c
+        for c in firsts.values()
+        if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])
+    ]
     if not found and len(rising) == 1:
-        proposal.reasons.append(f"{rising[0]!r} is the only column that rises, and counts as the time")
+        proposal.reasons.append(f"{rising[0]!r} is the first column and rises: it counts as the time")
         found = rising
     if not found:
         for column in still:
@@ -209,7 +217,7 @@ def _units_of_time(first: float, step: float) -> list[str]:
     """
     rates = {unit: 1e9 / (step * size) for unit, size in USUAL_TIME_NS.items() if step > 0.0}
     epochs = [u for u, hz in rates.items() if SLOWEST_HZ[0] <= hz <= PLAUSIBLE_HZ[1] and 1e18 < first * TIME_NS[u] < 4e18]
-    return epochs or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz <= PLAUSIBLE_HZ[1]]
+    return epochs or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz < PLAUSIBLE_HZ[1]]
 
 
 def _rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:

@@ -157,3 +157,32 @@ def test_rows_that_name_their_numbers(tmp_path, row):
 @pytest.mark.parametrize("row", ["a: 1 b: - 2 c: 3 d: 4 e: 5", "1.5,2.5,3.5,x: left,4.5", "level: 1, 2"])
 def test_other_rows_name_no_numbers(row):
     assert as_table("\n".join([row] * 20)) == ("", 0)
+
+
+@pytest.mark.parametrize("name", ["mag_y", "temperature"])
+def test_a_column_that_rises_is_no_time_unless_it_is_the_first(tmp_path, name):
+    columns = [*ACCEL_G.T, *(COUNTS * 0.07).T, 20.0 + T_S]
+    with pytest.raises(ConfigError, match="no column that rises looks like a time"):
+        read(written(tmp_path / "imu.csv", [*NAMES[1:], name], columns))
+    imu = read(written(tmp_path / "imu.csv", ["GPST", *NAMES[1:]], [columns[-1], *columns[:-1]])).imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+
+
+@pytest.mark.parametrize("order", [["accel", "gyro"], ["gyro", "accel"]])
+def test_a_table_without_header_and_time_asks_its_rate_alone(tmp_path, order):
+    parts = {"accel": ACCEL_G, "gyro": (COUNTS * 0.07).round(2)}
+    six = np.hstack([parts[sensor] for sensor in order])
+    (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in six.tolist()) + "\n")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "imu.csv")
+    assert 'gyro = ["gyro_x", "gyro_y", "gyro_z"]\ngyro_unit = "deg/s"\n' in str(caught.value)
+    assert 'accel_unit = "g"\n' in str(caught.value)
+
+
+def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
+    rows = np.hstack([T_S[:, None], ACCEL_G, COUNTS * 0.07, np.full((COUNT, 1), 25.5)])
+    (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "imu.csv")
+    assert '# perhaps accel = ["column 2", "column 3", "column 4"]' in str(caught.value)
+    assert '# perhaps gyro = ["column 5", "column 6", "column 7"]' in str(caught.value)
