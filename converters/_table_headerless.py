@@ -31,7 +31,7 @@ class _Halves(NamedTuple):
 
 
 def perhaps(columns: Columns) -> list[str]:
-    """Lines of a map for a table without a header whose first columns look like an IMU, and that has more of them."""
+    """Lines of a map for more columns without a header, of which the first look like an IMU."""
     halves = _halves(columns, [name for name in columns.values if re.fullmatch(r"column \d{1,4}", name)])
     if halves is None:
         return []
@@ -48,7 +48,7 @@ def _halves(columns: Columns, names: list[str]) -> _Halves | None:
 
 
 def name_headerless(columns: Columns) -> None:
-    """Name the columns of an IMU: as ROS echoes it, or six axes with gravity, perhaps behind a time."""
+    """Name an IMU's columns: as ROS echoes it, or six axes with gravity, behind a time or not."""
     width = max((int(name[7:]) for name in columns.values if re.fullmatch(r"column \d{1,4}", name)), default=0)
     numbered = [f"column {number}" for number in range(1, width + 1)]
     if not width or not columns.values.keys() <= {*numbered}:

@@ -38,7 +38,8 @@ WORDS = {
 }
 STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column
 FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw may also be that of a command
-    rf"(?P<sensor>(?:.*_)?(WORDS)(_(ln|wr))?)_?(?P<axis>[xyz012]){STATE}",  # Shimmer has two: low noise and wide range
+    rf"(?P<sensor>(?:.*_)?(WORDS)(_(ln|wr))?)_?(?P<axis>[xyz]){STATE}",  # Shimmer has two: low noise and wide range
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[012]){STATE}",
     rf"(?P<of>(?:.*_)?)(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_(?P<axis>roll|pitch|yaw){STATE}",
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",

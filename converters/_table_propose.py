@@ -170,7 +170,8 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     counter = counter_of(columns, length or 0)
     measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
-    firsts = {c.rpartition("/")[0]: c for c in reversed(columns.values)}  # of each table; others may rise as a temperature does
+    # of each table, without a count of rows; further columns may rise as a temperature does
+    firsts = {c.rpartition("/")[0]: c for c in reversed(columns.values) if c != counter}
     rising = [
         c
         for c in firsts.values()

@@ -186,3 +186,15 @@ def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
         read(tmp_path / "imu.csv")
     assert '# perhaps accel = ["column 2", "column 3", "column 4"]' in str(caught.value)
     assert '# perhaps gyro = ["column 5", "column 6", "column 7"]' in str(caught.value)
+
+
+def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
+    names = ["t_ms", *NAMES[1:], "a0", "a1", "a2"]
+    path = written(tmp_path / "audio.csv", names, [1e3 * T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *RNG.normal(600, 9, (3, COUNT))])
+    np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):
+    names = ["", "Stop_watch", *NAMES[1:]]
+    path = written(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
+    assert np.array_equal(np.diff(read(path).imus["/imu0"].t_ns), np.full(COUNT - 1, 10_000_000))
