@@ -37,14 +37,18 @@ WORDS = {
     r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione",
 }
 STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column
+PLACES = (  # of several IMUs on a body
+    r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"
+    r"|hand|finger|leg|thigh|shank|knee|ankle|foot|shoe)"
+)
 FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw may also be that of a command
     rf"(?P<sensor>(?:.*_)?(WORDS)(_(ln|wr))?)_?(?P<axis>[xyz]){STATE}",  # Shimmer has two: low noise and wide range
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[012]){STATE}",
     rf"(?P<of>(?:.*_)?)(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_(?P<axis>roll|pitch|yaw){STATE}",
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
-    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<number>\d){STATE}",  # the first of several IMUs: ax1, acc_x_1
-    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<number>\d)_?(?P<axis>[xyz]){STATE}",  # acc1_x
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}){STATE}",  # ax1, acc_x_1, acc_x_chest
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
 )
 SYMBOLS = {"gyro": r"(?P<sensor>)(?P<axis>[pqr])", "accel": r"(?P<sensor>f)_?(?P<axis>[xyz])"}  # of an aircraft; specific force
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
@@ -67,7 +71,7 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     for column, name in names.items():
         if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
             found = match.groupdict()
-            owner = f"imu{found['number']}_" if "number" in found else found.get("of", "")
+            owner = f"{re.sub(r'^(?=[0-9])', 'imu', found['place'])}_" if "place" in found else found.get("of", "")
             groups.setdefault(owner + found["sensor"], {})[axes.get(found["axis"], found["axis"])] = column
     whole = {name: group for name, group in groups.items() if set(group) == set("xyz")}
     owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name in whole]

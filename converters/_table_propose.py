@@ -145,12 +145,11 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
             proposal.reasons.append(
                 f"the accel holds whole numbers of a median length of {level:.4g}: raw counts of a range of {said}?"
             )
-            scales = ", ".join(
-                f"{1.0 / counts:.8g} for ±{full:g} deg/s" for full, counts in zip(RANGES, COUNTS_A_DPS, strict=False)
-            )
+            first, *others = (f"{1.0 / counts:.8g}" for counts in COUNTS_A_DPS[: len(RANGES)])
             proposal.hints += [
-                f'if they are raw counts of {said}: accel_unit = "g" and accel_scale = {1.0 / raw[1]!r}',
-                f'and for a gyro of the same make: gyro_unit = "deg/s" and gyro_scale = {scales}',
+                f'accel_scale = {1.0 / raw[1]!r}  # with accel_unit = "g", if these are raw counts of {said}',
+                f'gyro_scale = {first}  # with gyro_unit = "deg/s", for raw counts of ±{RANGES[0]} deg/s;'
+                f" of ±{', ±'.join(map(str, RANGES[1:]))}: {', '.join(others)}",
             ]
     proposal.open.append(f"{sensor}_unit")
     proposal.reasons.append(NO_UNIT.format(sensor))
@@ -229,7 +228,9 @@ def _rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:
     if not step > 0.0 or len(units) != 1:
         return []
     rate = 1e9 / (step * TIME_NS[units[0]])
-    return [f"rate_hz = {rate:.4g}  in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"]
+    return [
+        f"rate_hz = {rate:.4g}  # in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"
+    ]
 
 
 def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:

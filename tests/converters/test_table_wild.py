@@ -85,7 +85,7 @@ def test_several_rows_with_one_stamp_propose_their_rate(tmp_path):
     t = 1.7e9 + np.arange(COUNT) // 10 * 0.1
     with pytest.raises(ConfigError) as caught:
         read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
-    assert "# rate_hz = 103.1  in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
+    assert "# rate_hz = 103.1  # in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
 
 
 def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
@@ -104,12 +104,14 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"角速度{a}(°/s)" for a in "XYZ"], [f"加速度{a}(m/s²)" for a in "XYZ"]),
         ([f"giroscopio_{a}_dps" for a in "xyz"], [f"aceleracion_{a}" for a in "xyz"]),
         ([f"w_{a} [deg/s]" for a in "xyz"], [f"f_{a}" for a in "xyz"]),
+        ([f"gyr_left_wrist_{a}_dps" for a in "xyz"], [f"acc_left_wrist_{a}" for a in "xyz"]),
+        ([f"Gyro{a}_chest (deg/s)" for a in "XYZ"], [f"Accel{a}_chest" for a in "XYZ"]),
         (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
     ],
 )
 def test_names_of_other_programs(tmp_path, gyro, accel):
     path = written(tmp_path / "imu.csv", ["time_s", *gyro, *accel], [T_S, *COUNTS.T, *(9.80665 * ACCEL_G).T])
-    imu = read(path).imus["/imu0"]
+    (imu,) = read(path).imus.values()
     np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
 
@@ -126,8 +128,11 @@ def test_raw_counts_are_asked_with_the_range_that_they_fit(tmp_path, counts, ful
     path = written(tmp_path / "raw.csv", NAMES, [T_S, *raw.T, *COUNTS.astype(int).T])
     with pytest.raises(ConfigError, match="raw counts of a range of") as caught:
         read(path)
-    assert f'# if they are raw counts of ±{full} g ({counts} counts a g): accel_unit = "g"' in str(caught.value)
-    assert f"accel_scale = {1 / counts!r}" in str(caught.value)
+    line = (
+        f'# accel_scale = {1 / counts!r}  # with accel_unit = "g", if these are raw counts of ±{full} g ({counts} counts a g)'
+    )
+    assert line in str(caught.value)
+    assert "# gyro_scale = 0.0076335878" in str(caught.value)
     assert raw_counts(ACCEL_G * counts + 0.5) is None
 
 
@@ -198,3 +203,14 @@ def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):
     names = ["", "Stop_watch", *NAMES[1:]]
     path = written(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
     assert np.array_equal(np.diff(read(path).imus["/imu0"].t_ns), np.full(COUNT - 1, 10_000_000))
+
+
+def test_imus_on_a_body_become_one_each_and_statistics_none(tmp_path):
+    places = ["chest", "left_leg", "right_leg"]
+    names = ["Millis", *(f"{sensor}{a}_{place}" for place in places for sensor in ("Accel", "Gyro") for a in "XYZ")]
+    columns = [1e3 * T_S, *(part for _ in places for part in (*ACCEL_G.T, *(COUNTS * 0.07).T))]
+    assert {*read(written(tmp_path / "body.csv", names, columns)).imus} == {f"/{place}/imu" for place in places}
+    with pytest.raises(ConfigError, match="0 triples of columns look like the gyro"):
+        read(
+            written(tmp_path / "features.csv", [name.replace("chest", "mean").replace("leg", "std") for name in names], columns)
+        )
