@@ -26,7 +26,7 @@ from ._table_names import (
 from ._table_registers import COUNTS_A_DPS, raw_counts, unit_by_steps
 from ._table_text import Columns
 from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
-from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, USUAL_TIME_NS, gravity_units
+from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, USUAL_TIME_NS, gravity_units, is_motion_alone
 
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 SLOWEST_HZ = 0.01, 0.9  # of samples with a time since 1970, and of others
@@ -86,7 +86,8 @@ def _propose_sensor(
         _propose_unit(proposal, sensor, columns)
     if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
         level, _ = gravity_units(columns, chosen)
-        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
+        is_motion = is_motion_alone(columns, chosen)
+        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or is_motion or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
             proposal.open.append("accel")
             proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
 

@@ -214,3 +214,13 @@ def test_imus_on_a_body_become_one_each_and_statistics_none(tmp_path):
         read(
             written(tmp_path / "features.csv", [name.replace("chest", "mean").replace("leg", "std") for name in names], columns)
         )
+
+
+@pytest.mark.parametrize("names", [NAMES, ["time", *(f"linear_acceleration_{a}" for a in "xyz"), *NAMES[4:]]])
+def test_a_motion_without_gravity_is_asked_though_it_is_as_long_as_gravity_in_g(tmp_path, names):
+    motion = RNG.normal(0.0, 0.65, (COUNT, 3))
+    assert abs(np.median(np.linalg.norm(motion, axis=1)) - 1.0) < 0.15
+    with pytest.raises(ConfigError, match=r"gravity was taken out|no unit of the accel"):
+        read(written(tmp_path / "walk.csv", names, [T_S, *motion.T, *(COUNTS * 0.07).T]))
+    turning = np.linalg.qr(np.random.default_rng(2).normal(size=(COUNT, 3, 3)))[0][:, 0] * RNG.normal(1.0, 0.2, (COUNT, 1))
+    read(written(tmp_path / "tumble.csv", NAMES, [T_S, *turning.T, *(COUNTS * 0.07).T]))
