@@ -209,6 +209,10 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     else:
         proposal.open.append("time_unit")
         proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
+        if column == counter:
+            proposal.hints.append(
+                f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
+            )
 
 
 def _units_of_time(first: float, step: float) -> list[str]:

@@ -153,7 +153,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     stated = filter(None, map(STATED_NUMBER.fullmatch, lines[:first]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     rows = _fields(lines[first:], delimiter)
-    if rows and all(row[-1] == "" for row in rows):  # a delimiter ends each row, in the header perhaps none
+    above = _fields(lines[:first], delimiter)
+    is_named = any(rows and len(row) == len(rows[0]) and row[-1].strip() for row in above)
+    if rows and not is_named and all(row[-1] == "" for row in rows):  # a delimiter ends each row, in the header perhaps none
         rows = [row[:-1] for row in rows]
     width = max(map(len, rows), default=0)
     names, units = _header(lines[:first], delimiter, width)

@@ -34,7 +34,7 @@ USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
 
 
 def gravity_units(columns: Columns, chosen: Sequence[str]) -> tuple[float, list[str]]:
-    """Median length of the vectors in three columns, and the units in which it is gravity; none for motion alone."""
+    """Median length of the vectors, and the units in which it is gravity; none for motion alone."""
     level = _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
     return level, [] if is_motion_alone(columns, chosen) else [
         u for u, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND

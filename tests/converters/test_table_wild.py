@@ -74,6 +74,13 @@ def test_a_time_since_1970_may_be_slow(tmp_path, start, step_s, unit):
     assert np.allclose(np.diff(log.imus["/imu0"].t_ns) * 1e-9, step_s, atol=1e-4)
 
 
+def test_a_last_column_that_has_a_name_and_no_values_keeps_the_header(tmp_path):
+    gyro = (COUNTS * 0.07).round(2)
+    rows = [",".join(map(repr, row)) + ",," for row in np.hstack([T_S[:, None], ACCEL_G, gyro]).tolist()]
+    (tmp_path / "sparse.csv").write_text("\n".join([",".join([*NAMES, "bias", "scale"]), "0" + "," * 8, *rows]) + "\n")
+    np.testing.assert_allclose(read(tmp_path / "sparse.csv").imus["/imu0"].gyro, np.deg2rad(gyro), rtol=1e-9)
+
+
 @pytest.mark.parametrize("step", [1, 0.5])
 def test_a_step_of_a_second_or_of_a_millisecond_is_asked(tmp_path, step):
     path = written(tmp_path / "imu.csv", ["timestamp", *NAMES[1:]], [np.arange(COUNT) * step, *ACCEL_G.T, *(COUNTS * 0.07).T])
