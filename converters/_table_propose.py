@@ -30,6 +30,7 @@ from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, USUAL_TIME_NS, gravity_uni
 
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 SLOWEST_HZ = 0.01, 0.9  # of samples with a time since 1970, and of others
+MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 MOST_SHOWN = 12  # triples of columns in a message
 OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
@@ -192,6 +193,15 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     if re.match(OWN_TIME["gyro"], spelled[column][1]):
         own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
         proposal.entries |= {"accel_time": own[0]} if own else {}
+    _propose_time_unit(proposal, column, names, columns)
+    if column == counter and "time_unit" in proposal.open:
+        proposal.hints.append(
+            f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
+        )
+
+
+def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[str, str]], columns: Columns) -> None:
+    """Unit of the time, as stated or by a plausible rate that no other time contradicts."""
     if (unit := unit_named(columns.units.get(column, "")) or names[column][1]) in TIME_NS:  # a calendar's is not the header's
         proposal.entries["time_unit"] = unit
         return
@@ -203,16 +213,28 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")
         return
     certain = _units_of_time(float(values[0]), step)
+    if len(certain) == 1 and (other := _another_pace(columns, column, certain[0], names)):
+        proposal.open.append("time_unit")
+        proposal.reasons.append(f"{column!r} would count {certain[0]}, but {other}")
+        return
     if len(certain) == 1:
         proposal.entries["time_unit"] = certain[0]
         proposal.reasons.append(f"{column!r} counts {certain[0]}: {1e9 / (step * TIME_NS[certain[0]]):.1f} samples a second")
     else:
         proposal.open.append("time_unit")
         proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
-        if column == counter:
-            proposal.hints.append(
-                f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
-            )
+
+
+def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tuple[str, str]]) -> str:
+    """How another time, whose unit is stated, contradicts the unit of this one; empty if none does."""
+    span = float(columns.values[column][-1] - columns.values[column][0]) * TIME_NS[unit]
+    for other, values in columns.values.items():
+        stated = unit_named(columns.units.get(other, "")) or names[other][1]
+        if other != column and stated in TIME_NS and len(values) == len(columns.values[column]) and goes_on(values):
+            passed = float(values[-1] - values[0]) * TIME_NS[stated]
+            if abs(passed - span) > MOST_APART * passed + WHOLE_NS:
+                return f"by {other!r} {passed * 1e-9:.4g} s pass and not {span * 1e-9:.4g} s"
+    return ""
 
 
 def _units_of_time(first: float, step: float) -> list[str]:

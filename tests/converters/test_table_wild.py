@@ -76,8 +76,8 @@ def test_a_time_since_1970_may_be_slow(tmp_path, start, step_s, unit):
 
 def test_a_last_column_that_has_a_name_and_no_values_keeps_the_header(tmp_path):
     gyro = (COUNTS * 0.07).round(2)
-    rows = [",".join(map(repr, row)) + ",," for row in np.hstack([T_S[:, None], ACCEL_G, gyro]).tolist()]
-    (tmp_path / "sparse.csv").write_text("\n".join([",".join([*NAMES, "bias", "scale"]), "0" + "," * 8, *rows]) + "\n")
+    rows = [",".join(map(repr, row)) + ",,,," for row in np.hstack([T_S[:, None], ACCEL_G, gyro]).tolist()]
+    (tmp_path / "sparse.csv").write_text("\n".join([",".join([*NAMES, "bias", "scale"]), "0" + "," * 10, *rows]) + "\n")
     np.testing.assert_allclose(read(tmp_path / "sparse.csv").imus["/imu0"].gyro, np.deg2rad(gyro), rtol=1e-9)
 
 
@@ -231,3 +231,17 @@ def test_a_motion_without_gravity_is_asked_though_it_is_as_long_as_gravity_in_g(
         read(written(tmp_path / "walk.csv", names, [T_S, *motion.T, *(COUNTS * 0.07).T]))
     turning = np.linalg.qr(np.random.default_rng(2).normal(size=(COUNT, 3, 3)))[0][:, 0] * RNG.normal(1.0, 0.2, (COUNT, 1))
     read(written(tmp_path / "tumble.csv", NAMES, [T_S, *turning.T, *(COUNTS * 0.07).T]))
+
+
+def test_a_unit_that_another_time_contradicts_is_asked(tmp_path):
+    gyro = COUNTS * 0.07
+    names = ["NodeTimestamp", "Date", *NAMES[1:]]
+    rows = [
+        ",".join([str(6 * n), f"2026-11-21 15:04:{n * 0.04:06.3f}", *map(repr, row)])
+        for n, row in enumerate(np.hstack([ACCEL_G, gyro]).tolist())
+    ]
+    (tmp_path / "node.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+    with pytest.raises(ConfigError, match=r"'NodeTimestamp' would count ms, but by 'Date' 11.96 s pass and not 1.794 s"):
+        read(tmp_path / "node.csv")
+    log = read(written(tmp_path / "apple.csv", ["timeIntervalSince1970", *NAMES[1:]], [1.7e9 + T_S, *ACCEL_G.T, *gyro.T]))
+    assert len(log.imus["/imu0"]) == COUNT
