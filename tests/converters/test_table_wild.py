@@ -245,3 +245,11 @@ def test_a_unit_that_another_time_contradicts_is_asked(tmp_path):
         read(tmp_path / "node.csv")
     log = read(written(tmp_path / "apple.csv", ["timeIntervalSince1970", *NAMES[1:]], [1.7e9 + T_S, *ACCEL_G.T, *gyro.T]))
     assert len(log.imus["/imu0"]) == COUNT
+
+
+def test_tables_of_a_folder_may_name_their_sensor_in_each_row(tmp_path):
+    parts = {"acce": ACCEL_G, "gyro": COUNTS * 0.07}
+    for name, values in parts.items():
+        rows = [f"{name.upper()};{t:.3f};{t:.3f};{x:.4f};{y:.4f};{z:.4f};0" for t, (x, y, z) in zip(T_S, values, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    np.testing.assert_allclose(read(tmp_path).imus["/imu0"].gyro, np.deg2rad(parts["gyro"]), atol=1e-9)
