@@ -60,7 +60,7 @@ class _Files:
         for path in sorted(self.names):
             folder, _, file = path.rpartition("/")
             if file.lower().endswith(".csv") and folder.rpartition("/")[2] != "meta":
-                found[re.sub(r"[^a-z]", "", file[:-4].lower())] = path
+                found[re.sub(r"[^a-z0-9]", "", file[:-4].lower())] = path
         return found
 
 

@@ -150,3 +150,9 @@ def test_oxts_of_kitti_gives_the_imu_and_an_estimate(convert, imutool, tmp_path)
         assert not log.truth_topics
     report = json.loads(imutool("info", "out.mcap", "--json", "-", cwd=tmp_path).stdout)
     assert report["truth"][0]["kind"] == "estimate"
+
+
+def test_a_second_recording_beside_the_first_does_not_take_its_place(convert, tmp_path):
+    files = PHONES["phyphox"] | {"Gyroscope_2.csv": phyphox(2.0 * GYRO, "rad/s")}
+    assert convert(pack(tmp_path / "two.zip", files), tmp_path / "out.mcap").returncode == 0
+    assert np.array_equal(read(tmp_path / "out.mcap").imu.gyro, GYRO)
