@@ -14,6 +14,7 @@ from imutool.errors import DataError, not_installed
 
 from ._archive import refusing
 from ._table_headerless import name_headerless
+from ._table_labels import as_table
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
@@ -36,7 +37,7 @@ def kind_of(head: bytes, path: Path) -> str:
         return "npz" if any(name.endswith(".npy") for name in names) else "sheet" if names & {*SHEETS} else ""
     if head.startswith(OLD_EXCEL):
         return "sheet"
-    return "csv" if is_text_table(head) else ""
+    return "csv" if is_text_table(head) or (b"\0" not in head and as_table(text_of(head))[0]) else ""
 
 
 def load(path: Path, kind: str) -> Columns:
@@ -65,7 +66,13 @@ def _members(path: Path) -> set[str]:
 
 def _load_csv(path: Path, columns: Columns) -> None:
     text = text_of(path.read_bytes())
-    if not read_rows(text, columns, path):
+    labelled, left_out = as_table(text)
+    if labelled:
+        read_csv(labelled, columns, path)
+        columns.remarks.notes.append("its rows name their numbers")
+        if left_out:
+            columns.remarks.losses.append(f"{left_out} lines of other words are left out")
+    elif not read_rows(text, columns, path):
         read_csv(text, columns, path)
         name_headerless(columns)
 

@@ -13,7 +13,7 @@ from imutool.errors import DataError
 from ._source import head
 from ._table_files import kind_of, load
 from ._table_groups import TRUE_GROUPS
-from ._table_map import propose
+from ._table_propose import propose
 from ._table_sensors import SENSORS, name_columns, sensors_among
 from ._table_text import Columns, read_csv, text_of
 from .sensor_tables import is_phone

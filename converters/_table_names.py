@@ -7,15 +7,15 @@ import re
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
 ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
 TIME_WORDS = (
-    rf"({XSENS_TIME}|times?|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
+    rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad per sec(ond)?",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps|deg per sec(ond)?",
+    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "mg": r"mg",
     "g": r"g",
@@ -32,21 +32,28 @@ CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
-    r"|w_rs_s|dreh(rate|geschwindigkeit)",
-    "accel": r"accel(eration|erometer)?|acce?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
-    r"|(linear)?beschleunigung|a_rs_s",
+    r"|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?",
+    "accel": r"accel(eration|erometer)?|acc[el]?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
+    r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione",
 }
 STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column
+PLACES = (  # of several IMUs on a body
+    r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"
+    r"|hand|finger|leg|thigh|shank|knee|ankle|foot|shoe)"
+)
 FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw may also be that of a command
-    rf"(?P<sensor>(?:.*_)?(WORDS)(_(ln|wr))?)_?(?P<axis>[xyz012]){STATE}",  # Shimmer has two: low noise and wide range
-    rf"(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
+    rf"(?P<sensor>(?:.*_)?(WORDS)(_(ln|wr))?)_?(?P<axis>[xyz]){STATE}",  # Shimmer has two: low noise and wide range
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[012]){STATE}",
+    rf"(?P<of>(?:.*_)?)(?P<axis>[xyz])_(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_(?P<axis>roll|pitch|yaw){STATE}",
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
-    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<number>\d){STATE}",  # the first of several IMUs: ax1, acc_x_1
-    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<number>\d)_?(?P<axis>[xyz]){STATE}",  # acc1_x
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}){STATE}",  # ax1, acc_x_1, acc_x_chest
+    rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
 )
+SYMBOLS = {"gyro": r"(?P<sensor>)(?P<axis>[pqr])", "accel": r"(?P<sensor>f)_?(?P<axis>[xyz])"}  # of an aircraft; specific force
+CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
 AXES = {"0": "x", "1": "y", "2": "z"}
-TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z"}
+TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": "z"}
 
 
 def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
@@ -54,7 +61,7 @@ def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
 
     `names` are spellings of the columns' names; `left_gyr_x` is of `left`, `gx2` of `imu2`.
     """
-    tries = (_triples(sensor, spelled, form) for form in FORMS for spelled in names)
+    tries = (_triples(sensor, spelled, form) for form in (*FORMS, SYMBOLS[sensor]) for spelled in names)
     return next(filter(None, tries), {})
 
 
@@ -63,8 +70,9 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
     axes = TURNS if sensor == "gyro" else AXES
     for column, name in names.items():
         if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
-            number = f"imu{match['number']}_" if "number" in match.groupdict() else ""
-            groups.setdefault(number + match["sensor"], {})[axes.get(match["axis"], match["axis"])] = column
+            found = match.groupdict()
+            owner = f"{re.sub(r'^(?=[0-9])', 'imu', found['place'])}_" if "place" in found else found.get("of", "")
+            groups.setdefault(owner + found["sensor"], {})[axes.get(found["axis"], found["axis"])] = column
     whole = {name: group for name, group in groups.items() if set(group) == set("xyz")}
     owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name in whole]
     return dict(zip(owners if len({*owners}) == len(whole) else whole, whole.values(), strict=True))
@@ -89,13 +97,17 @@ def spaced_name(column: str) -> str:
 def split_name(column: str) -> tuple[str, str]:
     """Name in lower case with underscores, and the unit in brackets or at the end."""
     text = column.strip().lower()
+    for words, translated in CHINESE.items():
+        text = text.replace(words, translated)
     bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
     unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(p, bracket[1].strip())), "")
     if bracket:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
-        end := re.search(r"(?:_in)?_(m?dps|deg_s|degps|degs|rad_s|radps|rads|mps2|ms2|m_s_?2|mg|g|ns|us|ms|s|sec)$", name)
+        end := re.search(
+            r"(?:_in)?_(m?dps|(deg|rad)(_?(per_?)?s(ec(ond)?)?|ps)|mps2|ms2|m_(per_)?s_?2|mg|g|ns|us|ms|s|sec)$", name
+        )
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]

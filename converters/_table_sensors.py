@@ -97,7 +97,7 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
     """
     names = [*table.values]
-    has_header = names != [f"column {number}" for number in range(1, len(names) + 1)]
+    has_header = not all(re.fullmatch(r"column \d+", name) for name in names)  # a text in the first one is no number
     if not sensor:
         pose = POSE if len(names) == len(POSE) and _turns(table, names[-4:]) else POSE[:1]
         new = {} if has_header or not rises(table.values[names[0]]) else dict(zip(names, pose, strict=False))

@@ -153,8 +153,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     stated = filter(None, map(STATED_NUMBER.fullmatch, lines[:first]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     rows = _fields(lines[first:], delimiter)
-    if rows and all(row[-1] == "" for row in rows):  # a delimiter ends each row, in the header perhaps none
-        rows = [row[:-1] for row in rows]
+    ends = {len(row) for row in _fields(lines[:first], delimiter) if row and row[-1].strip()}
+    while rows and len(rows[0]) > 1 and len(rows[0]) not in ends and all(row[-1] == "" for row in rows):
+        rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
     width = max(map(len, rows), default=0)
     names, units = _header(lines[:first], delimiter, width)
     whole = [row for row in rows if len(row) == width]

@@ -1,6 +1,7 @@
 """Folder or zip with a table for each sensor: Sensor Logger, phyphox, KITTI raw OXTS.
 
-Sensor Logger and phyphox record an accelerometer with gravity, or acceleration and gravity apart, in tables of their own. The
+Sensor Logger and phyphox record an accelerometer with gravity, or acceleration and gravity apart, in tables of their own.
+Sensor Logger's `Accelerometer`, which has a column `seconds_elapsed`, is without gravity. The
 layouts are those of github.com/tszheichoi/awesome-sensor-logger (UNITS.md, COORDINATES.md) and of phyphox's export. OXTS lies
 in `oxts/data/*.txt`, 30 numbers a file, as the development kit of KITTI raw describes them.
 """
@@ -29,7 +30,7 @@ from ._source import find_folders, name
 from ._table_names import split_name
 from ._table_text import Columns, read_csv
 from ._table_times import begun_at_zero
-from ._table_units import STANDARD_GRAVITY
+from ._table_units import GRAVITY_BAND, STANDARD_GRAVITY
 
 GENERAL = True
 IMU_TOPIC = "/imu0"
@@ -59,7 +60,7 @@ class _Files:
         for path in sorted(self.names):
             folder, _, file = path.rpartition("/")
             if file.lower().endswith(".csv") and folder.rpartition("/")[2] != "meta":
-                found[re.sub(r"[^a-z]", "", file[:-4].lower())] = path
+                found[re.sub(r"[^a-z0-9]", "", file[:-4].lower())] = path
         return found
 
 
@@ -135,13 +136,14 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     gyro_ns, gyro = _vector(files, tables[gyro_table], clock, where, remarks)
     accel_ns, accel, used = _acceleration(files, tables, clock, where, remarks)
     level = float(np.median(np.linalg.norm(accel, axis=1)))
-    if LEAST_GRAVITY < level < MOST_IN_G:
-        accel = accel * STANDARD_GRAVITY
-        remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
-    elif level <= LEAST_GRAVITY:
+    is_alone = used == ("accelerometer",) and "seconds_elapsed" in files.text(tables["accelerometer"]).partition("\n")[0]
+    if level <= LEAST_GRAVITY or (is_alone and abs(level / STANDARD_GRAVITY - 1.0) > GRAVITY_BAND):
         fix = "Record the acceleration with gravity, or gravity too"
         raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=fix)
-    if _is_ios(files):
+    if in_g := level < MOST_IN_G:
+        accel = accel * STANDARD_GRAVITY
+        remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
+    if _is_ios(files) or (in_g and "accelerometeruncalibrated" in used):  # where Sensor Logger writes g on no other system
         accel = -accel
         remarks.notes.append("the phone is of Apple, whose accelerometer reads -g upwards: its sign was turned")
     remarks.notes.append(f"gyro from {tables[gyro_table]}, accel from {' + '.join(tables[table] for table in used)}")

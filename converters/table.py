@@ -24,7 +24,8 @@ from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_folder import is_split, load_split
 from ._table_groups import group_entries, imus_apart, known_layout, time_beside
-from ._table_map import IMU_TOPIC, Proposal, TableMap, propose, read_map
+from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
+from ._table_propose import propose
 from ._table_rotations import of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times

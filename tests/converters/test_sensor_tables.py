@@ -68,6 +68,10 @@ PHONES = {
         "AccelerometerUncalibrated.csv": sensor_logger(-(GRAVITY + MOTION) / 9.80665),
         "Metadata.csv": METADATA.format("ios"),
     },
+    "sensor logger, ios, without its metadata": {
+        "Gyroscope.csv": sensor_logger(GYRO),
+        "AccelerometerUncalibrated.csv": sensor_logger(-(GRAVITY + MOTION) / 9.80665),
+    },
     "phyphox": {
         "Gyroscope.csv": phyphox(GYRO, "rad/s"),
         "Accelerometer.csv": phyphox(GRAVITY + MOTION, "m/s^2"),
@@ -116,8 +120,9 @@ def test_an_unpacked_folder_reads_as_its_zip_and_other_zips_are_none(convert, tm
     assert "no sequence found" in done.stderr
 
 
-def test_motion_without_gravity_is_refused_and_says_what_to_record(convert, tmp_path):
-    files = {"Gyroscope.csv": sensor_logger(GYRO), "Accelerometer.csv": sensor_logger(MOTION)}
+@pytest.mark.parametrize("strength", [1.0, 50.0, 150.0])
+def test_motion_without_gravity_is_refused_and_says_what_to_record(convert, tmp_path, strength):
+    files = {"Gyroscope.csv": sensor_logger(GYRO), "Accelerometer.csv": sensor_logger(strength * MOTION)}
     done = convert(pack(tmp_path / "walk.zip", files), tmp_path / "out.mcap")
     assert done.returncode == 4
     assert "gravity was taken out" in done.stderr
@@ -145,3 +150,9 @@ def test_oxts_of_kitti_gives_the_imu_and_an_estimate(convert, imutool, tmp_path)
         assert not log.truth_topics
     report = json.loads(imutool("info", "out.mcap", "--json", "-", cwd=tmp_path).stdout)
     assert report["truth"][0]["kind"] == "estimate"
+
+
+def test_a_second_recording_beside_the_first_does_not_take_its_place(convert, tmp_path):
+    files = PHONES["phyphox"] | {"Gyroscope_2.csv": phyphox(2.0 * GYRO, "rad/s")}
+    assert convert(pack(tmp_path / "two.zip", files), tmp_path / "out.mcap").returncode == 0
+    assert np.array_equal(read(tmp_path / "out.mcap").imu.gyro, GYRO)

@@ -11,7 +11,7 @@ import pytest
 from imutool.converters import table
 from imutool.converters._table_dates import calendar_times
 from imutool.converters._table_files import kind_of, load
-from imutool.converters._table_map import propose
+from imutool.converters._table_propose import propose
 from imutool.converters._table_text import Columns
 from imutool.errors import ConfigError, DataError
 

@@ -1,0 +1,276 @@
+"""Map that a table shows by the names of its columns, the units in them, and the values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.recording.joined_imu import in_order, unit_by_gravity
+
+from ._table_headerless import perhaps
+from ._table_map import NO_UNIT, Proposal
+from ._table_names import (
+    CORE_MOTION,
+    ROS_WORDS,
+    TIME_WORDS,
+    WITHOUT_GRAVITY,
+    XSENS_TIME,
+    name_and_unit,
+    spaced_name,
+    triples,
+    unit_named,
+)
+from ._table_registers import COUNTS_A_DPS, raw_counts, unit_by_steps
+from ._table_text import Columns
+from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
+from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, USUAL_TIME_NS, gravity_units, is_motion_alone
+
+LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
+SLOWEST_HZ = 0.01, 0.9  # of samples with a time since 1970, and of others
+MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
+RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
+MOST_SHOWN = 12  # triples of columns in a message
+OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
+
+
+def propose(columns: Columns) -> Proposal:
+    """Map that names, units and magnitudes of the columns suggest."""
+    proposal = Proposal({}, [], [])
+    names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values}
+    for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
+        _propose_sensor(proposal, sensor, units, names, columns)
+    _propose_time(proposal, names, columns)
+    if "gyro" in proposal.entries and "gyro" not in proposal.open:
+        _propose_gyro_unit(proposal, columns)
+    if not proposal.entries.keys() & {"gyro", "accel"}:
+        proposal.hints += perhaps(columns)
+    accel = proposal.entries.get("accel", [""])
+    if re.match(CORE_MOTION, spaced_name(accel[0])):
+        proposal.entries["accel"] = [f"-{column}" for column in accel]
+        proposal.reasons.append(
+            f"{accel[0]}/y/z are of CoreMotion, whose accelerometer reads -1 g along the axis that points up"
+        )
+    return proposal
+
+
+def _propose_sensor(
+    proposal: Proposal, sensor: str, units: dict[str, float], names: dict[str, tuple[str, str]], columns: Columns
+) -> None:
+    """Columns of the three axes, and their unit."""
+    plain = {column: name for column, (name, _) in names.items()}
+    spaced = {column: spaced_name(column) for column in names}
+    found = [*triples(sensor, plain, spaced).values()]
+    whole = _with_gravity(found, spaced, columns) if sensor == "accel" else found
+    if len(whole) < len(found):
+        proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
+    if len(whole) != 1:
+        proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
+        shown = "".join(f"{': ' if n == 0 else ', '}{triple['x']}/y/z" for n, triple in enumerate(whole[:MOST_SHOWN]))
+        proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}{shown}")
+    if not whole:
+        return
+    chosen = [whole[0][axis] for axis in "xyz"]
+    proposal.entries[sensor] = chosen
+    stated = {names[column][1] for column in chosen} - {""}
+    if len(stated) == 1 and stated <= units.keys():
+        proposal.entries[f"{sensor}_unit"] = stated.pop()
+    elif len(stated) > 1:
+        proposal.open += [sensor, f"{sensor}_unit"]
+        listed = ", ".join(chosen)
+        proposal.reasons.append(f"{listed} state different units: {sensor}_scale = [x, y, z] in a map brings them to one")
+    elif re.search(ROS_WORDS, names[chosen[0]][0]):
+        proposal.entries[f"{sensor}_unit"] = next(iter(units))
+    else:
+        _propose_unit(proposal, sensor, columns)
+    if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
+        level, _ = gravity_units(columns, chosen)
+        is_motion = is_motion_alone(columns, chosen)
+        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or is_motion or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
+            proposal.open.append("accel")
+            proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
+
+
+def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:
+    """The one of several accelerations that has gravity, by its name or by its size; all where none stands out."""
+    named = [triple for triple in found if not re.search(WITHOUT_GRAVITY, spaced[triple["x"]])]
+    sized = [triple for triple in named if gravity_units(columns, list(triple.values()))[1]]
+    return next((each for each in (named, sized) if len(each) == 1), found)
+
+
+def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
+    """Unit of the gyro from the steps in which it counts, and from how gravity turns in the accelerometer."""
+    steps = unit_by_steps(_side_by_side(columns, proposal.entries["gyro"]))
+    said = f"the gyro counts in steps of {steps[1]:.6g} {steps[0]}, as a common sensor does" if steps else ""
+    stated = proposal.entries.get("gyro_unit", "")
+    if stated and steps and steps[0] != stated:
+        proposal.open.append("gyro_unit")
+        proposal.reasons.append(f"the names of the columns say {stated}, and {said}")
+    if "gyro_unit" not in proposal.open or stated:
+        return
+    motion = _unit_by_motion(proposal, columns) if proposal.open == ["gyro_unit"] else None
+    found = {unit: reason for unit, reason in ((steps[0] if steps else "", said), motion or ("", "")) if unit}
+    if len(found) == 1:
+        proposal.settle_gyro_unit(*found.popitem())
+    else:
+        proposal.reasons.extend(found.values())
+
+
+def _unit_by_motion(proposal: Proposal, columns: Columns) -> tuple[str, str] | None:
+    """Unit with which gravity turns as the gyro says, and the reason."""
+    t, gyro, accel = (_side_by_side(columns, np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
+    if len(gyro) != len(accel):
+        return None
+    t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
+    kept = in_order(t_ns, np.concatenate([gyro, accel], axis=1), "")
+    found = unit_by_gravity(kept.t_ns, kept.values[:, :3], kept.values[:, 3:], GYRO_SI) if len(kept.t_ns) else None
+    return found and (found[0], f"gravity turns in the accelerometer as a gyro in {found[0]} says (t = {found[1]:.1f})")
+
+
+def _side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
+    return np.stack([columns.values[name].astype(float) for name in names], axis=1)
+
+
+def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
+    """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
+    if sensor == "accel":
+        level, near = gravity_units(columns, proposal.entries[sensor])
+        if near:
+            proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
+        if len(near) == 1:
+            proposal.entries["accel_unit"] = near[0]
+            return
+        if raw := raw_counts(_side_by_side(columns, proposal.entries[sensor])):
+            said = f"±{raw[0]} g ({raw[1]} counts a g)"
+            proposal.reasons.append(
+                f"the accel holds whole numbers of a median length of {level:.4g}: raw counts of a range of {said}?"
+            )
+            first, *others = (f"{1.0 / counts:.8g}" for counts in COUNTS_A_DPS[: len(RANGES)])
+            proposal.hints += [
+                f'accel_scale = {1.0 / raw[1]!r}  # with accel_unit = "g", if these are raw counts of {said}',
+                f'gyro_scale = {first}  # with gyro_unit = "deg/s", for raw counts of ±{RANGES[0]} deg/s;'
+                f" of ±{', ±'.join(map(str, RANGES[1:]))}: {', '.join(others)}",
+            ]
+    proposal.open.append(f"{sensor}_unit")
+    proposal.reasons.append(NO_UNIT.format(sensor))
+
+
+def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns) -> None:
+    """Column of the time and its unit, from its name or from a plausible rate."""
+    length = len(columns.values[proposal.entries["gyro"][0]]) if "gyro" in proposal.entries else None
+    spelled = {c: (name or unit, spaced_name(c)) for c, (name, unit) in names.items()}
+    found = [c for c, each in spelled.items() if any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", name) for name in each)]
+    found = [c for c in found if length in (None, len(columns.values[c]))]
+    still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
+    if "gyro" in proposal.entries:
+        group = proposal.entries["gyro"][0].rpartition("/")[0]
+        found.sort(key=lambda c: c.rpartition("/")[0] != group)
+        found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
+    found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
+    counter = counter_of(columns, length or 0)
+    measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
+    # of each table, without a count of rows; further columns may rise as a temperature does
+    firsts = {c.rpartition("/")[0]: c for c in reversed(columns.values) if c != counter}
+    rising = [
+        c
+        for c in firsts.values()
+        if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])
+    ]
+    if not found and len(rising) == 1:
+        proposal.reasons.append(f"{rising[0]!r} is the first column and rises: it counts as the time")
+        found = rising
+    if not found:
+        for column in still:
+            values = columns.values[column]
+            counts = f"{len(np.unique(values))} different values in {len(values)} rows"
+            proposal.reasons.append(f"{column!r} is named as a time and does not rise: {counts}")
+            proposal.hints += _rate_of_rows(column, values, columns.units.get(column, "") or names[column][1])
+        _propose_rate(proposal, columns, counter, length)
+        return
+    column = proposal.entries["time"] = found[0]
+    if re.match(OWN_TIME["gyro"], spelled[column][1]):
+        own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
+        proposal.entries |= {"accel_time": own[0]} if own else {}
+    _propose_time_unit(proposal, column, names, columns)
+    if column == counter and "time_unit" in proposal.open:
+        proposal.hints.append(
+            f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
+        )
+
+
+def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[str, str]], columns: Columns) -> None:
+    """Unit of the time, as stated or by a plausible rate that no other time contradicts."""
+    if (unit := unit_named(columns.units.get(column, "")) or names[column][1]) in TIME_NS:  # a calendar's is not the header's
+        proposal.entries["time_unit"] = unit
+        return
+    values = columns.values[column].astype(float)
+    step = float(np.nanmedian(np.diff(values)))
+    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
+        counts = "100us" if step * TIME_NS["100us"] <= 1e9 / PLAUSIBLE_HZ[0] else "us"
+        proposal.entries["time_unit"] = counts
+        proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")
+        return
+    certain = _units_of_time(float(values[0]), step)
+    if len(certain) == 1 and (other := _another_pace(columns, column, certain[0], names)):
+        proposal.open.append("time_unit")
+        proposal.reasons.append(f"{column!r} would count {certain[0]}, but {other}")
+        return
+    if len(certain) == 1:
+        proposal.entries["time_unit"] = certain[0]
+        proposal.reasons.append(f"{column!r} counts {certain[0]}: {1e9 / (step * TIME_NS[certain[0]]):.1f} samples a second")
+    else:
+        proposal.open.append("time_unit")
+        proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
+
+
+def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tuple[str, str]]) -> str:
+    """How another time, whose unit is stated, contradicts the unit of this one; empty if none does."""
+    span = float(columns.values[column][-1] - columns.values[column][0]) * TIME_NS[unit]
+    for other, values in columns.values.items():
+        stated = unit_named(columns.units.get(other, "")) or names[other][1]
+        if other != column and stated in TIME_NS and len(values) == len(columns.values[column]) and goes_on(values):
+            passed = float(values[-1] - values[0]) * TIME_NS[stated]
+            if abs(passed - span) > MOST_APART * passed + WHOLE_NS:
+                return f"by {other!r} {passed * 1e-9:.4g} s pass and not {span * 1e-9:.4g} s"
+    return ""
+
+
+def _units_of_time(first: float, step: float) -> list[str]:
+    """Units in which a time since 1970 begins in this century, or else in which its step is one of an IMU.
+
+    A board that prints may be as slow as once a second, so a step of 1 may be a second or a millisecond.
+    """
+    rates = {unit: 1e9 / (step * size) for unit, size in USUAL_TIME_NS.items() if step > 0.0}
+    epochs = [u for u, hz in rates.items() if SLOWEST_HZ[0] <= hz <= PLAUSIBLE_HZ[1] and 1e18 < first * TIME_NS[u] < 4e18]
+    return epochs or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz < PLAUSIBLE_HZ[1]]
+
+
+def _rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:
+    """Line of a map that counts rows, where several have one stamp."""
+    first, last = float(values[0]), float(values[-1])
+    step = (last - first) / max(len(values) - 1, 1)
+    units = [unit] if unit in TIME_NS else _units_of_time(first, step)
+    if not step > 0.0 or len(units) != 1:
+        return []
+    rate = 1e9 / (step * TIME_NS[units[0]])
+    return [
+        f"rate_hz = {rate:.4g}  # in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"
+    ]
+
+
+def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:
+    """Sampling rate of samples that are counted, in place of a time."""
+    counted = f"{counter!r} counts the samples" if counter else "no column holds the time: rows are counted"
+    rate = stated_rate(columns, proposal.entries.get("gyro", [""])[0])
+    proposal.entries |= {"counter": counter} if counter else {}
+    if rate is None:
+        proposal.open += ["rate_hz"] if counter else ["time", "time_unit"]
+        what = counted if counter else "no column that rises looks like a time"
+        proposal.reasons.append(f"{what}, and no number in the file is named as a sampling rate")
+        return
+    proposal.rate_hz = rate[1]
+    proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
+    if length:
+        proposal.entries |= {"time": count_times(columns, rate[1], length, counter), "time_unit": "s"}

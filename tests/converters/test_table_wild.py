@@ -1,0 +1,255 @@
+"""Tables as boards, phones and students write them: no units, slow clocks, raw counts, names of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.converters import table
+from imutool.converters._table_labels import as_table
+from imutool.converters._table_registers import raw_counts, unit_by_steps
+from imutool.errors import ConfigError
+
+COUNT = 300
+RNG = np.random.default_rng(23)
+T_S = np.arange(COUNT) * 0.01
+COUNTS = np.round(RNG.normal(0.0, 12.0, (COUNT, 3)))  # of a gyro at rest
+ACCEL_G = np.round(RNG.normal(0.0, 0.01, (COUNT, 3)) + np.array([0.1, -0.2, 0.97]), 4)
+NAMES = ["t", *(f"a{a}" for a in "xyz"), *(f"g{a}" for a in "xyz")]
+
+
+def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
+    rows = (",".join(map(repr, row)) for row in zip(*(np.asarray(column).tolist() for column in columns), strict=True))
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    return path
+
+
+def read(path: Path):
+    return table.read_sequence(table.sequences(path)[0])
+
+
+@pytest.mark.parametrize(
+    ("unit", "step", "places"),
+    [
+        ("deg/s", 2000 / 2**15, 2),
+        ("deg/s", 1 / 131, 4),
+        ("deg/s", 0.07, 2),
+        ("rad/s", np.deg2rad(500 / 2**15), 12),
+        ("rad/s", 1 / 900, 6),
+        ("mdeg/s", 8.75, 2),
+    ],
+)
+def test_the_steps_of_a_register_show_the_unit_of_the_gyro(tmp_path, unit, step, places):
+    gyro = np.round(COUNTS * step + 0.3 * step, places)
+    log = read(written(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *gyro.T]))
+    size = {"deg/s": np.pi / 180, "mdeg/s": np.pi / 180e3, "rad/s": 1.0}[unit]
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, gyro * size, rtol=1e-9)
+    assert any(f" {unit}, as a common sensor does" in note for note in log.remarks.notes)
+
+
+@pytest.mark.parametrize("grid", [1.0, 0.1, 0.125, 0.06, 0.03, 0.01, 0.0012, 0.0011, 0.001, 1 / 128, 1e-6, 9.80665 / 16384])
+@pytest.mark.parametrize("spread", [1.5, 5.0, 60.0])
+def test_other_steps_show_no_unit(grid, spread):
+    counts = np.round(np.random.default_rng(4).normal(0.0, spread, (2000, 3)))
+    assert unit_by_steps(counts * grid) is None
+    assert unit_by_steps(np.full((50, 3), np.nan)) is None
+    assert unit_by_steps(np.random.default_rng(4).normal(0.0, spread, (2000, 3)) * grid) is None
+
+
+def test_a_stated_unit_against_the_steps_is_asked(tmp_path):
+    names = ["time", *(f"angular_velocity_{a}" for a in "xyz"), *(f"linear_acceleration_{a}" for a in "xyz")]
+    path = written(tmp_path / "ros.csv", names, [T_S, *(COUNTS / 16).T, *(9.8 * ACCEL_G).T])
+    with pytest.raises(ConfigError, match=r"say rad/s, and the gyro counts in steps of 0.0625 deg/s") as caught:
+        read(path)
+    assert 'gyro_unit = "rad/s"  # please confirm: rad/s or deg/s or mdeg/s?' in str(caught.value)
+
+
+@pytest.mark.parametrize(("start", "step_s", "unit"), [(1.7e9, 0.4, "s"), (1.7e12, 0.4, "ms"), (1.7e18, 0.3, "ns")])
+def test_a_time_since_1970_may_be_slow(tmp_path, start, step_s, unit):
+    size = {"s": 1.0, "ms": 1e-3, "ns": 1e-9}[unit]
+    t = start + np.arange(COUNT) * round(step_s / size, 9)
+    log = read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T]))
+    assert np.allclose(np.diff(log.imus["/imu0"].t_ns) * 1e-9, step_s, atol=1e-4)
+
+
+def test_a_last_column_that_has_a_name_and_no_values_keeps_the_header(tmp_path):
+    gyro = (COUNTS * 0.07).round(2)
+    rows = [",".join(map(repr, row)) + ",,,," for row in np.hstack([T_S[:, None], ACCEL_G, gyro]).tolist()]
+    (tmp_path / "sparse.csv").write_text("\n".join([",".join([*NAMES, "bias", "scale"]), "0" + "," * 10, *rows]) + "\n")
+    np.testing.assert_allclose(read(tmp_path / "sparse.csv").imus["/imu0"].gyro, np.deg2rad(gyro), rtol=1e-9)
+
+
+@pytest.mark.parametrize("step", [1, 0.5])
+def test_a_step_of_a_second_or_of_a_millisecond_is_asked(tmp_path, step):
+    path = written(tmp_path / "imu.csv", ["timestamp", *NAMES[1:]], [np.arange(COUNT) * step, *ACCEL_G.T, *(COUNTS * 0.07).T])
+    with pytest.raises(ConfigError, match=r"a step of .* fits s and ms"):
+        read(path)
+
+
+def test_several_rows_with_one_stamp_propose_their_rate(tmp_path):
+    t = 1.7e9 + np.arange(COUNT) // 10 * 0.1
+    with pytest.raises(ConfigError) as caught:
+        read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
+    assert "# rate_hz = 103.1  # in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
+
+
+def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
+    rows = [f"15:04:{n // 100:02d}.{n % 100:02d}0\t{x}\t{y}\t{z}\t1\t2\t3" for n, (x, y, z) in enumerate(ACCEL_G)]
+    names = ["Time(s)", *(f"a{a}(g)" for a in "xyz"), *(f"w{a}(deg/s)" for a in "xyz")]
+    (tmp_path / "wit.txt").write_text("\n".join(["StartTime: 2026-11-21 15:04:00.000\t\t", "\t".join(names), *rows]) + "\n")
+    imu = read(tmp_path / "wit.txt").imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel"),
+    [
+        ([f"Gyro{a}_deg_per_s" for a in "XYZ"], [f"Accel{a}_m_per_s2" for a in "XYZ"]),
+        ([f"EKF Raw {a} Gyro (deg/s)" for a in "XYZ"], [f"EKF Raw {a} Accel" for a in "XYZ"]),
+        ([f"角速度{a}(°/s)" for a in "XYZ"], [f"加速度{a}(m/s²)" for a in "XYZ"]),
+        ([f"giroscopio_{a}_dps" for a in "xyz"], [f"aceleracion_{a}" for a in "xyz"]),
+        ([f"w_{a} [deg/s]" for a in "xyz"], [f"f_{a}" for a in "xyz"]),
+        ([f"gyr_left_wrist_{a}_dps" for a in "xyz"], [f"acc_left_wrist_{a}" for a in "xyz"]),
+        ([f"Gyro{a}_chest (deg/s)" for a in "XYZ"], [f"Accel{a}_chest" for a in "XYZ"]),
+        (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
+    ],
+)
+def test_names_of_other_programs(tmp_path, gyro, accel):
+    path = written(tmp_path / "imu.csv", ["time_s", *gyro, *accel], [T_S, *COUNTS.T, *(9.80665 * ACCEL_G).T])
+    (imu,) = read(path).imus.values()
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_forces_are_no_accelerations(tmp_path):
+    names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"F{a}" for a in "xyz")]
+    with pytest.raises(ConfigError, match="no unit of the accel"):
+        read(written(tmp_path / "force.csv", names, [T_S, *COUNTS.T, *(55.0 * ACCEL_G).T]))
+
+
+@pytest.mark.parametrize(("counts", "full"), [(16384, 2), (8192, 4), (4096, 8), (2048, 16)])
+def test_raw_counts_are_asked_with_the_range_that_they_fit(tmp_path, counts, full):
+    raw = np.round(ACCEL_G * counts).astype(int)
+    path = written(tmp_path / "raw.csv", NAMES, [T_S, *raw.T, *COUNTS.astype(int).T])
+    with pytest.raises(ConfigError, match="raw counts of a range of") as caught:
+        read(path)
+    line = (
+        f'# accel_scale = {1 / counts!r}  # with accel_unit = "g", if these are raw counts of ±{full} g ({counts} counts a g)'
+    )
+    assert line in str(caught.value)
+    assert "# gyro_scale = 0.0076335878" in str(caught.value)
+    assert raw_counts(ACCEL_G * counts + 0.5) is None
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "{t}: |Acc X:{a[0]}, Acc Y:{a[1]}, Acc Z:{a[2]} |Gyr X:{g[0]} deg/s, Gyr Y:{g[1]} deg/s, Gyr Z:{g[2]} deg/s",
+        "{{'acc': {{'x': {a[0]}, 'y': {a[1]}, 'z': {a[2]}}}, 'gyro': {{'x': {g[0]}, 'y': {g[1]}, 'z': {g[2]}}}, 't': {t}}}",
+        '{{"time": {t}, "accel": [{a[0]}, {a[1]}, {a[2]}], "gyro": [{g[0]}, {g[1]}, {g[2]}], "temp_c": 25.5}}',
+        "t={t} ax={a[0]} ay={a[1]} az={a[2]} gx={g[0]} gy={g[1]} gz={g[2]}",
+        "[IMU] Time: {t} Accel: ({a[0]}, {a[1]}, {a[2]}), Gyroscope: ({g[0]}, {g[1]}, {g[2]})",
+        "Time: {t}, Acceleration X: {a[0]}, Y: {a[1]}, Z: {a[2]} g, Gyro X: {g[0]}, Y: {g[1]}, Z: {g[2]} deg/s",
+    ],
+)
+def test_rows_that_name_their_numbers(tmp_path, row):
+    gyro = np.round(COUNTS * 0.07, 2)
+    rows = [row.format(t=1000 + 10 * n, a=a, g=g) for n, (a, g) in enumerate(zip(ACCEL_G.tolist(), gyro.tolist(), strict=True))]
+    (tmp_path / "serial.log").write_text("\n".join(["MPU6050 ready", *rows]) + "\n")
+    log = read(tmp_path / "serial.log")
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro), rtol=1e-9)
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-9)
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+    assert "1 lines of other words are left out" in log.remarks.losses
+
+
+@pytest.mark.parametrize("row", ["a: 1 b: - 2 c: 3 d: 4 e: 5", "1.5,2.5,3.5,x: left,4.5", "level: 1, 2"])
+def test_other_rows_name_no_numbers(row):
+    assert as_table("\n".join([row] * 20)) == ("", 0)
+
+
+@pytest.mark.parametrize("name", ["mag_y", "temperature"])
+def test_a_column_that_rises_is_no_time_unless_it_is_the_first(tmp_path, name):
+    columns = [*ACCEL_G.T, *(COUNTS * 0.07).T, 20.0 + T_S]
+    with pytest.raises(ConfigError, match="no column that rises looks like a time"):
+        read(written(tmp_path / "imu.csv", [*NAMES[1:], name], columns))
+    imu = read(written(tmp_path / "imu.csv", ["GPST", *NAMES[1:]], [columns[-1], *columns[:-1]])).imus["/imu0"]
+    assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
+
+
+@pytest.mark.parametrize("order", [["accel", "gyro"], ["gyro", "accel"]])
+def test_a_table_without_header_and_time_asks_its_rate_alone(tmp_path, order):
+    parts = {"accel": ACCEL_G, "gyro": (COUNTS * 0.07).round(2)}
+    six = np.hstack([parts[sensor] for sensor in order])
+    (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in six.tolist()) + "\n")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "imu.csv")
+    assert 'gyro = ["gyro_x", "gyro_y", "gyro_z"]\ngyro_unit = "deg/s"\n' in str(caught.value)
+    assert 'accel_unit = "g"\n' in str(caught.value)
+
+
+def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
+    rows = np.hstack([T_S[:, None], ACCEL_G, COUNTS * 0.07, np.full((COUNT, 1), 25.5)])
+    (tmp_path / "imu.csv").write_text("\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path / "imu.csv")
+    assert '# perhaps accel = ["column 2", "column 3", "column 4"]' in str(caught.value)
+    assert '# perhaps gyro = ["column 5", "column 6", "column 7"]' in str(caught.value)
+
+
+def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
+    names = ["t_ms", *NAMES[1:], "a0", "a1", "a2"]
+    path = written(tmp_path / "audio.csv", names, [1e3 * T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *RNG.normal(600, 9, (3, COUNT))])
+    np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):
+    names = ["", "Stop_watch", *NAMES[1:]]
+    path = written(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
+    assert np.array_equal(np.diff(read(path).imus["/imu0"].t_ns), np.full(COUNT - 1, 10_000_000))
+
+
+def test_imus_on_a_body_become_one_each_and_statistics_none(tmp_path):
+    places = ["chest", "left_leg", "right_leg"]
+    names = ["Millis", *(f"{sensor}{a}_{place}" for place in places for sensor in ("Accel", "Gyro") for a in "XYZ")]
+    columns = [1e3 * T_S, *(part for _ in places for part in (*ACCEL_G.T, *(COUNTS * 0.07).T))]
+    assert {*read(written(tmp_path / "body.csv", names, columns)).imus} == {f"/{place}/imu" for place in places}
+    with pytest.raises(ConfigError, match="0 triples of columns look like the gyro"):
+        read(
+            written(tmp_path / "features.csv", [name.replace("chest", "mean").replace("leg", "std") for name in names], columns)
+        )
+
+
+@pytest.mark.parametrize("names", [NAMES, ["time", *(f"linear_acceleration_{a}" for a in "xyz"), *NAMES[4:]]])
+def test_a_motion_without_gravity_is_asked_though_it_is_as_long_as_gravity_in_g(tmp_path, names):
+    motion = RNG.normal(0.0, 0.65, (COUNT, 3))
+    assert abs(np.median(np.linalg.norm(motion, axis=1)) - 1.0) < 0.15
+    with pytest.raises(ConfigError, match=r"gravity was taken out|no unit of the accel"):
+        read(written(tmp_path / "walk.csv", names, [T_S, *motion.T, *(COUNTS * 0.07).T]))
+    turning = np.linalg.qr(np.random.default_rng(2).normal(size=(COUNT, 3, 3)))[0][:, 0] * RNG.normal(1.0, 0.2, (COUNT, 1))
+    read(written(tmp_path / "tumble.csv", NAMES, [T_S, *turning.T, *(COUNTS * 0.07).T]))
+
+
+def test_a_unit_that_another_time_contradicts_is_asked(tmp_path):
+    gyro = COUNTS * 0.07
+    names = ["NodeTimestamp", "Date", *NAMES[1:]]
+    rows = [
+        ",".join([str(6 * n), f"2026-11-21 15:04:{n * 0.04:06.3f}", *map(repr, row)])
+        for n, row in enumerate(np.hstack([ACCEL_G, gyro]).tolist())
+    ]
+    (tmp_path / "node.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+    with pytest.raises(ConfigError, match=r"'NodeTimestamp' would count ms, but by 'Date' 11.96 s pass and not 1.794 s"):
+        read(tmp_path / "node.csv")
+    log = read(written(tmp_path / "apple.csv", ["timeIntervalSince1970", *NAMES[1:]], [1.7e9 + T_S, *ACCEL_G.T, *gyro.T]))
+    assert len(log.imus["/imu0"]) == COUNT
+
+
+def test_tables_of_a_folder_may_name_their_sensor_in_each_row(tmp_path):
+    parts = {"acce": ACCEL_G, "gyro": COUNTS * 0.07}
+    for name, values in parts.items():
+        rows = [f"{name.upper()};{t:.3f};{t:.3f};{x:.4f};{y:.4f};{z:.4f};0" for t, (x, y, z) in zip(T_S, values, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows) + "\n")
+    np.testing.assert_allclose(read(tmp_path).imus["/imu0"].gyro, np.deg2rad(parts["gyro"]), atol=1e-9)
