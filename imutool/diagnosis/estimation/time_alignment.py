@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
-from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
@@ -25,6 +24,7 @@ from imutool.inertial.correlation import cross_correlation
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
 from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
+from imutool.inertial.wiener import wiener_filter
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
@@ -168,13 +168,19 @@ def _simulated(
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    clean = wiener_filter(even, 1.0 / period_s, settings.alignment)
+    clean = wiener_filter(even, 1.0 / period_s, settings.alignment, _recorded(real.imu, t_s, start_ns))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
     if R_wb is None:
         R_wb = _attitude(real, t_ns)
     return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise
+
+
+def _recorded(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Float64[np.ndarray, "m 6"]:
+    """Recorded samples on a simulation's clock; NaN outside of them."""
+    own_s, columns = seconds(imu.t_ns, start_ns), [*imu.gyro.T, *imu.accel.T]
+    return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
 
 
 def _by_poses(
