@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -32,13 +32,27 @@ class WienerSettings(Settings, frozen=True):
     short_time_parts: Annotated[int, Meta(ge=1)] = 7  # frequencies, and times a quarter of that apart, whose mean is one
 
 
+class NoiseLeft(NamedTuple):
+    """One-sided density of the noise that a filter leaves, by frequency: a motion hides it."""
+
+    f_hz: Float64[np.ndarray, " f"]
+    density: Float64[np.ndarray, "f k"]
+
+
 def wiener_filter(
+    x: Float64[np.ndarray, "n k"], rate_hz: float, settings: WienerSettings | None = None
+) -> Float64[np.ndarray, "n k"]:
+    """Signals without noise, as `denoised`."""
+    return denoised(x, rate_hz, settings)[0]
+
+
+def denoised(
     x: Float64[np.ndarray, "n k"],
     rate_hz: float,
     settings: WienerSettings | None = None,
     recorded: Float64[np.ndarray, "n r"] | None = None,
-) -> Float64[np.ndarray, "n k"]:
-    """Wiener filter of a simulation's signals, by frequency, across signals and in short times.
+) -> tuple[Float64[np.ndarray, "n k"], NoiseLeft]:
+    """Wiener filter of a simulation's signals, by frequency, across signals and in short times; and the noise that is left.
 
     Frequencies that no combination of the recorded signals shares show the noise, of whatever colour (NaN where nothing is
     recorded); without them the top of the spectrum does, and the noise is white. In units of it, the eigenvectors of the
@@ -68,7 +82,8 @@ def wiener_filter(
     here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
     gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
-    return np.asarray(line + clean[size : size + n])
+    left = 2.0 * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0] / (rate_hz * float((stft.win**2).sum()))
+    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
 
 
 def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:

@@ -35,7 +35,8 @@ EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the
 def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
     """Whitened log with its noise model; beside poses also with the band that they know."""
     if pair.exact:
-        return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, pair.settings.noise))
+        residual, rate_hz = _left(pair, candidates), 1.0 / pair.period_s
+        return _counting(pair, level(residual, pair.usable, rate_hz, pair.settings.noise, pair.noise_left))
     assert pair.band_hz is not None
     ideal, works = expected(pair, ()), pair.axes
     band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)
