@@ -52,11 +52,12 @@ def denoised(
     settings: WienerSettings | None = None,
     recorded: Float64[np.ndarray, "n r"] | None = None,
 ) -> tuple[Float64[np.ndarray, "n k"], NoiseLeft]:
-    """Wiener filter of a simulation's signals, by frequency, across signals and in short times; and the noise that is left.
+    """Signals without noise, by a Wiener filter in short times, and the noise that is left.
 
-    Frequencies that no combination of the recorded signals shares show the noise, of whatever colour (NaN where nothing is
-    recorded); without them the top of the spectrum does, and the noise is white. In units of it, the eigenvectors of the
-    cross-spectrum with hardly more than noise go: what a gyro shows of a motion helps an accelerometer that hardly shows it.
+    It filters by frequency and across signals. Frequencies that no combination of the recorded signals shares show the noise,
+    of whatever colour (NaN where nothing is recorded); without them the top of the spectrum does, and the noise is white. In
+    units of it, the eigenvectors of the cross-spectrum with hardly more than noise go: what a gyro shows of a motion helps an
+    accelerometer that hardly shows it.
     What stays is multiplied by 1 - noise / power of its own time: one gain for all of it would leave noise at rest, and take
     from the motion.
     """
