@@ -11,6 +11,7 @@ from typing import Annotated
 import msgspec
 
 from imutool.config import Settings
+from imutool.inertial.wiener import WienerSettings
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
@@ -99,7 +100,7 @@ class TimestampSettings(Settings, frozen=True):
     even_sigma: Positive = 5.0  # deviations by which samples must be nearer to even than to their stamps
 
 
-class AlignmentSettings(Settings, frozen=True):
+class AlignmentSettings(WienerSettings, frozen=True):
     """Alignment of two IMUs in time: by experience on blind cases and logs without an epoch."""
 
     least_s: Positive = 8.0  # of shared time: below, nothing can be fitted and tested
@@ -108,9 +109,6 @@ class AlignmentSettings(Settings, frozen=True):
     farthest_s: Positive = 5.0  # by which clocks of one epoch may differ
     least_correlation: Share = 0.6  # of the angular rates, below which two motions differ
     alike_sigma: tuple[float, float] = (3.0, 6.0)  # over chance, with a shared epoch and at any lag; 210 unrelated pairs: 5.3
-    noise_band: Share = 0.8  # of Nyquist: above, a simulated motion has nothing but noise
-    short_time_s: Positive = 2.5  # of a Wiener filter's gain: a body moves and rests (0.6 to 2.5 s tried, shorter is worse)
-    short_time_parts: Count = 7  # frequencies, and times a quarter of that apart, whose mean power makes a gain
     poses_share: Share = 0.9  # of the simulation that its poses must cover to stand for it
     poses_hz: Positive = 40.0  # slower poses cannot be differentiated twice
     coarse_samples: Count = 5  # of the means in which a misfit between poses and samples stands out

@@ -11,6 +11,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.settings import DiagnoseSettings, SplitSettings
+from imutool.inertial.wiener import NoiseLeft
 from imutool.recording import Poses
 from imutool.sensor.effect import Effect, SignalState, Theta
 from imutool.sensor.samples import NOTHING, IdealMotion, SensorSamples
@@ -126,13 +127,14 @@ class AlignedLog(ABC):
 class Pair(AlignedLog):
     """Aligned IMU samples (rad/s, m/s²) with the `ideal` motion on an even clock.
 
-    `sim_noise` was filtered out of a simulation's samples (zero where its poses replace them), `truth` are the true poses at
-    the stamps.
+    `sim_noise` was filtered out of a simulation's samples but for `noise_left` (zero where its poses replace them), `truth` are
+    the true poses at the stamps.
     """
 
     ideal: IdealMotion = field(kw_only=True)
     truth: Poses | None = field(default=None, kw_only=True)
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
+    noise_left: NoiseLeft | None = field(default=None, kw_only=True)
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING, kw_only=True)
 
     @property

@@ -13,23 +13,19 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import uniform_filter, uniform_filter1d
-from scipy.signal import ShortTimeFFT, csd, welch
-from scipy.signal.windows import hann
+from scipy.signal import csd, welch
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
+from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, WhitenedLog, Whitener, level, settled, whitener
-from imutool.diagnosis.settings import AlignmentSettings, BandSettings
-from imutool.inertial.stationary import nothing_but_noise
+from imutool.diagnosis.settings import BandSettings
 from imutool.noise.bias_walk import WalkLikelihood, walk_likelihood
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect
 
 RIDGE = 1e-8
-MOSTLY = 2.0  # times the white noise: less is noise for the most part
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 OnAxis = tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q _"]]  # parameters that act on an axis, and their derivatives
@@ -39,7 +35,8 @@ EDGES_HZ = (0.5, 0.8, 1.25, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, 25.0)  # of the
 def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -> WhitenedImu:
     """Whitened log with its noise model; beside poses also with the band that they know."""
     if pair.exact:
-        return _counting(pair, level(_left(pair, candidates), pair.usable, 1.0 / pair.period_s, pair.settings.noise))
+        residual, rate_hz = _left(pair, candidates), 1.0 / pair.period_s
+        return _counting(pair, level(residual, pair.usable, rate_hz, pair.settings.noise, pair.noise_left))
     assert pair.band_hz is not None
     ideal, works = expected(pair, ()), pair.axes
     band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)
@@ -261,38 +258,3 @@ def known_band_hz(
             if (known & is_diluted(fast / slow, np.hypot(slow_std, fast_std), coherence)).any():
                 return low  # a lively axis must not hide a quiet one
     return most_hz
-
-
-def wiener_filter(
-    x: Float64[np.ndarray, "n k"], rate_hz: float, settings: AlignmentSettings = DEFAULT.alignment
-) -> Float64[np.ndarray, "n k"]:
-    """Wiener filter of a simulation's signals, by frequency, across signals and in short times.
-
-    The top of the spectrum shows the white noise. In units of it, the eigenvectors of the cross-spectrum with hardly more than
-    noise go: what a gyro shows of a motion helps an accelerometer that hardly shows it. What stays is multiplied by
-    1 - noise / power of its own time: one gain for all of it would leave noise at rest, and take from the motion.
-    """
-    n = len(x)
-    line = np.linspace(x[0], x[-1], n)  # without which the ends meet their own mirror, so that no step shows there
-    noisy = np.array([nothing_but_noise(column) for column in x.T])  # the ends would be taken for a ramp
-    line[:, noisy] = x[:, noisy].mean(axis=0)
-    size = 4 * max(1, min(round(settings.short_time_s * rate_hz), n - 1) // 4)
-    stft = ShortTimeFFT(hann(size, sym=False), size // 4, fs=rate_hz)
-    y = x - line
-    mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
-    parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
-    top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
-    std = np.sqrt(np.maximum(np.median(top, axis=(0, 1)) / np.log(2.0), 1e-300))  # a shock is no noise of other times
-    parts /= std
-    power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
-    power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")
-    value, vector = np.linalg.eigh(power)
-    vector = vector * (value > MOSTLY)[:, None, :]
-    kept = vector @ vector.conj().swapaxes(1, 2)
-    parts = parts @ kept.swapaxes(1, 2)
-    noise = np.abs(np.diagonal(kept, axis1=1, axis2=2))[:, None, :]
-    around_each = (settings.short_time_parts, settings.short_time_parts, 1)
-    here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
-    gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
-    clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
-    return np.asarray(line + clean[size : size + n])

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair, split
-from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.estimation.timestamps import without_jitter
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
@@ -25,6 +24,7 @@ from imutool.inertial.correlation import cross_correlation
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
 from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
+from imutool.inertial.wiener import NoiseLeft, denoised
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
@@ -32,6 +32,7 @@ from imutool.sensor.samples import IdealMotion
 REFINEMENTS = 3  # of a lag
 KNOWN_SHARE = 0.5  # of the samples that have a true pose, from which on the poses are worth drawing
 LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
+Simulated = tuple[IdealMotion, Float64[np.ndarray, "6"], NoiseLeft | None]
 
 
 def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT) -> list[Pair]:
@@ -50,16 +51,16 @@ def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings 
         )
     start_ns = int(real.imu.t_ns[0])
     stamp_s = seconds(real.imu.t_ns, start_ns)
-    found: list[tuple[IdealMotion, Float64[np.ndarray, "6"], Bool[np.ndarray, " n"]]] = []
+    found: list[tuple[Simulated, Bool[np.ndarray, " n"]]] = []
     for part in _stretches(sim, settings):
         t_sim = seconds(part.imu.t_ns, start_ns) - shift_s  # on the recording's clock
-        ideal, noise = _simulated(t_sim, part, shift_s, start_ns, real, settings)
-        found.append((ideal, noise, (stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])))
-    shared_s = [_shared_s(stamp_s, inside) for _, _, inside in found]
+        simulated = _simulated(t_sim, part, shift_s, start_ns, real, settings)
+        found.append((simulated, (stamp_s >= simulated[0].t_s[0]) & (stamp_s <= simulated[0].t_s[-1])))
+    shared_s = [_shared_s(stamp_s, inside) for _, inside in found]
     least_s = min(settings.alignment.least_s, max(shared_s))
     return [
-        _pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, None, settings)
-        for (ideal, noise, inside), shared in zip(found, shared_s, strict=True)
+        replace(_pair(real, ideal, stamp_s, inside, "simulation", shift_s, noise, None, settings), noise_left=left)
+        for ((ideal, noise, left), inside), shared in zip(found, shared_s, strict=True)
         if shared >= least_s
     ]
 
@@ -155,8 +156,8 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
 
 def _simulated(
     t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording, settings: DiagnoseSettings
-) -> tuple[IdealMotion, Float64[np.ndarray, "6"]]:
-    """Simulated motion without noise on an even clock, and the noise that was filtered out."""
+) -> Simulated:
+    """Simulated motion without noise on an even clock, the noise that was filtered out, and what is left of it."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
     noise = white_noise(samples)
     t_sim = without_jitter(t_sim, samples, settings.timestamps)
@@ -165,16 +166,22 @@ def _simulated(
     if ideal is not None:
         t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + ideal.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-        return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6)
+        return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6), None
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    clean = wiener_filter(even, 1.0 / period_s, settings.alignment)
+    clean, left = denoised(even, 1.0 / period_s, settings.alignment, _recorded(real.imu, t_s, start_ns))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
     if R_wb is None:
         R_wb = _attitude(real, t_ns)
-    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise
+    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, left
+
+
+def _recorded(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Float64[np.ndarray, "m 6"]:
+    """Recorded samples on a simulation's clock; NaN outside of them."""
+    own_s, columns = seconds(imu.t_ns, start_ns), [*imu.gyro.T, *imu.accel.T]
+    return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
 
 
 def _by_poses(

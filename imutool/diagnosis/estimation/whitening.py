@@ -19,6 +19,7 @@ from scipy.signal import firwin, lfilter, periodogram
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, AlignedLog, Blocks, Pair
 from imutool.diagnosis.settings import NoiseSettings
+from imutool.inertial.wiener import NoiseLeft
 from imutool.noise.bias_walk import without_walk
 
 Rows = Sequence[Float64[np.ndarray, " n"]] | Float64[np.ndarray, "r n"]
@@ -204,11 +205,15 @@ def whitener(
 
 
 def level(
-    residual: Float64[np.ndarray, "n k"], usable: Bool[np.ndarray, "n ..."], rate_hz: float, settings: NoiseSettings
+    residual: Float64[np.ndarray, "n k"],
+    usable: Bool[np.ndarray, "n ..."],
+    rate_hz: float,
+    settings: NoiseSettings,
+    left: NoiseLeft | None = None,
 ) -> Whitener:
     """Whitening filters of a sensor beside an exact simulation, or above the band of its poses.
 
-    As `whitener`, but below `motion_hz` the noise is taken to be what it is above.
+    As `whitener`, but below `motion_hz` the noise is taken to be what it is above, and what is `left` of a simulation's own.
 
     What is left down there may be physics that nobody thought of, and must not be taken for noise.
     """
@@ -221,6 +226,8 @@ def level(
         power = median_filter(power, settings.line_bins, mode="nearest")  # a line is no noise
         low, high = min(settings.motion_hz, 0.3 * rate_hz), min(settings.reference_hz, 0.45 * rate_hz)
         power[f_hz < low] = np.median(power[(f_hz >= low) & (f_hz <= high)])
+        if left is not None:
+            power[f_hz < low] += np.interp(f_hz[f_hz < low], left.f_hz, left.density[:, axis])
         filters[axis], std[axis] = autoregression(power, rate_hz, settings.order)
     return Whitener(filters, std)
 

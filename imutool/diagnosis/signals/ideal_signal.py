@@ -12,10 +12,10 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import firwin, welch
 
 from imutool.array_types import Float64, Int64
-from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.errors import DataError
+from imutool.inertial.wiener import wiener_filter
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
 from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamics, following, identified

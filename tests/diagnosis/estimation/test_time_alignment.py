@@ -15,9 +15,9 @@ from support import planted
 from imutool.converters import fetch
 from imutool.diagnosis.estimation.aligned_log import Pair, split
 from imutool.diagnosis.estimation.jacobians import expected
-from imutool.diagnosis.estimation.noise_estimate import wiener_filter
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
 from imutool.errors import DataError
+from imutool.inertial.wiener import wiener_filter
 from imutool.recording import Recording, Scalars
 
 KEPT = 0.01  # of a signal below a tenth of Nyquist that the filter may change

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter, sosfilt
 
 from imutool.diagnosis.estimation.whitening import Band, Whitener, burg, level, settled, whitener
 from imutool.diagnosis.settings import NoiseSettings
+from imutool.inertial.wiener import NoiseLeft
 
 N, RATE_HZ, STD = 12_000, 100.0, 0.01
 SIGMAS = 4.5  # of a sample autocorrelation, one over the root of the count; some 60 are looked at
@@ -98,6 +99,17 @@ def test_rows_are_filtered_as_the_books_filters_do(banded: bool) -> None:
 def test_level_of_white_noise_is_its_size(seed: int, count: int) -> None:
     w = level(STD * white(seed, count), np.ones(count, bool), RATE_HZ, NoiseSettings())
     np.testing.assert_allclose(w(STD * white(seed, count))[6:].std(axis=0), 1.0, atol=LEVEL)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_level_counts_what_is_left_of_a_simulations_noise_where_a_motion_hides_it(seed: int) -> None:
+    """Noise of twice the size below a tenth of the rate, as of a simulation that moves up to there."""
+    slow = sosfilt(butter(4, 0.1 * RATE_HZ, fs=RATE_HZ, output="sos"), 2.0 * STD * white(seed + 10), axis=0)
+    edge_hz = np.array([0.0, 0.1, 0.1 + 1e-6, 0.5]) * RATE_HZ
+    left = NoiseLeft(edge_hz, np.outer([1.0, 1.0, 0.0, 0.0], 2.0 * (2.0 * STD) ** 2 / RATE_HZ * np.ones(6)))
+    x, settings = STD * white(seed) + slow, NoiseSettings(motion_hz=0.15 * RATE_HZ, reference_hz=0.4 * RATE_HZ)
+    means = [level(x, np.ones(N, bool), RATE_HZ, settings, known)(x)[20:].std(axis=0) for known in (left, None)]
+    assert np.abs(means[0] - 1.0).max() < 0.1 < np.abs(means[1] - 1.0).min()
 
 
 def test_level_does_not_take_a_slow_misfit_for_noise() -> None:

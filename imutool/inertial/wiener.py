@@ -1,0 +1,124 @@
+"""Wiener filter of simulated signals; noise is what a recording does not share."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta
+from scipy.ndimage import binary_erosion, median_filter, uniform_filter, uniform_filter1d
+from scipy.signal import ShortTimeFFT
+from scipy.signal.windows import hann
+from scipy.stats import beta
+
+from imutool.array_types import Bool, Complex128, Float64
+from imutool.config import Settings
+from imutool.inertial.stationary import nothing_but_noise
+
+MOSTLY = 2.0  # times the noise: less is noise for the most part
+OVERLAP = 4  # windows begin a quarter of a window apart
+INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequencies (noise alone: 0.5 and 0.67)
+CHANCE = 1e-4  # of noise to share more at one frequency
+APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
+SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
+Parts = Complex128[np.ndarray, "f t k"]
+
+
+class WienerSettings(Settings, frozen=True):
+    """Settings of the filter: by experience on blind cases."""
+
+    noise_band: Annotated[float, Meta(gt=0, le=1)] = 0.8  # of Nyquist: above, a simulated motion has nothing but noise
+    short_time_s: Annotated[float, Meta(gt=0)] = 2.5  # of a gain: a body moves and rests (0.6 to 2.5 s tried, shorter is worse)
+    short_time_parts: Annotated[int, Meta(ge=1)] = 7  # frequencies, and times a quarter of that apart, whose mean is one
+
+
+class NoiseLeft(NamedTuple):
+    """One-sided density of the noise that a filter leaves, by frequency: a motion hides it."""
+
+    f_hz: Float64[np.ndarray, " f"]
+    density: Float64[np.ndarray, "f k"]
+
+
+def wiener_filter(
+    x: Float64[np.ndarray, "n k"], rate_hz: float, settings: WienerSettings | None = None
+) -> Float64[np.ndarray, "n k"]:
+    """Signals without noise, as `denoised`."""
+    return denoised(x, rate_hz, settings)[0]
+
+
+def denoised(
+    x: Float64[np.ndarray, "n k"],
+    rate_hz: float,
+    settings: WienerSettings | None = None,
+    recorded: Float64[np.ndarray, "n r"] | None = None,
+) -> tuple[Float64[np.ndarray, "n k"], NoiseLeft]:
+    """Signals without noise, by a Wiener filter in short times, and the noise that is left.
+
+    It filters by frequency and across signals. Frequencies that no combination of the recorded signals shares show the noise,
+    of whatever colour (NaN where nothing is recorded); without them the top of the spectrum does, and the noise is white. In
+    units of it, the eigenvectors of the cross-spectrum with hardly more than noise go: what a gyro shows of a motion helps an
+    accelerometer that hardly shows it.
+    What stays is multiplied by 1 - noise / power of its own time: one gain for all of it would leave noise at rest, and take
+    from the motion.
+    """
+    n, settings = len(x), settings or WienerSettings()
+    line = np.linspace(x[0], x[-1], n)  # without which the ends meet their own mirror, so that no step shows there
+    noisy = np.array([nothing_but_noise(column) for column in x.T])  # the ends would be taken for a ramp
+    line[:, noisy] = x[:, noisy].mean(axis=0)
+    size = 4 * max(1, min(round(settings.short_time_s * rate_hz), n - 1) // 4)
+    stft = ShortTimeFFT(hann(size, sym=False), size // OVERLAP, fs=rate_hz)
+    y = x - line
+    mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
+    parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
+    std = _noise_std(parts, None if recorded is None else _shared(x, recorded, stft, settings), settings)[:, None]
+    parts /= std
+    power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
+    power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")
+    value, vector = np.linalg.eigh(power)
+    vector = vector * (value > MOSTLY)[:, None, :]
+    kept = vector @ vector.conj().swapaxes(1, 2)
+    parts = parts @ kept.swapaxes(1, 2)
+    noise = np.abs(np.diagonal(kept, axis1=1, axis2=2))[:, None, :]
+    around_each = (settings.short_time_parts, settings.short_time_parts, 1)
+    here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
+    gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
+    clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
+    left = 2.0 * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0] / (rate_hz * float((stft.win**2).sum()))
+    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
+
+
+def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:
+    """Noise of the parts by frequency: by those that are not shared, and as white as the top where none are."""
+    power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
+    top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
+    out = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1))
+    apart = APART * settings.short_time_parts
+    for k, column in enumerate(shared.T if shared is not None else ()):
+        own = np.flatnonzero(binary_erosion(~column, iterations=apart, border_value=True))
+        if column.any() and len(own) > SMOOTH * settings.short_time_parts:
+            level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
+            out[:, k] = np.interp(np.arange(len(out)), own, level)
+    return np.asarray(np.sqrt(np.maximum(out, 1e-300)))
+
+
+def _shared(
+    x: Float64[np.ndarray, "n k"], recorded: Float64[np.ndarray, "n r"], stft: ShortTimeFFT, settings: WienerSettings
+) -> Bool[np.ndarray, "f k"] | None:
+    """Frequencies at which signals share more than chance with recorded ones (multiple coherence); None in too short a time."""
+    rows, around = np.flatnonzero(np.isfinite(recorded).all(axis=1)), settings.short_time_parts
+    if not len(rows) or rows[-1] + 1 - rows[0] < stft.m_num:
+        return None
+    both = np.concatenate([recorded, x], axis=1)[rows[0] : rows[-1] + 1]
+    both = both - np.linspace(both[0], both[-1], len(both))
+    inside = slice(stft.lower_border_end[1], stft.upper_border_begin(len(both))[1])
+    parts = np.moveaxis(stft.stft(both, axis=0), 1, 2)[:, inside]
+    independent = round(INDEPENDENT[0] * parts.shape[1] * INDEPENDENT[1] * around)
+    r = recorded.shape[1]
+    if independent <= 2 * r:
+        return None
+    power = uniform_filter1d(np.einsum("fti,ftj->fij", parts, parts.conj()), around, axis=0, mode="nearest")
+    own = np.maximum(np.abs(np.diagonal(power, axis1=1, axis2=2)), 1e-300)
+    power /= np.sqrt(own[:, :, None] * own[:, None, :])
+    of_recorded, cross = power[:, :r, :r] + 1e-9 * np.eye(r), power[:, :r, r:]
+    coherence = np.einsum("frk,frk->fk", cross.conj(), np.linalg.solve(of_recorded, cross)).real
+    return np.asarray(coherence > beta.isf(CHANCE, r, independent - r))

@@ -1,0 +1,68 @@
+"""Noise that is not white: what a recording of the same motion does not share goes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter, sosfilt
+
+from imutool.inertial.wiener import denoised, wiener_filter
+
+RATE_HZ, DURATION_S, MOTION_HZ = 400.0, 60.0, 5.0
+
+
+def motion(seed: int) -> np.ndarray:
+    """Three signals of one motion."""
+    t = np.arange(0.0, DURATION_S, 1.0 / RATE_HZ)
+    rng = np.random.default_rng(seed)
+    wave = 2.0 * np.pi * np.multiply.outer(t, rng.uniform(0.1, MOTION_HZ, (60, 3))) + rng.uniform(0.0, 2.0 * np.pi, (60, 3))
+    return np.sin(wave).sum(axis=1) / np.sqrt(30.0)
+
+
+def slow_noise(like: np.ndarray, cutoff_hz: float, seed: int) -> np.ndarray:
+    """Noise behind a low-pass, far below the rate."""
+    keep = np.exp(-2.0 * np.pi * cutoff_hz / RATE_HZ)
+    white = 0.5 * np.random.default_rng([seed, 1]).normal(size=like.shape)
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], white, axis=0))
+
+
+def faster(x: np.ndarray) -> float:
+    """Size of what is twice as fast as the motion, away from the ends."""
+    return float(
+        np.sqrt((sosfilt(butter(6, 2.0 * MOTION_HZ, "high", fs=RATE_HZ, output="sos"), x, axis=0)[800:-800] ** 2).mean())
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("cutoff_hz", [20.0, 40.0])
+def test_noise_behind_a_low_pass_goes_where_a_recording_does_not_share_it(seed: int, cutoff_hz: float) -> None:
+    x = motion(seed)
+    noise = slow_noise(x, cutoff_hz, seed)
+    recorded = 0.95 * x + 0.1 * np.random.default_rng([seed, 2]).normal(size=x.shape)
+    recorded[: round(RATE_HZ)] = np.nan  # the simulation begins before
+    clean, alone = (denoised(x + noise, RATE_HZ, recorded=known)[0] for known in (recorded, None))
+    assert faster(clean) < 0.1 * faster(noise) < 0.5 * faster(alone)
+    inner = slice(800, -800)
+    gain = (clean * x)[inner].sum(axis=0) / (clean**2)[inner].sum(axis=0)
+    np.testing.assert_allclose(gain, 1.0, atol=0.02)
+
+
+def test_nothing_is_taken_from_a_motion_that_has_no_noise() -> None:
+    x = motion(0)
+    recorded = x + 0.1 * np.random.default_rng(2).normal(size=x.shape)
+    off = denoised(x, RATE_HZ, recorded=recorded)[0] - x
+    assert np.sqrt((off**2).mean()) < 0.01 * np.sqrt((x**2).mean())
+
+
+def test_a_recording_of_another_motion_says_nothing_of_the_noise() -> None:
+    x, recorded = motion(0) + 0.1 * np.random.default_rng(3).normal(size=(24_000, 3)), motion(1)
+    np.testing.assert_allclose(denoised(x, RATE_HZ, recorded=recorded)[0], wiener_filter(x, RATE_HZ), atol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_that_is_left_under_a_motion_is_told_with_its_density(seed: int) -> None:
+    x, size = motion(seed), 0.2
+    _, left = denoised(x + size * np.random.default_rng([seed, 1]).normal(size=x.shape), RATE_HZ)
+    density = 2.0 * size**2 / RATE_HZ
+    np.testing.assert_allclose(left.density[(left.f_hz > 1.0) & (left.f_hz < 4.0)].mean(axis=0), density, rtol=0.2)
+    assert left.density[left.f_hz > 3.0 * MOTION_HZ].max() < 0.1 * density
