@@ -10,7 +10,6 @@ from imutool.array_types import Float64, Int64
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.cleaning.unit_evidence import POSES_APART_NS
-from imutool.inertial.correlation import cross_correlation
 from imutool.recording import seconds
 from imutool.recording.columns import median
 
@@ -57,6 +56,8 @@ def _clock_difference(motion: Motion, truth: Truth) -> float | None:
         return None
     true = np.interp(STEP_S * np.arange(count[0]), true_s, np.linalg.norm(rate, axis=1))
     gyro = np.interp(step[0] + np.arange(count[1]), step, np.linalg.norm(mean[:, :3] - median(mean[:, :3]), axis=1))
+    from imutool.inertial.correlation import cross_correlation  # scipy, which poses on the IMU's clock never need
+
     found = cross_correlation(gyro, true, LEAST_SHARED)
     lag, value, sigma = found.best(np.ones(len(found.lag), bool))
     if value < WEAK or sigma < CERTAIN:

@@ -16,7 +16,7 @@ from imutool.errors import DataError, LogError
 from imutool.file_location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import PoseBatch, decode_image
+from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, decode_image
 from imutool.mcap_io.codec.joined_imu import pairs_by_name, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
@@ -26,6 +26,7 @@ from imutool.mcap_io.topics import (
     ENCODINGS,
     MESSAGE_POSES,
     PART_KEY,
+    StampCheck,
     Topic,
     joined_topic,
     reflected_topics,
@@ -227,15 +228,28 @@ class Log:
                     times = found.times()[found.of_channels(channels)]
                     yield from [times] if len(times) else []
 
+    def imu_batches(self, topic: str) -> Iterator[ImuBatch]:
+        """The messages of an IMU topic in file order, a chunk at a time.
+
+        Raises:
+            LogError: no such IMU topic, another encoding, NaN or infinite values, stamps that do not increase, damage.
+        """
+        described, stamps = self.topic(topic, (schemas.IMU,)), StampCheck()
+        for _, rows in self.rows([described.name]):
+            with self.named(described.name):
+                for batch in described.decode_imu(rows):
+                    stamps.check_imu(batch)
+                    yield batch
+
     def pose_batches(self, topic: str, end_ns: int | None = None) -> Iterator[PoseBatch]:
-        """The poses of a topic in file order; of a TFMessage one batch per transform in it."""
+        """The poses of a topic in file order; of a TFMessage one batch per transform in it; LogError as `imu_batches`."""
         described = self.topic(topic, (*MESSAGE_POSES, schemas.TF))
         for _, rows in self.rows([topic], end_ns=end_ns):
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
     def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
-        """Stamp and encoded bytes of every image of a CompressedImage topic, in file order."""
+        """Stamp and encoded bytes of every image of a CompressedImage topic, in file order; LogError as `imu_batches`."""
         encoding = self.topic(topic, (schemas.IMAGE,)).message_encoding
         for _, rows in self.rows([topic], start_ns, end_ns):
             with self.named(topic):

@@ -193,6 +193,18 @@ class StampCheck:
             )
         self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
+    def check_imu(self, batch: ImuBatch) -> None:
+        """Takes in the next samples of an IMU.
+
+        Raises:
+            LogError: NaN, infinity, or a stamp that does not come after the one before it.
+        """
+        try:
+            check_finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+            self.check(batch.stamp_ns, batch.sequence)
+        except LogError as error:
+            raise LogError(error.what, expected=error.expected, fix=error.fix or CLEAN_FIX) from error
+
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:
     """The topics of a log by their names, in order of their channel ids.
