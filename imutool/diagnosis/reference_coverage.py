@@ -112,7 +112,7 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
     """Intervals of the recording that the simulation or its own poses cover without a hole."""
     if sim is not None:
         shared = _shared_stretches(real, sim)
-        for pair in with_simulation(real, sim, settings):
+        for pair in with_simulation(real, sim, settings, own_poses=bool(shared)):
             yield replace(pair, band_hz=_shared_band_hz(pair, shared)) if shared else pair
         return
     if not real.truths:

@@ -14,6 +14,7 @@ from scipy.stats import beta
 from imutool.array_types import Bool, Complex128, Float64
 from imutool.config import Settings
 from imutool.inertial.stationary import nothing_but_noise
+from imutool.recording import Imu, seconds
 
 MOSTLY = 2.0  # times the noise: less is noise for the most part
 OVERLAP = 4  # windows begin a quarter of a window apart
@@ -62,9 +63,7 @@ def denoised(
     from the motion.
     """
     n, settings = len(x), settings or WienerSettings()
-    line = np.linspace(x[0], x[-1], n)  # without which the ends meet their own mirror, so that no step shows there
-    noisy = np.array([nothing_but_noise(column) for column in x.T])  # the ends would be taken for a ramp
-    line[:, noisy] = x[:, noisy].mean(axis=0)
+    line = _line(x)
     size = 4 * max(1, min(round(settings.short_time_s * rate_hz), n - 1) // 4)
     stft = ShortTimeFFT(hann(size, sym=False), size // OVERLAP, fs=rate_hz)
     y = x - line
@@ -87,6 +86,22 @@ def denoised(
     return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
 
 
+def _line(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
+    """Lines from end to end, without which the ends meet their own mirror, so that no step shows there.
+
+    Of noise alone it is the mean: its ends would be taken for a ramp.
+    """
+    line, noisy = np.linspace(x[0], x[-1], len(x)), np.array([nothing_but_noise(column) for column in x.T])
+    line[:, noisy] = x[:, noisy].mean(axis=0)
+    return np.asarray(line)
+
+
+def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Float64[np.ndarray, "m 6"]:
+    """Recorded samples at the times of a simulation; NaN outside of them."""
+    own_s, columns = seconds(imu.t_ns, start_ns), [*imu.gyro.T, *imu.accel.T]
+    return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
+
+
 def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:
     """Noise of the parts by frequency: by those that are not shared, and as white as the top where none are."""
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
@@ -95,7 +110,8 @@ def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: W
     apart = APART * settings.short_time_parts
     for k, column in enumerate(shared.T if shared is not None else ()):
         own = np.flatnonzero(binary_erosion(~column, iterations=apart, border_value=True))
-        if column.any() and len(own) > SMOOTH * settings.short_time_parts:
+        by_chance = settings.short_time_parts  # of frequencies whose means overlap
+        if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
     return np.asarray(np.sqrt(np.maximum(out, 1e-300)))
@@ -109,7 +125,7 @@ def _shared(
     if not len(rows) or rows[-1] + 1 - rows[0] < stft.m_num:
         return None
     both = np.concatenate([recorded, x], axis=1)[rows[0] : rows[-1] + 1]
-    both = both - np.linspace(both[0], both[-1], len(both))
+    both = both - _line(both)
     inside = slice(stft.lower_border_end[1], stft.upper_border_begin(len(both))[1])
     parts = np.moveaxis(stft.stft(both, axis=0), 1, 2)[:, inside]
     independent = round(INDEPENDENT[0] * parts.shape[1] * INDEPENDENT[1] * around)

@@ -66,3 +66,9 @@ def test_the_noise_that_is_left_under_a_motion_is_told_with_its_density(seed: in
     density = 2.0 * size**2 / RATE_HZ
     np.testing.assert_allclose(left.density[(left.f_hz > 1.0) & (left.f_hz < 4.0)].mean(axis=0), density, rtol=0.2)
     assert left.density[left.f_hz > 3.0 * MOTION_HZ].max() < 0.1 * density
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_white_noise_gets_no_colour_from_what_it_shares_by_chance(seed: int) -> None:
+    x, recorded = np.random.default_rng(seed).normal(size=(2, 2_400, 6))
+    assert np.array_equal(denoised(x, 100.0, recorded=recorded)[0], wiener_filter(x, 100.0))

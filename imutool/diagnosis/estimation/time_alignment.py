@@ -24,7 +24,7 @@ from imutool.inertial.correlation import cross_correlation
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
 from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
-from imutool.inertial.wiener import NoiseLeft, denoised
+from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
@@ -35,7 +35,9 @@ LEAST_NOISE = np.array([1e-4] * 3 + [1e-3] * 3)
 Simulated = tuple[IdealMotion, Float64[np.ndarray, "6"], NoiseLeft | None]
 
 
-def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT) -> list[Pair]:
+def with_simulation(
+    real: Recording, sim: Recording, settings: DiagnoseSettings = DEFAULT, own_poses: bool = False
+) -> list[Pair]:
     """Align a recording with each stretch of a simulation of the same motion.
 
     Raises:
@@ -54,7 +56,7 @@ def with_simulation(real: Recording, sim: Recording, settings: DiagnoseSettings 
     found: list[tuple[Simulated, Bool[np.ndarray, " n"]]] = []
     for part in _stretches(sim, settings):
         t_sim = seconds(part.imu.t_ns, start_ns) - shift_s  # on the recording's clock
-        simulated = _simulated(t_sim, part, shift_s, start_ns, real, settings)
+        simulated = _simulated(t_sim, part, shift_s, start_ns, real, settings, own_poses)
         found.append((simulated, (stamp_s >= simulated[0].t_s[0]) & (stamp_s <= simulated[0].t_s[-1])))
     shared_s = [_shared_s(stamp_s, inside) for _, inside in found]
     least_s = min(settings.alignment.least_s, max(shared_s))
@@ -155,7 +157,13 @@ def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.nd
 
 
 def _simulated(
-    t_sim: Float64[np.ndarray, " m"], sim: Recording, shift_s: float, start_ns: int, real: Recording, settings: DiagnoseSettings
+    t_sim: Float64[np.ndarray, " m"],
+    sim: Recording,
+    shift_s: float,
+    start_ns: int,
+    real: Recording,
+    settings: DiagnoseSettings,
+    own_poses: bool,
 ) -> Simulated:
     """Simulated motion without noise on an even clock, the noise that was filtered out, and what is left of it."""
     samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
@@ -169,19 +177,14 @@ def _simulated(
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6), None
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    clean, left = denoised(even, 1.0 / period_s, settings.alignment, _recorded(real.imu, t_s, start_ns))
+    recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns)  # which does not share errors of poses either
+    clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
     R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
     if R_wb is None:
         R_wb = _attitude(real, t_ns)
-    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, left
-
-
-def _recorded(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Float64[np.ndarray, "m 6"]:
-    """Recorded samples on a simulation's clock; NaN outside of them."""
-    own_s, columns = seconds(imu.t_ns, start_ns), [*imu.gyro.T, *imu.accel.T]
-    return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
+    return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, None if own_poses else left
 
 
 def _by_poses(
