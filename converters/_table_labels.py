@@ -14,9 +14,10 @@ from ._table_names import unit_named
 LOOKED_AT = 200  # first lines, which show the words between the numbers
 LEAST_ROWS, LEAST_SHARE = 5, 0.5  # of the lines looked at that have the same words
 LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
+LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
     r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
-    r"|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\w.^])"
+    r"|[-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)(?![\w.^])"
 )
 LABEL = re.compile(r"[A-Za-zµ°][^:=]*[:=]\s*[\[({'\"]*\s*$")
 SIGN = re.compile(r"[-+]\s*$")  # apart from its number
@@ -37,8 +38,10 @@ def as_table(text: str) -> tuple[str, int]:
 
 def _words(line: str) -> tuple[str, ...]:
     """What stands before each number and behind the last; empty where fewer than two numbers have a label."""
+    if len(line) > LONGEST_LINE:
+        return ()
     words = tuple(NUMBER.split(line)[::2])
-    named = sum(map(bool, map(LABEL.search, words[:-1])))
+    named = sum(bool(LABEL.search(text[-LONGEST_LABEL:])) for text in words[:-1])
     return words if len(words) > LEAST_NUMBERS and named >= LEAST_LABELS and not any(map(SIGN.search, words)) else ()
 
 

@@ -111,12 +111,9 @@ class Proposal(msgspec.Struct):
         for name in (*asked_for, *(name for name in self.entries if name not in left_out)):
             value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
             text = json.dumps(value, ensure_ascii=False)
-            asked = f"please state: {' or '.join(UNITS_OF.get(name, ['the columns']))}"
-            asked = (
-                f"please confirm: {'these columns' if isinstance(value, list) else asked[14:]}?"
-                if name in self.entries
-                else asked
-            )
+            choices = " or ".join(UNITS_OF.get(name, ["the columns"]))
+            proposed = "these columns" if isinstance(value, list) else choices
+            asked = f"please confirm: {proposed}?" if name in self.entries else f"please state: {choices}"
             lines.append(f"{name} = {text}" + (f"  # {asked}" if name in self.open else ""))
         if several:
             lines.append(
