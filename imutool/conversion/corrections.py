@@ -76,14 +76,16 @@ class Corrections:
         return replace(content, messages=lambda: self._in_order(content), metadata=metadata)
 
     def _in_order(self, content: MessageLog) -> Iterator[Message]:
-        """Corrected messages; where the poses come from another clock, they are sorted in by the corrected one."""
+        """Corrected messages; where poses come from another clock, they are sorted in by the corrected one."""
         if abs(self.late_ns) < SAME_CLOCK_NS:
             return self._each(content.messages())
-        others, poses = (self._where(content, is_pose) for is_pose in (False, True))
-        return heapq.merge(others, poses, key=lambda message: message.log_time)
+        others, moved = (self._where(content, is_moved) for is_moved in (False, True))
+        return heapq.merge(others, moved, key=lambda message: message.log_time)
 
-    def _where(self, content: MessageLog, is_pose: bool) -> Iterator[Message]:
-        return (message for message in self._each(content.messages()) if _is_pose(message.topic) is is_pose)
+    def _where(self, content: MessageLog, is_moved: bool) -> Iterator[Message]:
+        """Corrected messages whose log time has moved, or the others."""
+        both = zip(content.messages(), self._each(content.messages()), strict=True)
+        return (after for before, after in both if (after.log_time != before.log_time) is is_moved)
 
     def _each(self, messages: Iterator[Message]) -> Iterator[Message]:
         seen = Counter[str]()
@@ -99,7 +101,6 @@ class Corrections:
 
     def _corrected(self, message: Message) -> Message:
         topic = message.topic
-        name = schemas.canonical(topic.schema_name)
         if topic.message_encoding not in ENCODINGS:
             return message
         if topic.name in self.imus:
@@ -107,32 +108,31 @@ class Corrections:
         turned = bool((self.world != np.eye(3)).any())
         if not _is_pose(topic) or not (turned or self.late_ns or self.body is not NOT_TURNED):
             return message
-        if abs(self.late_ns) > SAME_CLOCK_NS:
-            message = message._replace(
-                log_time=message.log_time - self.late_ns, publish_time=message.publish_time - self.late_ns
-            )
-        if name != schemas.VECTOR3:
-            return message._replace(payload=self._poses(topic, bytes(message.payload)))
         patch = MessagePatch(topic, bytes(message.payload))
-        patch.numbers()[:] = self.world @ patch.numbers()
-        patch.move_stamp(-self.late_ns)
+        before_ns = patch.stamp_ns()
+        self._correct_poses(topic, patch)
+        moved_ns = patch.stamp_ns() - before_ns
+        if abs(moved_ns) > SAME_CLOCK_NS:
+            message = message._replace(log_time=message.log_time + moved_ns, publish_time=message.publish_time + moved_ns)
         return message._replace(payload=bytes(patch.data))
 
-    def _poses(self, topic: MessageTopic, payload: bytes) -> bytes:
-        patch = MessagePatch(topic, payload)
+    def _correct_poses(self, topic: MessageTopic, patch: MessagePatch) -> None:
+        """Correct the poses or the velocity in the judged poses' frame."""
         named = 2 if "text" in schemas.SHAPES[patch.schema_name] else 1
         turn, body = quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
         for which in range(len(patch.layout.stamps)):
             if patch.layout.texts[named * which] != self.frame_id:
                 continue
             numbers = patch.numbers(which)
+            patch.move_stamp(-self.late_ns, which)
+            if patch.schema_name == schemas.VECTOR3:
+                numbers[:] = self.world @ numbers
+                continue
             numbers[schemas.POSITION] = self.world @ numbers[schemas.POSITION]
             q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW][None].astype(np.float64)
             if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
                 q_wxyz = quaternion.multiply(q_wxyz, body)
             numbers[schemas.XYZW] = quaternion.multiply(turn, q_wxyz)[0][XYZW_FROM_WXYZ]
-            patch.move_stamp(-self.late_ns, which)
-        return bytes(patch.data)
 
 
 def _is_pose(topic: MessageTopic) -> bool:

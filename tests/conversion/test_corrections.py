@@ -13,8 +13,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
+from imutool import registry
 from imutool.api.models import debias as debias_log
-from imutool.conversion.corrections import RECORD
+from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.run import convert
 from imutool.errors import LogError
 from imutool.log_info.inspection import inspect
@@ -22,6 +23,7 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
+from imutool.recording.message_log import Message
 from imutool.sensor.made_up_flight import flight
 
 P = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -107,6 +109,28 @@ def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_
         )
     )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "right.mcap"]
+
+
+def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
+    """Odometry on the IMU's clock, in a frame of its own, beside a motion capture on another clock."""
+    made = flight(3, duration_s=60.0, rate_hz=100.0, truth_rate_hz=50.0)
+    late = replace(made.truth, t_ns=made.truth.t_ns + 3_600 * 10**9)
+    write(replace(made, truths={"/mocap/pose": late, "/odom/pose": made.truth}), tmp_path / "both.mcap")
+    corrections = Corrections(frame_id="world", late_ns=3_600 * 10**9, pose_topic="/mocap/pose", notes={"/mocap/pose": "late"})
+    module = registry.load("imutool.converters", "mcap_log")
+    content = module.read_sequence(next(iter(module.sequences(tmp_path / "both.mcap"))))
+
+    def renamed(message: Message) -> Message:
+        if message.topic.name != "/odom/pose":
+            return message
+        return message._replace(payload=bytes(message.payload).replace(b"world", b"earth"))
+
+    renamed_content = replace(content, messages=lambda: map(renamed, content.messages()))
+    corrected = list(corrections.put_on(renamed_content).messages())
+    times = {name: [m.log_time for m in corrected if m.topic.name == name] for name in ("/imu0", "/mocap/pose", "/odom/pose")}
+    assert times["/odom/pose"] == made.truth.t_ns.tolist()
+    assert times["/mocap/pose"] == made.truth.t_ns.tolist()
+    assert [m.log_time for m in corrected] == sorted(m.log_time for m in corrected)
 
 
 def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
