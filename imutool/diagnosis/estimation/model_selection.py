@@ -129,8 +129,8 @@ class _Search:
 
     @property
     def tried(self) -> int:
-        """Number of hypotheses of the Bonferroni correction."""
-        return self.candidates.count((*self.named, *self.unnamed))
+        """Number of hypotheses of the Bonferroni correction; one where the motion shows no candidate."""
+        return max(1, self.candidates.count((*self.named, *self.unnamed)))
 
     @property
     def threshold(self) -> float:

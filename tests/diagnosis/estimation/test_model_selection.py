@@ -60,6 +60,11 @@ def sure(found: Selection, name: str, truth: list[float]) -> bool:
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
 
 
+def test_nothing_is_found_where_there_is_nothing_to_try() -> None:
+    """As where all of a misfit lies in a reference's own moments."""
+    assert not select_effects([planted.weighed(planted.pair(planted.rich(), {}, 0))], ()).selected
+
+
 # ── a bias that walks ──
 
 WALK_S, CORNER_HZ = 60.0, 0.1  # where the walk and the white noise have one density
