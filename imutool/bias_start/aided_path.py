@@ -89,7 +89,7 @@ def aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids, setting
     bounded = STOPS in aids.signals and aids.odometry is None
     speed = FilterSettings() if bounded else FilterSettings(speed_m_s=UNBOUNDED_M_S)
     filter_ = BiasFilter(prior, speed, ahead=True, aiding=Aiding(measure, STOPS in aids.signals, walk))
-    filter_.state = _state(start, prior, measure.std)
+    filter_.state = _state(start, prior, measure.std, speed)
     pieces, first, state = [], 0, filter_.state
     for end_s, resting, over, after in _estimates(filter_, imu, t_s):
         last = int(np.searchsorted(t_s, end_s))
@@ -200,10 +200,11 @@ def _estimates(filter_: BiasFilter, imu: Imu, t_s: Float64[np.ndarray, " n"]) ->
         yield previous[0].end_s, previous[0].resting, previous[1], previous[0].step.after
 
 
-def _state(start: StartPose, prior: BiasPrior, offsets_std: Float64[np.ndarray, " _"]) -> State:
+def _state(start: StartPose, prior: BiasPrior, offsets_std: Float64[np.ndarray, " _"], s: FilterSettings) -> State:
     (R_wb,) = quaternion.matrix(quaternion.unit(start.q_wb_wxyz[None]))
-    P = np.diag(np.concatenate([START_STD, prior.std, prior.ground_std, offsets_std]) ** 2)
-    return State(R_wb, start.v_w.copy(), np.zeros(3), prior.mean.copy(), np.zeros(6), P, np.zeros(OFFSETS))
+    steady_std = np.repeat([s.pivot_m, s.speed_m_s], 3)
+    P = np.diag(np.concatenate([START_STD, prior.std, prior.ground_std, steady_std, offsets_std]) ** 2)
+    return State(R_wb, start.v_w.copy(), np.zeros(3), prior.mean.copy(), np.zeros(6), np.zeros(6), P, np.zeros(OFFSETS))
 
 
 def _between(imu: Imu, state: State, resting: bool) -> Poses:

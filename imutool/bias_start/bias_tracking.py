@@ -23,6 +23,7 @@ from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 from imutool.recording.columns import quantile
 
 BLOCK_S = 0.5
+RATE_S = 0.1  # at the end of a block, over which the rate is a mean
 CHUNK_S, LOOK_AHEAD_S = 600.0, 600.0  # of smoothing: a bias ten minutes later says nothing about the present one
 
 
@@ -137,8 +138,8 @@ class BiasFilter:
         most = (MOST_CHANGE + MOST_DEVIATIONS * prior.std)[:3]
         rests = rests and bool((np.abs(u[:-1, :3].mean(axis=0) - prior.mean[:3]) < most).all())
         if self.state is None:
-            P = np.diag(np.concatenate([prior.std, prior.ground_std]) ** 2)
-            self.state = inertial_filter.level(u[:, 3:].mean(axis=0), prior.mean, np.zeros(6), P, s)
+            std = np.concatenate([prior.std, prior.ground_std])
+            self.state = inertial_filter.start(u[:, 3:].mean(axis=0), prior.mean, std, s)
         x, T = self.state, float(t[-1] - t[0])
         if block.longest_s > GAP_S and self._aiding is not None:
             step = inertial_filter.pause_step(x, T, self._walk)
@@ -150,8 +151,9 @@ class BiasFilter:
             variance = resting[:, :3].var(axis=0) / len(resting)
             step = inertial_filter.rest_step(x, resting.mean(axis=0), variance, T, self._walk, s)
         else:
-            motion = integrate(t, u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:])
-            step = inertial_filter.motion_step(x, motion, block.missing_s, self._walk, s)
+            gyro, accel = u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:]
+            rate = gyro[np.searchsorted(t, t[-1] - RATE_S) :].mean(axis=0)
+            step = inertial_filter.motion_step(x, integrate(t, gyro, accel), rate, block.missing_s, self._walk, s)
         if self._aiding is not None:
             step = step._replace(after=self._aiding.measure(step.after, float(t[-1])))
         self.state = step.after

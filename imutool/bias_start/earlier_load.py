@@ -95,9 +95,7 @@ def _log_likelihood(model: BiasModel, samples: Samples, first_ns: int | None) ->
     gyro, accel = gyro - bias[:, :3], accel - bias[:, 3:]
     filter_ = BiasFilter(prior, ahead=True)
     blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
-    return float(innovations(blocks, prior.settings).log_likelihood.sum()) + _at_rest(
-        [block for block in blocks if block.resting], t_s, gyro
-    )
+    return float(innovations(blocks).log_likelihood.sum()) + _at_rest([block for block in blocks if block.resting], t_s, gyro)
 
 
 def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:

@@ -20,6 +20,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
 
 from imutool.bias import static
@@ -29,13 +30,13 @@ from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std
-from imutool.inertial.inertial_filter import VELOCITY, FilterSettings
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
 from imutool.recording.columns import quantile
 
 CHECKED_S = 120.0  # of a log that the check reads
+LEAST_SPEED_M_S, LEAST_PIVOT_M = 1.0, 1e-3  # of the filter: an arm and a tight bound would take up what a wrong scale leaves
 UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sensor nobody calibrated (BMI160 of TUM-VI: 1.3)
 MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
@@ -158,11 +159,13 @@ def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:
 
 def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     """Evidence of samples, which hold no motion-dependent bias, about a prior of a constant bias."""
-    filter_ = BiasFilter(replace(prior, walk=np.zeros(6)), ahead=True)
+    speed_m_s = max(prior.settings.speed_m_s, LEAST_SPEED_M_S)
+    careful = msgspec.structs.replace(prior.settings, speed_m_s=speed_m_s, pivot_m=LEAST_PIVOT_M)
+    filter_ = BiasFilter(replace(prior, walk=np.zeros(6)), careful, ahead=True)
     blocks = [*filter_.feed(*samples), *filter_.finish()]
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    found = innovations(blocks, prior.settings)
+    found = innovations(blocks)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -198,14 +201,10 @@ def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], pri
             return
 
 
-def innovations(blocks: Sequence[FilteredBlock], s: FilterSettings) -> Innovations:
-    """Innovations of each block's velocity."""
-    R_bw = np.array([block.step.expected.R_wb.T for block in blocks])
-    v = np.array([block.step.expected.v_w for block in blocks])
-    S = np.array([block.step.expected.P[VELOCITY, VELOCITY] for block in blocks])
-    bounded = 2.0 * s.speed_m_s**2 * s.speed_correlation_s
-    noise = np.array([s.rest_m_s**2 if b.resting else bounded / (b.end_s - b.start_s) for b in blocks])
-    S = S + noise[:, None, None] * np.eye(3)
+def innovations(blocks: Sequence[FilteredBlock]) -> Innovations:
+    """Innovations of each block's velocity, in body axes; none of a block with a gap."""
+    measured = [(block.step.expected.R_wb.T, *block.step.innovation) for block in blocks if block.step.innovation is not None]
+    R_bw, v, S = (np.array([row[k] for row in measured]).reshape(-1, *shape) for k, shape in enumerate(((3, 3), (3,), (3, 3))))
     return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
 
 

@@ -22,6 +22,7 @@ Vectors = Float64[np.ndarray, "n 3"]
 EYE = np.eye(3)
 HATS = np.cross(EYE[:, None], EYE[None]).swapaxes(1, 2).reshape(3, 9)  # hat(x), row by row, is x @ HATS: one product
 AFTER, BEFORE = (1, 2, 0), (2, 0, 1)  # axes of a cross product
+SMALL_RAD2 = 1e-8  # below, two terms of the series are exact to 1e-17
 LEAST_RAD2 = 1e-300  # added to a square, so that sin(x) / x is 1 at zero
 
 
@@ -56,6 +57,29 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
     R += hat(first * xi)
     R.reshape(*xi.shape[:-1], 9)[..., ::4] += 1.0 - 2.0 * sine**2
     return R
+
+
+def exp_and_jacobian(xi: Vector3) -> tuple[Matrix3, Matrix3]:
+    """Rotation by a rotation vector and its left Jacobian, of a single vector: in floats, as one array costs as much as all."""
+    x, y, z = xi.tolist()
+    square = x * x + y * y + z * z
+    if square < SMALL_RAD2:
+        sine, first, second = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    else:
+        angle = math.sqrt(square)
+        sine, first = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        second = (1.0 - sine) / square
+    X = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    X2 = X.dot(X)
+    return EYE + sine * X + first * X2, EYE + first * X + second * X2
+
+
+def log(R: Matrix3) -> Vector3:
+    """Rotation vector of a rotation."""
+    from scipy.spatial.transform import Rotation
+
+    xi: Vector3 = Rotation.from_matrix(R).as_rotvec()
+    return xi
 
 
 def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Increment:

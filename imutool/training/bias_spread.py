@@ -20,7 +20,6 @@ from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
 from imutool.geometry import so3
-from imutool.inertial.inertial_filter import FilterSettings
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
 from imutool.training import closed_form
@@ -34,6 +33,7 @@ MOST_TAIL, LEAST_FREEDOM = 3.0, 0.1  # variance of Student's t: three degrees of
 SESSION_STEP = {"gyro": 3e-3, "accel": 0.3}  # another switching-on: a larger step of the bias from one log to the next
 LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
+VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
 
@@ -95,7 +95,7 @@ def store_statistics(
 
 
 def speed_of(pool: Pool) -> dict[str, Any]:
-    """Speed of the training logs for the model card, where it exceeds the filter's bound.
+    """Speed of the training logs for the model card, if they move as vehicles do.
 
     The filter takes velocity for noise of the density 2 v^2 tau, with its correlation time tau. The mean of such a velocity
     over a longer time T has the variance 2 v^2 tau / T. The largest density over all T counts, of the mean of the logs.
@@ -107,8 +107,8 @@ def speed_of(pool: Pool) -> dict[str, Any]:
         moved = (pool.p_wb[first + n] - pool.p_wb[first]).square().mean(1) / window_s
         of_log = [float(moved[pool.log[first] == log].mean()) for log in set(pool.log[first].tolist())]
         densities.append(float(np.mean(of_log or [0.0])))
-    square, density, s = float(pool.v_w[pool.trusted].square().mean()), max(densities), FilterSettings()
-    if density <= 2.0 * s.speed_m_s**2 * s.speed_correlation_s:
+    square, density = float(pool.v_w[pool.trusted].square().mean()), max(densities)
+    if density <= VEHICLE_M2_S:
         return {}
     return {"speed": {"speed_m_s": math.sqrt(square), "speed_correlation_s": density / (2.0 * square)}}
 

@@ -61,7 +61,10 @@ def test_another_name_is_doubtful_however_well_it_agrees(model: BiasModel, recor
 
 
 TAMPERED = {
-    "gyro in deg/s": ("gyro and gravity disagree", lambda imu: replace(imu, gyro=np.degrees(imu.gyro))),
+    "gyro in deg/s": (
+        "the raw samples agree with gravity and stops better",
+        lambda imu: replace(imu, gyro=np.degrees(imu.gyro)),
+    ),
     "accel in g": ("expected about 9.81", lambda imu: replace(imu, accel=imu.accel / 9.81)),
     "axes of the gyro permuted": ("gyro", lambda imu: replace(imu, gyro=imu.gyro[:, [1, 2, 0]])),
     "another unit": ("another unit", lambda imu: replace(imu, gyro=imu.gyro + np.array([0.08, 0.0, 0.0]))),

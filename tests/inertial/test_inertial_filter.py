@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,24 +16,24 @@ from imutool.inertial.inertial_filter import (
     FilterSettings,
     State,
     Step,
-    level,
     motion_step,
     rest_step,
     smooth,
     update,
 )
+from imutool.inertial.inertial_filter import start as first_state
 from imutool.inertial.preintegration import integrate
 
 S = FilterSettings()
 EXACT = 1e-10
 WALK = np.array([1e-4] * 3 + [2e-3] * 3)
-P_BIAS = np.diag([3e-3] * 3 + [0.2] * 3 + [1e-3] * 3 + [0.03] * 3) ** 2
+STD = np.array([3e-3] * 3 + [0.2] * 3 + [1e-3] * 3 + [0.03] * 3)
 
 
 def start(heading: float = 0.0) -> State:
-    x = level(np.array([0.5, -0.3, 9.7]), np.zeros(6), np.zeros(6), P_BIAS, S)
+    x = first_state(np.array([0.5, -0.3, 9.7]), np.zeros(6), STD, S)
     turn = Rotation.from_euler("z", heading).as_matrix()
-    return State(turn @ x.R_wb, turn @ x.v_w, turn @ x.p_wb, x.bias, x.ground, x.P)
+    return replace(x, R_wb=turn @ x.R_wb, v_w=turn @ x.v_w, p_wb=turn @ x.p_wb)
 
 
 def steps(x: State, count: int = 20, seed: int = 0) -> list[Step]:
@@ -46,7 +48,9 @@ def steps(x: State, count: int = 20, seed: int = 0) -> list[Step]:
                 rest_step(x, np.concatenate([1e-3 * rng.normal(size=3), accel.mean(axis=0)]), np.full(3, 1e-8), 0.5, WALK, S)
             )
         else:
-            found.append(motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S))
+            found.append(
+                motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), gyro[-1] - x.bias[:3], 0.0, WALK, S)
+            )
         x = found[-1].after
     return found
 
@@ -61,7 +65,7 @@ def test_errors_go_on_and_come_off_again() -> None:
 
 @pytest.mark.parametrize("up", [[0.1, 0.2, 9.8], [9.81, 0.0, 0.0], [0.0, 0.0, -9.81], [0.0, -9.0, -3.0]])
 def test_level_puts_the_force_upright_without_a_heading(up: list[float]) -> None:
-    x = level(np.array(up), np.zeros(6), np.zeros(6), P_BIAS, S)
+    x = first_state(np.array(up), np.zeros(6), STD, S)
     np.testing.assert_allclose(x.R_wb @ np.array(up) / np.linalg.norm(up), [0.0, 0.0, 1.0], rtol=0, atol=1e-12)
     np.testing.assert_allclose(x.R_wb @ x.R_wb.T, np.eye(3), rtol=0, atol=1e-12)
 
@@ -82,7 +86,7 @@ def test_heading_is_never_found_out() -> None:
     x = start()
     P = x.P.copy()
     P[2, 2] = 1.0
-    x = State(x.R_wb, x.v_w, x.p_wb, x.bias, x.ground, P)
+    x = replace(x, P=P)
     assert steps(x)[-1].after.P[2, 2] > 1.0
 
 
@@ -91,12 +95,12 @@ def test_a_move_is_linear_in_the_error() -> None:
     t = np.arange(101) / 200.0
     rng = np.random.default_rng(3)
     gyro, accel = 0.8 * rng.normal(size=3) + np.zeros((101, 3)), np.array([0.3, 0.1, 9.9]) + 0.2 * rng.normal(size=(101, 3))
-    x = start(0.7).moved(np.concatenate([np.zeros(3), [0.8, -0.5, 0.3], [1.0, 2.0, -3.0], np.zeros(12)]), start().P)
+    x = start(0.7).moved(np.concatenate([np.zeros(3), [0.8, -0.5, 0.3], [1.0, 2.0, -3.0], np.zeros(SIZE - 9)]), start().P)
 
     def expected(y: State) -> State:
-        return motion_step(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), 0.0, WALK, S).expected
+        return motion_step(y, integrate(t, gyro - y.bias[:3], accel - y.bias[3:]), gyro[-1] - y.bias[:3], 0.0, WALK, S).expected
 
-    F = motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), 0.0, WALK, S).F
+    F = motion_step(x, integrate(t, gyro - x.bias[:3], accel - x.bias[3:]), gyro[-1] - x.bias[:3], 0.0, WALK, S).F
     size = 1e-6
     for i in range(15):
         e = np.zeros(SIZE)
@@ -139,6 +143,6 @@ def test_smoothing_a_linear_case_is_least_squares() -> None:
     # unknown: b0, b1, b2 along x, and d
     A = np.array([[1, 0, 0, 0], [0, 0, 0, 1], [-1, 1, 0, 0], [0, -1, 1, 0], [0, 1, 0, 1], [0, 0, 1, 1]], float)
     y = np.array([0, 0, 0, 0, 1e-3, 2e-3])
-    w = 1 / np.array([P_BIAS[0, 0], P_BIAS[6, 6] + 2 * inertial_filter.LEAST_VARIANCE, q, q, r, r])
+    w = 1 / np.array([STD[0] ** 2, STD[6] ** 2 + 2 * inertial_filter.LEAST_VARIANCE, q, q, r, r])
     solved = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
     np.testing.assert_allclose([s.bias[0] for s in smooth(found)], solved[:3], rtol=1e-3)
