@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 STARTS = ("auto", "smooth", "truth")
 CANDIDATES = ("constant", "linear", "effects")  # from the simplest
-LEAST_GAIN = 0.03  # of the error, for a candidate to be worth its parameters
+LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by which a candidate is better than a simpler one
 LEAST_ERROR = 1e-6  # ° or m/s
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
@@ -163,7 +163,7 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
         (
             candidate
             for place, candidate in enumerate(sound)
-            if not any(beaten(table[candidate, ""], table[other, ""]) for other in sound[place + 1 :])
+            if not any(beaten(table[candidate, ""], table[other, ""], SURELY) for other in sound[place + 1 :])
         ),
         present[0],
     )
@@ -181,13 +181,13 @@ def _log_errors(
     return np.array(out)
 
 
-def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"]) -> bool:
-    """Whether errors are smaller by `LEAST_GAIN` and by more than their scatter between logs."""
+def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
+    """Whether errors are smaller by `LEAST_GAIN` and by more than `surely` standard errors of their scatter between logs."""
     gain = (errors - others)[np.isfinite(errors - others)]
     if not len(gain):
         return False
     scatter = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
-    return bool(gain.mean() > max(LEAST_GAIN, scatter))
+    return bool(gain.mean() > max(LEAST_GAIN, surely * scatter))
 
 
 def _error(score: Score, sensor: Sensor) -> float | None:
