@@ -18,7 +18,7 @@ WORKSPACES = "AMENT_PREFIX_PATH"  # what `source install/setup.bash` sets
 
 
 def definition_from_files(kind: str, beside: Path) -> tuple[bytes, str]:
-    """Whole definition of a type from .msg files; empty where one is missing, then with the name of its type.
+    """Definition of a type from .msg files; else nothing and the first type without one.
 
     Raises:
         DataError: a file is no definition that ROS 2 reads.
