@@ -9,6 +9,7 @@ A message that lacks them has NaN, so that `clean` can leave it out.
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -68,6 +69,21 @@ class Reflected:
             return Sample(stamp_ns or log_time, frame, [float(at(message, path)) for path in self.vectors])
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the message lacks {error}") from error
+
+    def with_stamp(self, raw: bytes, stamp_ns: int) -> bytes:
+        """Message in CDR with another stamp, written in place; without one as it is.
+
+        Raises:
+            ValueError: the bytes are no such message.
+        """
+        form, data = self.format, bytearray(raw)
+        if not isinstance(form, ros2_definition.DescribedCdr):
+            return raw
+        message = form.parse(raw)
+        for path, count in _parts(stamp_ns, self.stamp):
+            offset, code = form.place(message, path)
+            struct.pack_into(code, data, offset, count)
+        return bytes(data)
 
     def encode(self, samples: Sequence[Sample]) -> UInt8[np.ndarray, "n L"]:
         """Samples of one frame as CDR."""
