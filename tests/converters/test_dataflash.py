@@ -194,3 +194,13 @@ def test_a_log_that_ends_within_a_message_says_so(tmp_path):
     log = dataflash.read_sequence(dataflash.sequences(path)[0])
     assert log.remarks.losses == ["the log ends within a message EKF1: what came after is lost"]
     assert len(log.poses["/ekf/pose"]) == 499
+
+
+def test_what_a_log_with_texts_alone_on_a_topic_loses_to_a_cut_is_its_end(convert, imutool, tmp_path):
+    convert(write_older_log(tmp_path / "old.bin"), tmp_path / "out.mcap")
+    raw = (tmp_path / "out.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(raw[: raw.rindex(b"/MSG")])  # in the summary
+    done = imutool("repair", "cut.mcap", "saved.mcap", cwd=tmp_path)
+    assert "500 on /imu0" in done.stdout, done.stderr
+    with (tmp_path / "out.mcap").open("rb") as file:
+        assert {m.data for _, c, m in make_reader(file).iter_messages() if c.topic in ("/MSG", "/STRT")} == {b"\0\1\0\0\0"}
