@@ -40,7 +40,7 @@ GRAVITY_SHARE = 0.5  # of the median reading, that the calmest seconds read at l
 
 
 class AccelReading(NamedTuple):
-    """Gravity as accel reads it, whether at rest, and its unit; empty where none fits, or noise hides it."""
+    """Gravity as accel reads it, whether at rest, and its unit; empty where none is sure."""
 
     level: float | None
     at_rest: bool
@@ -62,7 +62,7 @@ def accel_reading(motion: Motion) -> AccelReading:
 
 
 def gravity_level(motion: Motion) -> tuple[float | None, bool, bool]:
-    """Gravity as the accel reads it, whether at rest, and whether it may be noise about zero; None without samples.
+    """Gravity as accel reads it, whether at rest, and whether it may be noise; None if empty.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
     Without any it is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is

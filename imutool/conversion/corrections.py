@@ -100,16 +100,21 @@ class Corrections:
             stamp_ns, raw = int(stamps[seen[name]]), bytes(message.payload)
             seen[name] += 1
             if (reflected := self.reflected.get(name)) is not None:
-                yield message._replace(payload=reflected.with_stamp(raw, stamp_ns))
-                continue
-            patch = MessagePatch(message.topic, raw)
-            patch.move_stamp(stamp_ns - patch.stamp_ns())
-            yield self._corrected(message._replace(payload=bytes(patch.data)))
+                raw = reflected.with_stamp(raw, stamp_ns)
+            else:
+                patch = MessagePatch(message.topic, raw)
+                patch.move_stamp(stamp_ns - patch.stamp_ns())
+                raw = bytes(patch.data)
+            yield self._corrected(message._replace(payload=raw))
 
     def _corrected(self, message: Message) -> Message:
         topic = message.topic
         if topic.message_encoding not in ENCODINGS:
             return message
+        if topic.name in self.imus and topic.name in self.reflected:
+            return message._replace(
+                payload=self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
+            )
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         turned = bool((self.world != np.eye(3)).any())
@@ -198,14 +203,16 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             if not described.is_read:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
-            if described.reflected is not None or described.message_encoding not in ENCODINGS:
+            patched = described.reflected is None or isinstance(described.reflected, Reflected)
+            if not patched or described.message_encoding not in ENCODINGS:
                 if (survey.matrices != np.eye(3)).any():
                     own = described.own_schema or described.schema_name
-                    kept.append(f"{topic} keeps its units and axes: only messages sensor_msgs/Imu are corrected, not {own}")
+                    kept.append(f"{topic} keeps its units and axes: only messages in CDR or ROS 1 are corrected, not {own}")
                 continue
             if (survey.matrices != np.eye(3)).any():
                 imus[topic] = survey.matrices
-                notes[topic].append(_imu_note(survey))
+                others = "; other fields of its messages stay" if isinstance(described.reflected, Reflected) else ""
+                notes[topic].append(_imu_note(survey) + others)
             if frame_id or not survey.pose_topic:
                 continue
             turned = None if topic in imus else turned_body(log, sound_samples(log, topic), survey.pose_topic)
@@ -213,7 +220,9 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
                 notes[pose_topic] += changes
-        own_types = {topic: found for topic in stamps if isinstance(found := log.topics[topic].reflected, Reflected)}
+        own_types = {
+            topic: found for topic in {**stamps, **imus} if isinstance(found := log.topics[topic].reflected, Reflected)
+        }
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
     return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, own_types, said, kept)
 

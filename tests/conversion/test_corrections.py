@@ -245,7 +245,12 @@ def test_stamps_in_messages_of_a_drivers_own_type_are_corrected(made: Recording,
     assert not any("stamps" in warning for warning in inspect(tmp_path / "even.mcap").warnings)
 
 
-def test_units_in_messages_of_a_drivers_own_type_are_named_as_kept(made: Recording, tmp_path: Path) -> None:
-    log = own_type(made, tmp_path / "own.mcap", scale=1 / 9.80665)
-    report = convert(log, tmp_path / "same.mcap", correct=["stamps", "conventions"])
-    assert any("/imu keeps its units and axes: only messages sensor_msgs/Imu" in note for note in report.notes)
+def test_units_and_stamps_in_messages_of_a_drivers_own_type_are_corrected_at_once(made: Recording, tmp_path: Path) -> None:
+    resting = replace(made, imu=Imu(made.imu.t_ns, 0.001 * made.imu.gyro, np.tile([0.0, 0.0, 9.80665], (len(made.imu), 1))))
+    log = own_type(resting, tmp_path / "own.mcap", scale=1 / 9.80665)
+    report = convert(log, tmp_path / "right.mcap", correct=["stamps", "conventions"])
+    assert any("accel times 9.80665" in note and "other fields of its messages stay" in note for note in report.notes)
+    found = read(tmp_path / "right.mcap").imu
+    np.testing.assert_allclose(found.accel, resting.imu.accel, rtol=1e-12)
+    assert (found.gyro == resting.imu.gyro).all()
+    assert np.abs(found.t_ns - made.imu.t_ns).max() <= 200
