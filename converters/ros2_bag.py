@@ -1,25 +1,27 @@
 """ROS 2 bag, sqlite3 or MCAP, split or compressed: every topic under its own name.
 
 A bag is the folder with its metadata.yaml, a folder of storage files that its recorder did not finish, or a single .db3 file.
-Bags of old ROS 2 versions hold no definitions: those of ROS 2 Jazzy stand in. A type that Jazzy lacks keeps its bytes without
-a definition, and is named.
+Bags of old ROS 2 versions hold no definitions: those of ROS 2 Jazzy stand in, then .msg files beside the bag or in the
+workspace that is sourced. A type without any keeps its bytes, and is named.
 """
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
+from ._msg_files import definition_from_files
 from ._ros_types import need_rosbags, ros2_definition
 from ._source import find_files, find_folders, head
 
@@ -27,6 +29,7 @@ GENERAL = True
 METADATA = "metadata.yaml"
 SQLITE = b"SQLite format 3\0"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+LISTED = re.compile(r"relative_file_paths:\s*\n((?:\s*- .*\n)+)")
 ENCODINGS = {"MSG": "ros2msg", "IDL": "ros2idl"}
 
 
@@ -57,7 +60,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         counts = Counter[str]()
         for connection in (c for reader in readers for c in reader.connections):
             if images or connection.msgtype not in IMAGES:
-                topics.setdefault(connection.topic, _topic(connection, remarks))
+                if connection.topic not in topics:
+                    topics[connection.topic] = _topic(connection, sequence.path, remarks)
                 counts[connection.topic] += connection.msgcount
     return MessageLog(
         sequence.name,
@@ -94,8 +98,8 @@ def _has_messages(path: Path) -> bool:
     return {"topics", "messages"} <= names
 
 
-def _topic(connection: Any, remarks: Remarks) -> MessageTopic:
-    """Topic with the definition in the bag, or that of ROS 2 Jazzy."""
+def _topic(connection: Any, path: Path, remarks: Remarks) -> MessageTopic:
+    """Topic with the definition in the bag, that of ROS 2 Jazzy, or that of .msg files."""
     kind, form = connection.msgtype, connection.msgdef.format.name
     metadata: tuple[tuple[str, str], ...] = (("topic_type_hash", connection.digest),) if connection.digest else ()
     if connection.ext.offered_qos_profiles:
@@ -105,18 +109,35 @@ def _topic(connection: Any, remarks: Remarks) -> MessageTopic:
     if form in ENCODINGS:
         return MessageTopic(connection.topic, kind, ENCODINGS[form], connection.msgdef.data.encode(), "cdr", metadata)
     known = ros2_definition(kind)
-    if known is None:
-        remarks.notes.append(f"{connection.topic} has no definition of its {kind}: its messages are kept as they are")
+    text, missing = (known[0], "") if known else definition_from_files(kind, path if path.is_dir() else path.parent)
+    if missing:
+        kept = f"{connection.topic} has no definition of its {kind}: its messages are kept as they are"
+        fix = f"source its ROS workspace, or copy {missing.rpartition('/')[2]}.msg into the bag's folder, and convert again"
+        remarks.notes.append(f"{kept}; to have its numbers, {fix}")
         return MessageTopic(connection.topic, kind, "", b"", "cdr", metadata)
-    return MessageTopic(connection.topic, kind, "ros2msg", known[0], "cdr", metadata)
+    return MessageTopic(connection.topic, kind, "ros2msg", text, "cdr", metadata)
 
 
 def _messages(path: Path, topics: dict[str, MessageTopic]) -> Iterator[Message]:
     with _open(path, Remarks()) as readers:
         for reader in readers:
-            wanted = [connection for connection in reader.connections if connection.topic in topics]
+            files = getattr(reader, "storages", [reader])  # metadata.yaml may state another quality of service than the files
+            wanted = [c for file in files for c in file.connections if c.topic in topics]
             for connection, time_ns, payload in reader.messages(wanted):
                 yield Message(topics[connection.topic], time_ns, time_ns, payload)
+
+
+def _renamed(folder: Path, remarks: Remarks) -> bool:
+    """Whether files that metadata.yaml names are not there, but others are; fewer than it names are a loss."""
+    match = LISTED.search((folder / METADATA).read_text(encoding="utf-8", errors="replace") + "\n")
+    named = [PurePath(line.strip()[2:].strip("'\" ")).name for line in match[1].splitlines()] if match else []
+    missing = [name for name in named if not (folder / name).exists()]
+    there = sorted(path.name for path in folder.iterdir() if path.suffix in (".db3", ".mcap"))
+    if not missing or not there:
+        return False
+    said = f"{METADATA} names {', '.join(missing)}, which the folder lacks; its files {', '.join(there)} were read instead"
+    (remarks.notes if len(there) >= len(named) else remarks.losses).append(said)
+    return True
 
 
 @contextmanager
@@ -129,16 +150,19 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
     import apsw
     from rosbags.rosbag2 import ReaderError
     from rosbags.rosbag2.reader import DirectoryReader
+    from rosbags.rosbag2.storage_mcap import McapReader
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     readers: list[Any]
     if path.is_file():
         readers = [Sqlite3Reader(path)]
-    elif (path / METADATA).is_file():
+    elif (path / METADATA).is_file() and not _renamed(path, remarks):
         readers = [DirectoryReader(path)]
     else:
         readers = [Sqlite3Reader(file) for file in sorted(path.glob("*.db3")) if _has_messages(file)]
-        remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their names")
+        readers = readers or [McapReader(file) for file in sorted(path.glob("*.mcap"))]
+        if not (path / METADATA).is_file():
+            remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their names")
     try:
         with ExitStack() as stack:
             for reader in readers:

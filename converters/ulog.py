@@ -142,8 +142,10 @@ def _ns(columns: Columns, name: str = "timestamp") -> Int64[np.ndarray, " n"]:
 
 
 def _sample_ns(columns: Columns) -> Int64[np.ndarray, " n"]:
-    """Time of a sample where PX4 logs it, else of its message."""
-    return _ns(columns, "timestamp_sample" if "timestamp_sample" in columns else "timestamp")
+    """Time of a sample where PX4 logs it, else of its message; 0 stands for a time that was not set, as in simulated truth."""
+    message_ns = _ns(columns)
+    sample_ns = _ns(columns, "timestamp_sample") if "timestamp_sample" in columns else message_ns
+    return np.where(sample_ns > 0, sample_ns, message_ns)
 
 
 def _vectors(columns: Columns, names: str) -> Float64[np.ndarray, "n k"]:

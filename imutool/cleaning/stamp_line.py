@@ -1,4 +1,4 @@
-"""Clock of a sensor under stamps that are late, come in batches, or wrap.
+"""Clock of a sensor under stamps that are late, in batches, wrap, or have wrong fractions.
 
 A stamp is never earlier than its sample, so the sensor's own clock is a line under the stamps: the edge of their lower convex
 hull above the middle of a window, which has the least sum of delays (Moon, Skelly and Towsley, Estimation and removal of clock
@@ -23,6 +23,11 @@ GAP_BATCHES = 1.7  # batches: samples are missing in a longer step, which ends a
 WRAPS = {
     f"{bits} bit of {unit}": 2**bits * ns for bits in (16, 32) for unit, ns in (("ns", 1), ("us", 1000), ("ms", 1_000_000))
 }
+SECOND_NS = 1_000_000_000
+FRACTIONS = {10: "10 ns", 100: "100 ns", 1000: "us", 10_000: "10 us", 100_000: "100 us", 1_000_000: "ms"}  # units of a fraction
+FILLED = 0.9  # of a second: how far fractions reach in their own unit
+LEAST_SECONDS, LEAST_HZ = 3, 4.0  # of a log whose fractions are judged
+EVEN = 5.0  # times: most by which the step into the next second differs from the others
 BUNCHED = 0.3  # of the mean period: a shorter step is within a batch
 BATCHED = 0.3  # share of such steps from which on stamps come in batches
 
@@ -31,11 +36,13 @@ class Stamps(NamedTuple):
     """Stamps of a topic without the wraps of its counter, and what was wrong with them.
 
     Attributes:
+        fraction: unit in which the driver counted the nanoseconds of the stamps; empty where it is ns.
         batch: mean samples in a batch; 1 where they come one by one.
         unset: whether all are the same, as a driver leaves them that fills in none.
     """
 
     stamp_ns: Int64[np.ndarray, " n"]
+    fraction: str
     wraps: Counter[str]
     batch: float
     unset: bool
@@ -45,7 +52,8 @@ class Stamps(NamedTuple):
         """What is wrong, in words."""
         if self.unset:
             return [f"the stamps are not set: each is {self.stamp_ns[0]} ns"]
-        words = [
+        words = [f"the stamps' fractions of a second are written in {self.fraction}, not in ns"] if self.fraction else []
+        words += [
             f"the clock of the stamps wraps {count} times, as a counter of {name} does" for name, count in self.wraps.items()
         ]
         if self.batch > 1.0:
@@ -55,6 +63,8 @@ class Stamps(NamedTuple):
 
 def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
     """Stamps whose wraps are undone; a wrap is a step back by the range of a counter."""
+    unit = _fraction_unit(stamp_ns)
+    stamp_ns = stamp_ns + (unit - 1) * (stamp_ns % SECOND_NS)
     steps, wraps = np.diff(stamp_ns), Counter[str]()
     usual = int(np.median(steps)) if len(steps) else 0
     for row in np.flatnonzero(steps < -max(usual, 1)):
@@ -67,7 +77,25 @@ def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
     near = steps[(steps >= 0) & (steps < GAP_NS)]
     share = float((near < BUNCHED * near.mean()).mean()) if len(near) > WINDOW else 0.0
     unset = len(steps) > 0 and not np.diff(stamp_ns).any()
-    return Stamps(whole, wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0, unset)
+    return Stamps(whole, FRACTIONS.get(unit, ""), wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0, unset)
+
+
+def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:
+    """Unit of the stamps' fractions of a second in ns: not 1 where a driver wrote them in another unit.
+
+    Such stamps crawl from the start of each second and leap into the next; in the right unit all steps are alike.
+    """
+    seconds, fraction = np.divmod(stamp_ns, SECOND_NS)
+    into_next = np.diff(seconds) == 1
+    if into_next.sum() < LEAST_SECONDS or len(stamp_ns) < LEAST_HZ * (seconds[-1] - seconds[0]):
+        return 1
+    largest, smallest = int(fraction.max()), int(fraction.min())
+    unit = next((u for u in FRACTIONS if FILLED * SECOND_NS <= largest * u < SECOND_NS), 1)
+    if unit == 1 or smallest * unit > (1.0 - FILLED) * SECOND_NS:
+        return 1
+    steps = np.diff(stamp_ns + (unit - 1) * fraction)
+    usual, leap = float(np.median(steps)), float(np.median(steps[into_next]))
+    return unit if usual > 0 and usual / EVEN <= leap <= usual * EVEN else 1
 
 
 def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:

@@ -35,11 +35,12 @@ MIN_TURN_RAD_S, FEWEST_TURNS = 0.1, 10  # of the true rate, and times at which i
 POSES_APART_NS = 300_000_000
 CALM_STEPS, CALM_SHARE = 10, 0.1  # windows of a second, and the calmest of them
 CALM_SCATTER = 0.03  # of the reading
+LARGEST_SCATTER = 1.0  # of the reading, in the median second: more is no gravity with motion, but noise about zero
 GRAVITY_SHARE = 0.5  # of the median reading, that the calmest seconds read at least where gravity is in it
 
 
 class AccelReading(NamedTuple):
-    """Gravity as accel reads it, whether at rest, and its unit; empty where none fits."""
+    """Gravity as accel reads it, whether at rest, and its unit; empty where none is sure."""
 
     level: float | None
     at_rest: bool
@@ -48,9 +49,9 @@ class AccelReading(NamedTuple):
 
 def accel_reading(motion: Motion) -> AccelReading:
     """Reading of gravity; no level without samples."""
-    level, at_rest = gravity_level(motion)
-    if level is None:
-        return AccelReading(None, False, "")
+    level, at_rest, is_noise = gravity_level(motion)
+    if level is None or is_noise:
+        return AccelReading(level, False, "")
     tolerance = REST_TOLERANCE if at_rest else MOVING_TOLERANCE
     if abs(level / GRAVITY_M_S2 - 1.0) <= tolerance:
         return AccelReading(level, at_rest, "m/s^2")
@@ -60,8 +61,8 @@ def accel_reading(motion: Motion) -> AccelReading:
     return AccelReading(level, at_rest, unit if near else "")
 
 
-def gravity_level(motion: Motion) -> tuple[float | None, bool]:
-    """Gravity as the accel reads it, and whether at rest; None without samples.
+def gravity_level(motion: Motion) -> tuple[float | None, bool, bool]:
+    """Gravity as accel reads it, whether at rest, and whether it may be noise; None if empty.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
     Without any it is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is
@@ -69,7 +70,7 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     """
     step, mean = motion.table()
     if not len(step):
-        return None, False
+        return None, False, False
     count = len(step) // CALM_STEPS
     cut = mean[: count * CALM_STEPS, 3:].reshape(count, CALM_STEPS, 3)
     whole = np.diff(step[: count * CALM_STEPS].reshape(count, CALM_STEPS)[:, [0, -1]], axis=1)[:, 0] == CALM_STEPS - 1
@@ -79,12 +80,13 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool]:
     calm = np.flatnonzero(whole)[np.argsort(scatter[whole])][:few]
     calm = calm[scatter[calm] < CALM_SCATTER]
     if len(calm):
-        return float(quantile(level[calm], 0.5)), True
+        return float(quantile(level[calm], 0.5)), True, False
     if not whole.any():
-        return float(quantile(np.linalg.norm(mean[:, 3:], axis=1), 0.5)), False
+        return float(quantile(np.linalg.norm(mean[:, 3:], axis=1), 0.5)), False, False
     median = float(quantile(level[whole], 0.5))
     calmest = float(quantile(level[np.flatnonzero(whole)[np.argsort((scatter * level)[whole])][:few]], 0.5))
-    return (calmest if calmest < GRAVITY_SHARE * median else median), False
+    is_noise = float(quantile(scatter[whole], 0.5)) > LARGEST_SCATTER
+    return (calmest if calmest < GRAVITY_SHARE * median else median), False, is_noise
 
 
 def rate_ratio(motion: Motion, truth: Truth) -> float | None:

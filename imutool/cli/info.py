@@ -180,7 +180,9 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
                 rows.append((imu["topic"], f"{name} noise", ", ".join(f"{d:.2e}" for d in density) + f" {unit}/√Hz"))
     for truth in report.truth:
         value = f"{100 * truth.coverage:.1f} % of the IMU, {_counted(truth.gaps, 'gap')}, longest {truth.longest_gap_s:.2f} s"
-        rows += [(truth.topic, "kind of poses", truth.kind), (truth.topic, "covers", value)]
+        rows.append((truth.topic, "kind of poses", truth.kind))
+        if report.imu:  # without one there is nothing to cover
+            rows.append((truth.topic, "covers", value))
         if not isinstance(truth.gyro_rms_rad_s, UnsetType) and not isinstance(truth.gyro_explained, UnsetType):
             value = f"{100 * truth.gyro_explained:.1f} % of the motion, {truth.gyro_rms_rad_s:.4f} rad/s rms remain"
             rows.append((truth.topic, "explains gyro", value))

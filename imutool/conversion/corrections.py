@@ -16,18 +16,18 @@ import numpy as np
 
 from imutool import registry
 from imutool.array_types import Float64, Int64
-from imutool.cleaning import CleaningSettings, Survey, look, raw_batches
+from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.conventions import axis_names
-from imutool.cleaning.stamp_line import WRAPS, read_stamps, restamped
 from imutool.conversion.message_patch import MessagePatch
 from imutool.conversion.message_writer import write_log
+from imutool.conversion.restamping import SAME_CLOCK_NS, find_stamps
 from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.log_info.inspection import sound_samples
 from imutool.log_info.pose_imu_rotation import Body, turned_body
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, ScalarBatch
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
+from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, VELOCITY_KEY
@@ -37,7 +37,6 @@ RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
 NOT_TURNED = Body(np.eye(3), frozenset())
 MOST_ROUNDS = 3  # a wrong clock of poses hides a turned body, and that a wrong world: each shows after the one before
-SAME_CLOCK_NS = 10**9  # most by which a topic may come into the log later than the IMU
 XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 
 
@@ -50,7 +49,9 @@ class Corrections:
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
         body: rotation from the body of the poses on `pose_topic` to the IMU.
         stamps: new stamps of messages of an IMU, of poses or vectors, in file order.
+        reflected: topics among them whose messages have a type of their own.
         notes: what is corrected, by topic.
+        kept: what stays wrong, and why.
     """
 
     imus: Mapping[str, Float64[np.ndarray, "2 3 3"]] = field(default_factory=dict)
@@ -60,7 +61,9 @@ class Corrections:
     body: Body = NOT_TURNED
     pose_topic: str = ""
     stamps: Mapping[str, Int64[np.ndarray, "..."]] = field(default_factory=dict)
+    reflected: Mapping[str, Reflected] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
+    kept: Sequence[str] = ()
 
     def __bool__(self) -> bool:
         """Whether there is anything to correct."""
@@ -94,15 +97,24 @@ class Corrections:
             if stamps is None:
                 yield self._corrected(message)
                 continue
-            patch = MessagePatch(message.topic, bytes(message.payload))
-            patch.move_stamp(int(stamps[seen[name]]) - patch.stamp_ns())
+            stamp_ns, raw = int(stamps[seen[name]]), bytes(message.payload)
             seen[name] += 1
-            yield self._corrected(message._replace(payload=bytes(patch.data)))
+            if (reflected := self.reflected.get(name)) is not None:
+                raw = reflected.with_stamp(raw, stamp_ns)
+            else:
+                patch = MessagePatch(message.topic, raw)
+                patch.move_stamp(stamp_ns - patch.stamp_ns())
+                raw = bytes(patch.data)
+            yield self._corrected(message._replace(payload=raw))
 
     def _corrected(self, message: Message) -> Message:
         topic = message.topic
         if topic.message_encoding not in ENCODINGS:
             return message
+        if topic.name in self.imus and topic.name in self.reflected:
+            return message._replace(
+                payload=self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
+            )
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         turned = bool((self.world != np.eye(3)).any())
@@ -181,31 +193,26 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
         LogError: damage.
     """
     imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
-    stamps: dict[str, Int64[np.ndarray, "..."]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
     world, frame_id, late_ns, body, pose_topic = np.eye(3), "", 0, NOT_TURNED, ""
-    clock: dict[str, int] = {}
+    kept: list[str] = []
     with Log(path) as log:
-        for topic in log.imu_topics:
-            if log.topics[topic].message_encoding not in ENCODINGS or log.topics[topic].reflected is not None:
-                continue
-            if STAMPS in wanted:
-                log_ns, before = _times(raw_batches(log, topic))
-                found = read_stamps(before)
-                late_stamps = log_ns if found.unset else before
-                stamps[topic] = restamped(late_stamps)
-                moved_s = 1e-9 * float(np.abs(stamps[topic] - late_stamps).max(initial=0))
-                under = "the log times" if found.unset else "them"
-                line = f"stamps are now on a line under {under}, moved by {moved_s:.6f} s at most"
-                notes[topic].append("; ".join([*found.faults, line]))
-                if found.wraps and not clock:
-                    clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
-            if CONVENTIONS not in wanted:
+        stamps = find_stamps(log, notes) if STAMPS in wanted else {}
+        for topic in log.imu_topics if CONVENTIONS in wanted else []:
+            described = log.topics[topic]
+            if not described.is_read:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
+            patched = described.reflected is None or isinstance(described.reflected, Reflected)
+            if not patched or described.message_encoding not in ENCODINGS:
+                if (survey.matrices != np.eye(3)).any():
+                    own = described.own_schema or described.schema_name
+                    kept.append(f"{topic} keeps its units and axes: only messages in CDR or ROS 1 are corrected, not {own}")
+                continue
             if (survey.matrices != np.eye(3)).any():
                 imus[topic] = survey.matrices
-                notes[topic].append(_imu_note(survey))
+                others = "; other fields of its messages stay" if isinstance(described.reflected, Reflected) else ""
+                notes[topic].append(_imu_note(survey) + others)
             if frame_id or not survey.pose_topic:
                 continue
             turned = None if topic in imus else turned_body(log, sound_samples(log, topic), survey.pose_topic)
@@ -213,39 +220,11 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
                 notes[pose_topic] += changes
-        for described in log.with_schema((*MESSAGE_POSES, schemas.VECTOR3)) if STAMPS in wanted else []:
-            if described.message_encoding in ENCODINGS and described.reflected is None:
-                decode = described.decode_poses if described.schema_name in MESSAGE_POSES else described.decode_scalars
-                log_ns, before = _times(batch for _, rows in log.rows([described.name]) for batch in decode(rows))
-                found = read_stamps(before)
-                whole_ns = log_ns if found.unset else _unwrapped(log_ns, before, **clock)
-                if (whole_ns != before).any():
-                    stamps[described.name] = whole_ns
-                    faults = "; ".join(found.faults) or "stamps start after a wrap"
-                    notes[described.name].append(f"{faults}; they {'are the log times' if found.unset else 'run on'} now")
+        own_types = {
+            topic: found for topic in {**stamps, **imus} if isinstance(found := log.topics[topic].reflected, Reflected)
+        }
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
-    return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, said)
-
-
-def _times(batches: Iterator[ImuBatch | PoseBatch | ScalarBatch]) -> Int64[np.ndarray, "2 n"]:
-    """Log times and stamps of a topic, in file order."""
-    every = [np.stack([batch.log_time.astype(np.int64), batch.stamp_ns]) for batch in batches]
-    return np.concatenate([np.zeros((2, 0), np.int64), *every], axis=1)
-
-
-def _unwrapped(
-    log_ns: Int64[np.ndarray, " n"], stamp_ns: Int64[np.ndarray, " n"], size_ns: int = 0, late_ns: int = 0
-) -> Int64[np.ndarray, " n"]:
-    """Stamps of poses or vectors without wraps; on the counter of the IMU, of `size_ns`, with as many turns as it has made.
-
-    The log lags behind the IMU's counter by `late_ns`; what lags alike but for whole turns is on the same counter.
-    """
-    whole_ns = read_stamps(stamp_ns).stamp_ns
-    if size_ns < 4 * SAME_CLOCK_NS or not len(whole_ns):
-        return whole_ns
-    turns = round((int(log_ns[0]) - late_ns - int(whole_ns[0])) / size_ns)
-    rest_ns = int(log_ns[0]) - late_ns - int(whole_ns[0]) - turns * size_ns
-    return whole_ns + turns * size_ns if abs(rest_ns) < SAME_CLOCK_NS else whole_ns
+    return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, own_types, said, kept)
 
 
 def _imu_note(survey: Survey) -> str:
@@ -275,8 +254,10 @@ def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compressi
     """
     refuse_existing(target, overwrite=overwrite)
     module, notes = registry.load("imutool.converters", "mcap_log"), list[str]()
+    kept: Sequence[str] = ()
     for number in range(MOST_ROUNDS if CONVENTIONS in wanted else 1):
         found = find_corrections(log, [CONVENTIONS] if number else wanted)
+        kept = found.kept
         if not found:
             break
         content: MessageLog = module.read_sequence(next(iter(module.sequences(log))))
@@ -287,4 +268,4 @@ def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compressi
         write_log(content, log, compression=compression, overwrite=overwrite)
         notes += content.remarks.notes
     log.replace(target)
-    return tuple(notes) or ("the motion shows nothing to correct",)
+    return (*notes, *kept) or ("the motion shows nothing to correct",)

@@ -14,10 +14,11 @@ from types import ModuleType
 
 from imutool import registry
 from imutool.conversion.corrections import parse_corrections
+from imutool.conversion.unread_formats import ENOUGH, describe_unread
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
-from imutool.file_location import compression, local
+from imutool.file_location import local
 from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -147,10 +148,9 @@ def _find(source: Path, format: str) -> _Sequences:
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
     if not claims:
-        program = "" if source.is_dir() else compression(_start(source))
-        fix = f"Unpack it first, for instance with {program} -d" if program else ""
+        what, fix = ("", "") if source.is_dir() else describe_unread(_start(source))
         raise DataError(
-            f"no sequence found: it is compressed with {program}" if program else "no sequence found",
+            f"no sequence found: {what}" if what else "no sequence found",
             where=source,
             expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
             fix="Name the file itself: single logs and tables in a folder are not looked for" if source.is_dir() else fix,
@@ -169,7 +169,7 @@ def _start(path: Path) -> bytes:
     """First bytes of a file; none of one that cannot be read."""
     try:
         with path.open("rb") as file:
-            return file.read(8)
+            return file.read(ENOUGH)
     except OSError:
         return b""
 

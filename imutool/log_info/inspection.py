@@ -153,7 +153,7 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     counts = {
         "out_of_order": int((t_ns < later).sum()),
         "duplicated": len(t_ns) - len(np.unique(t_ns)),
-        "missing": _missing(np.unique(restamped(t_ns) if stamps.batch > 1.0 else t_ns)),
+        "missing": _missing(np.unique(restamped(t_ns) if stamps.batch > 1.0 or stamps.fraction else t_ns)),
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }

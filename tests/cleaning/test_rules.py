@@ -321,6 +321,13 @@ def test_acceleration_without_gravity_is_not_trusted(made):
     assert "accel has no gravity in it" in survey.reasons
 
 
+def test_noise_as_large_as_gravity_is_not_taken_for_a_reading_in_g(made):
+    """Random numbers of a test publisher: means of a second read 1, as a log in g does."""
+    survey = look(made._replace(accel=np.random.default_rng(3).uniform(-9.9, 9.9, made.accel.shape)))
+    assert any(reason.startswith("the unit of accel is unknown") for reason in survey.reasons)
+    assert (survey.scale[3:] == 1.0).all()
+
+
 def test_motion_of_one_metre_per_second_squared_without_gravity_is_not_taken_for_g(made):
     """At rest it reads noise; the median of the rest is 1, as that of a log in g is."""
     phase = 1.5 * np.linspace(0.0, 2 * np.pi * 10, len(made.accel))

@@ -61,3 +61,23 @@ def test_a_clock_set_back_is_no_wrap_and_a_pause_ends_the_line() -> None:
     again = restamped(in_batches(paused, 6))
     assert np.abs(again - paused).max() < 600_000
     assert again[6000] - again[5999] > GAP_NS
+
+
+@pytest.mark.parametrize(("unit", "name"), [(100, "100 ns"), (1000, "us"), (1_000_000, "ms")])
+def test_fractions_of_a_second_in_another_unit_are_named_and_undone(unit: int, name: str) -> None:
+    true = START_NS + np.arange(2000) * 25_000_321
+    written = true // 10**9 * 10**9 + true % 10**9 // unit
+    found = read_stamps(written)
+    assert found.fraction == name
+    assert found.faults[0] == f"the stamps' fractions of a second are written in {name}, not in ns"
+    assert np.abs(found.stamp_ns - true).max() < unit
+    assert np.abs(restamped(written) - true).max() <= unit
+
+
+def test_bursts_of_a_second_are_no_fractions_of_another_unit() -> None:
+    number = np.arange(2000)
+    for start_ns in (0, 2_000_000, 400_000_000):
+        bursts = START_NS + start_ns + number // 40 * 10**9 + number % 40 * 200_000  # 40 samples in 8 ms, then a pause
+        assert read_stamps(bursts).fraction == ""
+    assert read_stamps(sampled()).fraction == ""
+    assert read_stamps(START_NS + np.arange(2000) * 10**9).fraction == ""

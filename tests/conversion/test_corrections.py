@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imutool import registry
@@ -204,3 +205,52 @@ def test_a_counter_that_wraps_runs_on_for_the_imu_and_the_poses_alike(
     assert np.abs(whole.imu.t_ns + origin_ns - made.imu.t_ns).max() <= 2000
     assert np.abs(whole.truth.t_ns + origin_ns - truth.t_ns).max() <= 1000
     assert sum("/ground_truth/pose" in note for note in report.notes) == 1
+
+
+def own_type(made: Recording, target: Path, scale: float = 1.0) -> Path:
+    """IMU in a type of a driver's own, whose fractions of a second are in units of 100 ns."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("std_msgs/Header header\nsensor_msgs/Imu imu\nstring raw\n", "own_driver/msg/Reading"))
+    kinds, none = store.types, np.zeros(9)
+    text, _ = store.generate_msgdef("own_driver/msg/Reading", ros_version=2)
+    with target.open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        schema = writer.register_schema("own_driver/msg/Reading", "ros2msg", text.encode())
+        channel = writer.register_channel("/imu", "cdr", schema)
+        for t_ns, gyro, accel in zip(made.imu.t_ns.tolist(), made.imu.gyro, scale * made.imu.accel, strict=True):
+            stamps = [
+                kinds["builtin_interfaces/msg/Time"](t_ns // 10**9, t_ns % 10**9 // 100),
+                kinds["builtin_interfaces/msg/Time"](0, 0),
+            ]
+            outer, inner = (kinds["std_msgs/msg/Header"](stamp, "imu") for stamp in stamps)
+            turn = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+            rate, force = (kinds["geometry_msgs/msg/Vector3"](*vector.tolist()) for vector in (gyro, accel))
+            imu = kinds["sensor_msgs/msg/Imu"](inner, turn, none, rate, none, force, none)
+            message = kinds["own_driver/msg/Reading"](outer, imu, "$VNYMR")
+            data = bytes(store.serialize_cdr(message, message.__msgtype__))
+            writer.add_message(channel, t_ns + 3_000_000, data, t_ns + 3_000_000)
+        writer.finish()
+    return target
+
+
+def test_stamps_in_messages_of_a_drivers_own_type_are_corrected(made: Recording, tmp_path: Path) -> None:
+    log = own_type(made, tmp_path / "own.mcap")
+    assert any("fractions of a second are written in 100 ns, not in ns" in warning for warning in inspect(log).warnings)
+    report = convert(log, tmp_path / "even.mcap", correct=["stamps"])
+    assert any("fractions of a second are written in 100 ns" in note for note in report.notes)
+    found = read(tmp_path / "even.mcap").imu
+    assert np.abs(found.t_ns - made.imu.t_ns).max() <= 200
+    assert (found.gyro == made.imu.gyro).all()
+    assert not any("stamps" in warning for warning in inspect(tmp_path / "even.mcap").warnings)
+
+
+def test_units_and_stamps_in_messages_of_a_drivers_own_type_are_corrected_at_once(made: Recording, tmp_path: Path) -> None:
+    resting = replace(made, imu=Imu(made.imu.t_ns, 0.001 * made.imu.gyro, np.tile([0.0, 0.0, 9.80665], (len(made.imu), 1))))
+    log = own_type(resting, tmp_path / "own.mcap", scale=1 / 9.80665)
+    report = convert(log, tmp_path / "right.mcap", correct=["stamps", "conventions"])
+    assert any("accel times 9.80665" in note and "other fields of its messages stay" in note for note in report.notes)
+    found = read(tmp_path / "right.mcap").imu
+    np.testing.assert_allclose(found.accel, resting.imu.accel, rtol=1e-12)
+    assert (found.gyro == resting.imu.gyro).all()
+    assert np.abs(found.t_ns - made.imu.t_ns).max() <= 200

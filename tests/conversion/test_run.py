@@ -275,3 +275,19 @@ def test_converting_needs_no_torch():
     code = f"import imutool.conversion.run, imutool.log_info.inspection, sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        (b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n", "blackbox log of Betaflight.*blackbox_decode"),
+        (bytes.fromhex("00060d058847e8f3fd0900000000"), "telemetry log of MAVLink.*vehicle's own log"),
+        (b"\xa3\x95\x80\x027ATT\0fffffffffffff", "sdlog2 log of PX4.*sdlog2_dump.py"),
+        (b"\x75\x65\x80\x38", "MicroStrain.*SensorConnect"),
+        (b"neither one nor the other", "no sequence found; expected a ROS bag"),
+    ],
+)
+def test_a_format_that_is_known_but_not_read_says_what_to_do(start: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / "flight.dat").write_bytes(start + bytes(3000))
+    with pytest.raises(DataError, match=said):
+        convert(tmp_path / "flight.dat", tmp_path / "out.mcap")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -14,7 +15,7 @@ from imutool.converters import dataflash
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
-CODES = {"Q": "Q", "B": "B", "f": "f", "c": "h", "C": "H", "n": "4s", "L": "i", "Z": "64s", "N": "16s"}
+CODES = {"I": "I", "H": "H", "Q": "Q", "B": "B", "f": "f", "c": "h", "C": "H", "n": "4s", "L": "i", "Z": "64s", "N": "16s"}
 
 
 class Writer:
@@ -143,3 +144,63 @@ def test_damage_is_passed_over_and_counted(convert, tmp_path):
     assert done.returncode == 3
     assert "are no message that it describes" in done.stderr
     assert len(read(tmp_path / "out.mcap", imu="/imu0").imu) >= 498
+
+
+def write_older_log(path: Path, text: bool = False) -> Path:
+    """Log as ArduPilot wrote it before 2015: times in ms, several messages without one, and a GPS with a time of the week."""
+    log = Writer()
+    log.form(1, "IMU", "Iffffff", "TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    log.form(2, "IMU2", "Iffffff", "TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
+    log.form(3, "EKF1", "IccCffffff", "TimeMS,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD")
+    log.form(4, "GPS", "BIHLI", "Status,TimeMS,Week,Lat,T")
+    log.form(5, "PARM", "Nf", "Name,Value")
+    log.form(6, "MSG", "Z", "Message")
+    log.form(7, "STRT", "", "")
+    log.add("STRT")
+    log.add("PARM", b"INS_MPU6K_FILTER", 20.0)
+    for n in range(500):
+        t_ms = 7_000 + 20 * n
+        log.add("IMU", t_ms, 0.1, 0.2, 0.3, 1.0, 2.0, -9.75)
+        log.add("IMU2", t_ms, 0.1, 0.2, 0.3, 1.0, 2.0, -9.5)
+        log.add("EKF1", t_ms, 0, 0, 4500, 0.5, 0.25, -0.125, 1.0, 2.0, -3.0)
+        if n == 250:
+            log.add("GPS", 3, 500_000_000, 1813, 473_977_418, t_ms)
+            log.add("MSG", b"Takeoff")
+            log.add("MSG", b"Mode Auto")
+    path.write_text("\n".join([*log.lines, ""])) if text else path.write_bytes(log.raw)
+    return path
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_log_of_before_2015_is_read_with_its_times_in_milliseconds(convert, tmp_path, text):
+    path = write_older_log(tmp_path / "old.log", text)
+    done = convert(path, tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "messages without a time have that of the message before them: MSG, PARM, STRT" in done.stderr
+    recording = read(tmp_path / "out.mcap", imu="/imu1", truth="/ekf/pose")
+    assert recording.imu.t_ns[[0, 1]].tolist() == [7_000_000_000, 7_020_000_000]
+    np.testing.assert_allclose(recording.imu.accel[0], [1.0, -2.0, 9.5])
+    np.testing.assert_allclose(recording.truth.p_wb[0], [2.0, 1.0, 3.0])
+    log = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert log.tables["/GPS"].t_ns.tolist() == [12_000_000_000]
+    assert log.tables["/PARM"].t_ns.tolist() == [7_000_000_000]
+    assert log.metadata["ardupilot/messages"] == {"12000000 us": "Takeoff", "12000000 us, 2": "Mode Auto"}
+    assert log.metadata["ardupilot/parameters"] == {"INS_MPU6K_FILTER": "20.0"}
+
+
+def test_a_log_that_ends_within_a_message_says_so(tmp_path):
+    path = write_older_log(tmp_path / "cut.bin")
+    path.write_bytes(path.read_bytes()[:-10])
+    log = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert log.remarks.losses == ["the log ends within a message EKF1: what came after is lost"]
+    assert len(log.poses["/ekf/pose"]) == 499
+
+
+def test_what_a_log_with_texts_alone_on_a_topic_loses_to_a_cut_is_its_end(convert, imutool, tmp_path):
+    convert(write_older_log(tmp_path / "old.bin"), tmp_path / "out.mcap")
+    raw = (tmp_path / "out.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(raw[: raw.rindex(b"/MSG")])  # in the summary
+    done = imutool("repair", "cut.mcap", "saved.mcap", cwd=tmp_path)
+    assert "500 on /imu0" in done.stdout, done.stderr
+    with (tmp_path / "out.mcap").open("rb") as file:
+        assert {m.data for _, c, m in make_reader(file).iter_messages() if c.topic in ("/MSG", "/STRT")} == {b"\0\1\0\0\0"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +123,78 @@ def test_a_cut_bag_is_refused_in_one_sentence(convert, tmp_path, storage, suffix
     assert "cannot be read as a ROS 2 bag" in done.stderr
     assert ("each .mcap with imutool repair" in done.stderr) == (suffix == "mcap")
     assert not (tmp_path / "a.mcap").exists()
+
+
+def change(bag: Path, statement: str) -> None:
+    """Change the database of a bag."""
+    (database,) = bag.glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        connection.execute(statement)
+    connection.close()
+
+
+QOS = """- history: 3
+  depth: 0
+  reliability: 1
+  durability: 2
+  deadline: {sec: 2147483647, nsec: 4294967295}
+  lifespan: {sec: 2147483647, nsec: 4294967295}
+  liveliness: 1
+  liveliness_lease_duration: {sec: 2147483647, nsec: 4294967295}
+  avoid_ros_namespace_conventions: false
+"""
+
+
+def test_topics_whose_quality_of_service_differs_in_the_metadata_arrive(convert, tmp_path):
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
+    change(bag, f"UPDATE topics SET offered_qos_profiles = '{QOS}' WHERE name != '/load'")
+    done = convert(bag, tmp_path / "a.mcap")
+    assert (done.returncode, done.stderr.strip()) == (0, "")
+    assert len(messages_of(tmp_path / "a.mcap")[0]) == 3 * COUNT
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_a_storage_file_that_was_renamed_is_read(convert, tmp_path, storage):
+    bag = write_bag(tmp_path / "bag", storage)
+    (file,) = (path for path in bag.iterdir() if path.suffix != ".yaml")
+    file.rename(file.with_stem("walk"))
+    done = convert(bag, tmp_path / "a.mcap")
+    assert done.returncode == 0, done.stderr
+    assert f"metadata.yaml names {file.name}, which the folder lacks; its files walk{file.suffix} were read" in done.stderr
+    assert len(messages_of(tmp_path / "a.mcap")[0]) == 3 * COUNT
+
+
+def test_a_missing_part_of_a_split_bag_is_a_loss(convert, tmp_path):
+    bag = split_bag(tmp_path / "bag", StoragePlugin.SQLITE3, None)
+    next(bag.glob("1_*")).unlink()
+    done = convert(bag, tmp_path / "a.mcap")
+    assert done.returncode == 3
+    assert "which the folder lacks" in done.stderr
+    assert len(messages_of(tmp_path / "a.mcap")[0]) == 6 * COUNT
+
+
+def test_definitions_come_from_msg_files_beside_the_bag_or_in_the_workspace(convert, tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
+    change(bag, "DELETE FROM message_definitions")
+    done = convert(bag, tmp_path / "none.mcap")
+    assert "source its ROS workspace, or copy Load.msg into the bag's folder" in done.stderr
+    assert messages_of(tmp_path / "none.mcap")[1]["/load"] == ""
+    text = "std_msgs/Header header\nPart[] parts\nfloat64 load\n"
+    (bag / "Load.msg").write_text(text)
+    assert "or copy Part.msg into the bag's folder" in convert(bag, tmp_path / "part.mcap").stderr
+    workspace = tmp_path / "install" / "share" / "my_robot" / "msg"
+    workspace.mkdir(parents=True)
+    (workspace / "Part.msg").write_text("int32 number\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'other'}{os.pathsep}{tmp_path / 'install'}")
+    done = convert(bag, tmp_path / "a.mcap")
+    assert (done.returncode, done.stderr.strip()) == (0, "")
+    definition = messages_of(tmp_path / "a.mcap")[1]["/load"]
+    assert "float64 load" in definition
+    assert "MSG: my_robot/Part\nint32 number" in definition
+    (bag / "Load.msg").write_text("float64\n")
+    done = convert(bag, tmp_path / "b.mcap")
+    assert done.returncode == 4
+    assert "Load.msg: is no definition of my_robot/msg/Load" in done.stderr
 
 
 def test_the_public_sample_arrives_whole(convert, tmp_path, data):

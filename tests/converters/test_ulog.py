@@ -116,6 +116,21 @@ def test_imu_and_truth_are_written_in_flu_and_enu(log):
     np.testing.assert_allclose(np.abs(recording.truth.q_wb_wxyz[3]), [np.cos(half), 0, 0, np.sin(half)], atol=1e-7)
 
 
+def test_truth_whose_sample_time_is_not_set_keeps_the_times_of_its_messages(convert, tmp_path):
+    writer, fields = Writer(), "uint64_t timestamp;uint64_t timestamp_sample;"
+    times = [START_US + 4000 * n for n in range(250)]
+    writer.topic("sensor_combined", COMBINED, [(t, 0.1, 0.2, 0.3, 4000, 0, 1.0, 2.0, -9.75, 4000) for t in times])
+    attitude, position = fields + "float[4] q", fields + "float x;float y;float z"
+    writer.topic("vehicle_attitude_groundtruth", attitude, [(t, 0, 1.0, 0.0, 0.0, 0.0) for t in times[::2]])
+    writer.topic("vehicle_local_position_groundtruth", position, [(t, 0, 1.0, 2.0, -3.0) for t in times[::5]])
+    done = convert(writer.write(tmp_path / "sim.ulg"), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "left out" not in done.stderr
+    truth = read(tmp_path / "out.mcap").truth
+    assert truth.t_ns[[0, 1]].tolist() == [1000 * times[0], 1000 * times[2]]
+    np.testing.assert_allclose(truth.p_wb[0], [2.0, 1.0, 3.0])
+
+
 def test_every_instance_is_an_imu_on_the_gyros_stamps(log):
     with Log(log) as opened:
         assert opened.imu_topics == ["/imu", "/imu/sensor0", "/imu/sensor1"]

@@ -21,11 +21,13 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, expected
 from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, WhitenedLog, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
+from imutool.errors import DataError
 from imutool.noise.bias_walk import WalkLikelihood, walk_likelihood
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect
 
 RIDGE = 1e-8
+LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 OnAxis = tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q _"]]  # parameters that act on an axis, and their derivatives
@@ -42,8 +44,28 @@ def whitened(pair: Pair, candidates: Sequence[Effect], settings: BandSettings) -
     band_hz = known_band_hz(pair.real[:, works], ideal[:, works], 1.0 / pair.period_s, pair.band_hz, settings)
     pair = replace(pair, band_hz=band_hz)
     band = Band.below(band_hz, 1.0 / pair.period_s, pair.settings.noise)
+    _check_rows(pair, band)
     whiten = _in_band(pair, _rich(pair, candidates, band), pair.real - ideal, band)
     return _counting(pair, limited_to_quiet_axes(whiten, settings.noisy_axis))
+
+
+def _check_rows(pair: Pair, band: Band) -> None:
+    """Refuse a log with too few rows in the band for a noise model.
+
+    Raises:
+        DataError: an axis has too few rows that follow others without a gap.
+    """
+    order = pair.settings.noise.order
+    usable = pair.usable[:: band.every]
+    counts = [int(settled(rows, order).sum()) for rows in usable.T if rows.any()]
+    if not counts or min(counts) < LEAST_ROWS * order:
+        step_s, left, least = pair.period_s * band.every, min(counts, default=0), LEAST_ROWS * order
+        raise DataError(
+            f"its poses show motion below {pair.band_hz:.3g} Hz; {left} values every {step_s:.2g} s are there without a gap",
+            where=pair.name,
+            expected=f"{least} or more",
+            fix="Record longer, with fewer gaps, or with poses at a higher rate",
+        )
 
 
 def _counting(pair: Pair, white: Whitener) -> WhitenedImu:

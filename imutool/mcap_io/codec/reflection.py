@@ -9,14 +9,15 @@ A message that lacks them has NaN, so that `clean` can leave it out.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Bool, Shaped, UInt8
+from imutool.array_types import Bool, Float64, Shaped, UInt8
 from imutool.errors import LogError
 from imutool.mcap_io.codec import ros2_definition
 from imutool.mcap_io.codec.decode import decode_imu
@@ -68,6 +69,34 @@ class Reflected:
             return Sample(stamp_ns or log_time, frame, [float(at(message, path)) for path in self.vectors])
         except (KeyError, IndexError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the message lacks {error}") from error
+
+    def with_stamp(self, raw: bytes, stamp_ns: int) -> bytes:
+        """Message in CDR with another stamp, written in place; without one as it is.
+
+        Raises:
+            ValueError: the bytes are no such message.
+        """
+        return self._patched(raw, _parts(stamp_ns, self.stamp))
+
+    def with_vectors(self, raw: bytes, matrices: Float64[np.ndarray, "2 3 3"]) -> bytes:
+        """Message of an IMU in CDR with both vectors multiplied, written in place.
+
+        Raises:
+            ValueError: the bytes are no such message.
+        """
+        values = np.array(self.sample(raw, 0).values).reshape(2, 3)
+        return self._patched(raw, zip(self.vectors, (matrices @ values[:, :, None]).ravel().tolist(), strict=True))
+
+    def _patched(self, raw: bytes, fields: Iterable[tuple[Path, float]]) -> bytes:
+        """Message in CDR with other numbers, written in place."""
+        form, data = self.format, bytearray(raw)
+        if not isinstance(form, ros2_definition.DescribedCdr):
+            return raw
+        message = form.parse(raw)
+        for path, value in fields:
+            offset, code = form.place(message, path)
+            struct.pack_into(code, data, offset, value)
+        return bytes(data)
 
     def encode(self, samples: Sequence[Sample]) -> UInt8[np.ndarray, "n L"]:
         """Samples of one frame as CDR."""

@@ -263,10 +263,14 @@ class DescribedCdr:
 
     def at(self, message: Message, path: Sequence[str | int]) -> Any:
         """Value of a number."""
-        raw, places = message
+        offset, form = self.place(message, path)
+        return struct.unpack_from(form, message[0], offset)[0]
+
+    @staticmethod
+    def place(message: Message, path: Sequence[str | int]) -> tuple[int, str]:
+        """First byte of a number, and its format."""
         name = ".".join(str(key) for key in path if isinstance(key, str))
-        offset, form = places[f"{name}[{path[-1]}]" if isinstance(path[-1], int) else name]
-        return struct.unpack_from(form, raw, offset)[0]
+        return message[1][f"{name}[{path[-1]}]" if isinstance(path[-1], int) else name]
 
     def new(self, values: Sequence[tuple[Sequence[str | int], Any]]) -> bytes:
         """Refuse: fields that are not numbers have no default."""

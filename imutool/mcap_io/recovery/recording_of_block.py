@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema
 
 from imutool.mcap_io.blocks import MessageBlock
 from imutool.mcap_io.codec import messages
-from imutool.mcap_io.recovery.definitions import NO_HABITS, Recording, different, key_pairs, parsed, topics_of
+from imutool.mcap_io.recovery.definitions import NO_HABITS, Recording, key_pairs, parsed, topics_of
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.scan_events import (
     Definition,
@@ -28,7 +28,7 @@ from imutool.mcap_io.recovery.scan_events import (
     definition_runs,
     note_habits,
 )
-from imutool.mcap_io.recovery.summary import Summary
+from imutool.mcap_io.recovery.summary import Summary, recording_of
 
 
 class Recordings:
@@ -46,16 +46,7 @@ class Recordings:
         self._certain = False  # an unbroken chain of records leads from the definitions of the current one to here
         self._follows = True  # the next block may go on with the one before: no data section ends between them
         self._behind_gap: list[ScannedBlock] | None = None  # blocks since the last gap, where one came since the log began
-        for summary in summaries:
-            lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks or ()}
-            recording = Recording(summary.base, lists=lists or None)
-            definitions = parsed(summary.definitions, summary.base, losses)
-            twice = {key for key, number in Counter((type(d), d.id) for d in different(definitions)).items() if number > 1}
-            for record in (d for d in definitions if (type(d), d.id) not in twice):
-                recording.define(record, proven=True)
-            for kind, number in sorted(twice, key=str):
-                losses.add_harmless(f"a summary defines {kind.__name__.lower()} {number} twice; neither is used")
-            self.each.append(recording)
+        self.each += [recording_of(summary, losses) for summary in summaries]
 
     def of(self, block: MessageBlock) -> Recording:
         """The recording of a block."""
@@ -154,7 +145,7 @@ class Recordings:
             if channel in recording.readable()
             and not (channel in recording.sizes and recording.sizes[channel][0] <= low <= high <= recording.sizes[channel][1])
         ]
-        misfits = any(not self._fits(found.block, channel, recording) for channel in unusual)
+        misfits = self._misfits(found, recording, unusual)
         compared = [self._fits(block, channel, recording) for channel, block in recording.samples.items()] if misfits else []
         never = bool(compared) and not any(compared)  # then the definitions never were those of the messages
         if not foreign and (not misfits or never):
@@ -168,6 +159,15 @@ class Recordings:
         self._give_up_misfits(self._current, [found])
         found.block.recording = len(self.each) - 1
         self.unproven.pop(found.block.offset, None)
+
+    def _misfits(self, found: ScannedBlock, recording: Recording, unusual: Sequence[int]) -> bool:
+        """Whether messages do not decode by definitions that others decode by: a writer may define a channel wrongly."""
+        misfits = [channel for channel in unusual if not self._fits(found.block, channel, recording)]
+        met = [channel for channel in misfits if channel in recording.samples]
+        fitted = any(self._fits(recording.samples[channel], channel, recording) for channel in met)
+        others = (recording.readable() & found.sizes.keys()) - set(misfits)
+        wrong = found.evidence and any(self._fits(found.block, channel, recording) for channel in others)
+        return fitted or (len(met) < len(misfits) and not wrong)
 
     def _give_up_misfits(self, recording: Recording, blocks: Sequence[ScannedBlock]) -> None:
         """Takes definitions back that came behind messages of a log that nothing defines, where they fit some of them not."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec import records
 from imutool.mcap_io.codec.records import FOOTER_SIZE, HEAD, MAGIC, crc32
 from imutool.mcap_io.index import MAX_SUMMARY
+from imutool.mcap_io.recovery.definitions import Recording, different, parsed
 from imutool.mcap_io.recovery.losses import Losses, reason
 from imutool.mcap_io.storage.source import Source
 
@@ -34,6 +36,19 @@ class Summary(NamedTuple):
     base: int
     definitions: list[tuple[int, bytes]]
     chunks: list[ChunkIndex]
+
+
+def recording_of(summary: Summary, losses: Losses) -> Recording:
+    """Recording whose definitions a summary states."""
+    lists = {(e.message_start_time, e.message_end_time, e.uncompressed_size) for e in summary.chunks or ()}
+    recording = Recording(summary.base, lists=lists or None)
+    definitions = parsed(summary.definitions, summary.base, losses)
+    twice = {key for key, number in Counter((type(d), d.id) for d in different(definitions)).items() if number > 1}
+    for record in (d for d in definitions if (type(d), d.id) not in twice):
+        recording.define(record, proven=True)
+    for kind, number in sorted(twice, key=str):
+        losses.add_harmless(f"a summary defines {kind.__name__.lower()} {number} twice; neither is used")
+    return recording
 
 
 def proven_summary(source: Source, losses: Losses) -> tuple[Footer, Summary | None]:

@@ -17,6 +17,7 @@ from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.reference_errors import SMOOTHED
 from imutool.diagnosis.settings import BandSettings
+from imutool.errors import DataError
 from imutool.inertial.wiener import wiener_filter
 from imutool.sensor import catalogue
 
@@ -44,6 +45,14 @@ def noise(log: WhitenedImu) -> np.ndarray:
 @functools.cache
 def quiet() -> np.ndarray:
     return noise(whitened(beside_poses(), WITHOUT, BAND))
+
+
+def test_a_log_with_too_few_values_without_a_gap_is_refused() -> None:
+    """A traceback once: a simulated flight of PX4 whose logger had dropped every third sample."""
+    pair = beside_poses()
+    gaps = np.arange(len(pair.real)) * pair.period_s % 0.4 < 0.2
+    with pytest.raises(DataError, match=r"0 values every 0\.\d+ s are there without a gap; expected 12 or more"):
+        whitened(replace(pair, known=np.repeat(~gaps[:, None], 6, axis=1)), WITHOUT, BAND)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,35 @@
+"""Formats that are known by their first bytes but not read: what they are, and what to do."""
+
+from __future__ import annotations
+
+import re
+
+from imutool.file_location import compression
+
+ENOUGH = 32  # bytes of a file's start
+FORMATS = {  # what a file that begins like this is, and what to do
+    rb"H Product:Blackbox": (
+        "it is a blackbox log of Betaflight or INAV",
+        "Decode it with blackbox_decode, and convert its CSV with a map of its columns",
+    ),
+    rb"\x00[\x03-\x07].{6}[\x55\xfd\xfe]": (  # a time in us of 1996 to 2041, then the first byte of a message
+        "it is a telemetry log of MAVLink, which has a few samples of the IMU a second",
+        "Convert the vehicle's own log, a .bin or .ulg",
+    ),
+    rb"\xa3\x95\x80": (
+        "it is an sdlog2 log of PX4 before 2017",
+        "Make a CSV of it with sdlog2_dump.py of PX4, and convert that with a map of its columns",
+    ),
+    rb"\x75\x65": (
+        "it looks like a binary log of a MicroStrain sensor",
+        "Export it as CSV with SensorConnect, and convert that",
+    ),
+}
+
+
+def describe_unread(start: bytes) -> tuple[str, str]:
+    """What a file with these first bytes is, and what to do; empty where that is not known."""
+    if program := compression(start):
+        return f"it is compressed with {program}", f"Unpack it first, for instance with {program} -d"
+    found = (said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL))
+    return next(found, ("", ""))
