@@ -83,11 +83,13 @@ CATALOGUE: Mapping[str, Model] = {
     model.name: model
     for model in (
         Model("gyro_scale", Stage.SENSOR, "gyro", _axes("-", 0.1), on(GYRO, forward.scale)),
+        Model("gyro_scale_asymmetry", Stage.SENSOR, "gyro", _axes("-", 0.1), on(GYRO, forward.two_gains)),
         Model("gyro_misalignment", Stage.SENSOR, "gyro", _SQUARE, on(GYRO, forward.misalignment)),
         Model("gyro_g_sensitivity", Stage.SENSOR, "gyro", _G, forward.g_sensitivity),
         Model("gyro_quadratic", Stage.SENSOR, "gyro", _axes("s/rad", 0.1), on(GYRO, forward.quadratic)),
         Model("gyro_bias_drift", Stage.SENSOR, "gyro", (*_axes("rad/s", 0.02), _TAU), on(GYRO, forward.warm_up)),
         Model("accel_scale", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, forward.scale)),
+        Model("accel_scale_asymmetry", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, forward.two_gains)),
         Model("accel_misalignment", Stage.SENSOR, "accel", _SQUARE, on(ACCEL, forward.misalignment)),
         Model("accel_quadratic", Stage.SENSOR, "accel", _axes("s^2/m", 6e-3), on(ACCEL, forward.quadratic)),
         Model("accel_bias_drift", Stage.SENSOR, "accel", (*_axes("m/s^2", 0.5), _TAU), on(ACCEL, forward.warm_up)),

@@ -248,6 +248,11 @@ def scale(values: Three, s: Theta, t_s: Times) -> Three:
     return values * (1.0 + s)
 
 
+def two_gains(values: Three, a: Theta, t_s: Times) -> Three:
+    """(1 + a / 2) v where v is positive, (1 - a / 2) v where it is negative."""
+    return np.where(values > 0.0, values * (1.0 + 0.5 * a), values * (1.0 - 0.5 * a))
+
+
 def misalignment(values: Three, theta: Theta, t_s: Times) -> Three:
     """(1 + M) v, M without a diagonal."""
     m = np.eye(3)

@@ -193,10 +193,12 @@ def test_a_vibration_is_a_sine_on_each_column() -> None:
 
 SENSOR_CASES: dict[str, tuple[list[float], np.ndarray]] = {
     "gyro_scale": ([0.1, 0.0, -0.2], np.concatenate([[0.03, 0.0, -0.4], NONE3])),
+    "gyro_scale_asymmetry": ([0.2, 0.2, -0.2], np.concatenate([[0.03, 0.05, -0.2], NONE3])),
     "gyro_misalignment": ([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], np.concatenate([[0.35, 0.89, -0.15], NONE3])),
     "gyro_g_sensitivity": ([1.0, 0, 0, 0, 1.0, 1.0, 0, 0, 0], np.concatenate([[1.0, 7.0, 0.0], NONE3])),
     "gyro_quadratic": ([1.0, 1.0, 0.1], np.concatenate([[0.09, 0.25, 0.4], NONE3])),
     "accel_scale": ([0.1, 0.1, -0.1], np.concatenate([NONE3, [0.1, -0.2, -0.9]])),
+    "accel_scale_asymmetry": ([0.2, 0.2, -0.2], np.concatenate([NONE3, [0.1, 0.2, -0.9]])),
     "accel_misalignment": ([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], np.concatenate([NONE3, [1.6, 3.9, -0.7]])),
     "accel_quadratic": ([0.1, 0.1, 0.01], np.concatenate([NONE3, [0.1, 0.4, 0.81]])),
 }

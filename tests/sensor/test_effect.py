@@ -164,7 +164,7 @@ def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect
 
 
 def test_the_catalogue_of_left_out_physics_is_there() -> None:
-    sensor = ("scale", "misalignment", "quadratic", "bias_drift")
+    sensor = ("scale", "scale_asymmetry", "misalignment", "quadratic", "bias_drift")
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {

@@ -86,6 +86,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "accel_bias": "{w.it} reads a constant {w.main} too much",
     "gyro_scale": "its scale is off by {w.main}",
     "accel_scale": "its scale is off by {w.main}",
+    "gyro_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
+    "accel_scale_asymmetry": "its scale for positive readings exceeds that for negative ones by {w.main}",
     "gyro_misalignment": "its axes are not square: one shows on another by {w.main}",
     "accel_misalignment": "its axes are not square: one shows on another by {w.main}",
     "gyro_g_sensitivity": "{w.it} feels the specific force, with {w.main}",

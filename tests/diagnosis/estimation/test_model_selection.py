@@ -19,6 +19,7 @@ from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
+from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
@@ -39,6 +40,7 @@ SINGLE = {
     "mount_rotation": [0.03, -0.02, 0.04],
     "gyro_g_sensitivity": [1e-3, 0.0, 0.0, 0.0, -1e-3, 0.0, 0.0, 0.0, 2e-3],
     "gravity": [0.05, 0.02, -0.02],
+    "gyro_scale_asymmetry": [0.05, -0.04, 0.06],
 }
 
 
@@ -94,6 +96,26 @@ def test_a_drift_is_a_drift_and_no_walk() -> None:
     found = asked(pair, beyond=False)
     assert names(found) == ["gyro_bias_drift"]
     assert sure(found, "gyro_bias_drift", drift)
+
+
+# ── two gains of an axis ──
+
+
+def test_two_gains_of_an_axis_that_never_changes_its_sign_are_a_scale() -> None:
+    pair = planted.pair(planted.rich(), {"accel_scale": [0.0, 0.0, 0.02]})
+    logs, named = [planted.weighed(pair)], planted.catalogue()
+    told = fit(logs, planted.acting({"accel_scale_asymmetry": [0.0] * 3}))
+    assert with_plainer_effects(logs, told, named).keys == ("accel_scale",)
+
+
+def test_two_gains_beside_a_scale_are_both_named() -> None:
+    found = asked(planted.pair(planted.shaken(), {"gyro_scale": [0.03] * 3, "gyro_scale_asymmetry": [0.06] * 3}), beyond=False)
+    assert sorted(names(found)) == ["gyro_scale", "gyro_scale_asymmetry"]
+    assert sure(found, "gyro_scale_asymmetry", [0.06] * 3)
+
+
+def test_a_wrong_reference_leaves_no_candidate_and_no_finding() -> None:
+    assert names(select_effects([planted.weighed(planted.pair(planted.rich()))], ())) == []
 
 
 # ── log_p_value ──
