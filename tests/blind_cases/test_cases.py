@@ -221,6 +221,13 @@ def test_drift_and_temperature_in_closed_form() -> None:
     assert np.abs(warm - np.outer([0.0, 5.0, 15.0], np.arange(6.0))).max() < 1e-10
 
 
+def test_play_drags_a_reading_behind_its_motion() -> None:
+    rate = np.repeat(np.array([0.0, 0.3, 1.0, 0.8, -0.5, 0.1])[:, None], 6, axis=1)
+    held = CATALOGUE["gyro_hysteresis"].act(Reading(np.arange(6.0), rate, {}), np.array([0.25]))
+    assert np.abs(held[:, 0] - [0.0, 0.05, 0.75, 0.75, -0.25, -0.15]).max() < EXACT
+    assert (held[:, 3:] == rate[:, 3:]).all()
+
+
 def test_a_mount_turned_by_a_quarter_swaps_the_axes() -> None:
     turned = CATALOGUE["mount_rotation"].act(RATE_HZ, BOTH, np.array([0.0, 0.0, np.pi / 2]))
     assert np.abs(turned[0] - [OMEGA[1], -OMEGA[0], OMEGA[2], F[1], -F[0], F[2]]).max() < EXACT

@@ -105,6 +105,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "clock_jump": _clock_jump,
     "clock_wander": "the clock of the recording wanders, by {w.main}",
     "gyro_delay": _gyro_delay,
+    "gyro_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
+    "accel_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
     "gyro_dead_band": "{w.it} reads zero below {w.main}",
     "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",

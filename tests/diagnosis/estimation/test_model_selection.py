@@ -41,6 +41,8 @@ SINGLE = {
     "gyro_g_sensitivity": [1e-3, 0.0, 0.0, 0.0, -1e-3, 0.0, 0.0, 0.0, 2e-3],
     "gravity": [0.05, 0.02, -0.02],
     "gyro_scale_asymmetry": [0.05, -0.04, 0.06],
+    "gyro_hysteresis": [0.01],
+    "gyro_delay": [0.004],
 }
 
 
