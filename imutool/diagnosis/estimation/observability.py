@@ -280,8 +280,8 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     if effect.name == "mount_resonance":  # no spring takes back what it passes on
         return outside or bool(theta[2:].sum() < 0.0) or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
-    least = settings.beyond_sim_noise * max(noise, default=0.0)  # less takes what a filter left of it
-    return outside or (effect.jumps and bool(theta[0] < least))
+    least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
+    return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
 
 
 def _rings_too_loud(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

@@ -41,7 +41,6 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
         forward,
         linear=False,
         starts=starts,
-        jumps=True,
     )
 
 
