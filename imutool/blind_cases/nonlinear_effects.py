@@ -1,4 +1,4 @@
-"""Forward models of readings that are no straight line of the motion: bent, of two gains, with a dead band, with play."""
+"""Forward models of nonlinear readings: bent, of two gains, with a dead band, with play."""
 
 from __future__ import annotations
 

@@ -362,7 +362,9 @@ def test_a_late_gyro_is_the_turned_spectrum_of_its_mirrored_column(n: int, late:
 def test_a_hysteresis_holds_a_reading_until_the_rate_has_moved_on() -> None:
     rate = np.array([0.0, 0.3, 1.0, 0.8, -0.5, -0.5, 0.1, 0.2])
     felt = still(gyro=(0.0, 0.0, 0.0))
-    samples = felt.sample(felt.t_s[: len(rate)], felt.t_s[: len(rate)]).with_readings(gyro=np.stack([rate, 0.0 * rate, -rate]).T)
+    samples = felt.sample(felt.t_s[: len(rate)], felt.t_s[: len(rate)]).with_readings(
+        gyro=np.stack([rate, 0.0 * rate, -rate]).T
+    )
     held = np.array([0.0, 0.05, 0.75, 0.75, -0.25, -0.25, -0.15, -0.05])
     close(act("gyro_hysteresis", samples, 0.25).gyro, np.stack([held, 0.0 * rate, -held]).T)
 

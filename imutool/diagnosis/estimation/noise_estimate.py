@@ -127,7 +127,7 @@ def with_bias_walk(found: Fit) -> Fit:
 
 
 def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
-    """Whether a line of a fit beside a simulation is noise of the recording's own colour, which an autoregression smooths."""
+    """Whether a line beside a simulation is coloured noise, which an autoregression smooths."""
     exact, chance = [log for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
     if effect.name != vibration.EFFECT.name or len(exact) < len(found.logs):
         return False

@@ -1,4 +1,4 @@
-"""Hysteresis of the accelerometer: the play operator of `gyro_hysteresis` on the specific force."""
+"""Hysteresis of the accelerometer: the play operator on the specific force."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Hysteresis of the gyro: its reading stays where it is until the rate has moved on by a width, then follows behind it.
+"""Hysteresis of the gyro: its reading follows the rate a width behind.
 
+It stays where it is until the rate has moved on by that width.
 The play operator, y = clip(y before, omega - width, omega + width) (Krasnosel'skii and Pokrovskii, Systems with Hysteresis,
 1989, ch. 1); hysteresis error: IEEE 528. It lags by a width, and a `gyro_delay` by a time.
 """

@@ -1,5 +1,6 @@
-"""Asymmetry of the gyro's scale factor: + a/2 |omega|, per axis; a is the gain where it reads positive less that elsewhere.
+"""Asymmetry of the gyro's scale factor: + a/2 |omega|, per axis.
 
+a is the gain of positive readings less that of negative ones, as a share of their mean.
 IEEE 528 and 952 (scale factor asymmetry); of an accelerometer the term K1'/2 |f| of IEEE 1293. A reading that never changes
 its sign has a scale instead.
 """
