@@ -159,7 +159,8 @@ def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:
     if entry.name == DRIVEN:
         return False
     (effect,) = (LATE_GYRO,) if entry.name == LATE_GYRO.name else catalogue.effects([entry.name])
-    if not effect.trained or (effect.stage == Stage.CLOCK and abs(_value(entry, "tau")) > MOST_TAU_S):
+    of_samples = effect.linear and effect.stage == Stage.SENSOR and not effect.needs  # its error follows from the samples alone
+    if not (effect.trained or of_samples) or (effect.stage == Stage.CLOCK and abs(_value(entry, "tau")) > MOST_TAU_S):
         return False
     if entry.name in DRIFTS:
         fixed = (replace(parameter, fixed_in_training=_value(entry, "tau")) for parameter in effect.parameters[3:])

@@ -27,7 +27,12 @@ FALSE_ALARM, POWER = 1e-3, 0.5
 DECIMATION = 4  # the misfit is slow against 200 Hz
 STEP = 0.02  # of the plausible size, for derivatives
 DISSIMILAR = {"vibration", "earth_rotation", "mount_resonance"}  # resemble nothing that a motion of some hertz does
-SPECIAL_CASE_OF = {"lever_arm": {"size_effect"}, "clock_offset": {"clock_jump"}}  # by definition
+SPECIAL_CASE_OF = {  # by definition
+    "lever_arm": {"size_effect"},
+    "clock_offset": {"clock_jump"},
+    "gyro_scale": {"gyro_scale_asymmetry"},  # of an axis that never changes its sign
+    "accel_scale": {"accel_scale_asymmetry"},
+}
 
 WINDOW_S = 1.0
 CLEAR, NONE = 30.0, 5.0  # squared misfit over the noise in a window, or a column

@@ -255,20 +255,10 @@ def misalignment(values: Three, theta: Theta, t_s: Times) -> Three:
     return values @ m.T
 
 
-def quadratic(values: Three, k: Theta, t_s: Times) -> Three:
-    """(1 + k v) v."""
-    return np.asarray(values * (1.0 + k * values))
-
-
 def warm_up(values: Three, theta: Theta, t_s: Times) -> Three:
     """v + b (1 - exp(-t / tau))."""
     rise = 1.0 - np.exp(-t_s[:, None] / theta[3])
     return np.asarray(values + rise * theta[:3])
-
-
-def dead_band(values: Three, width: Theta, t_s: Times) -> Three:
-    """Zero below the width."""
-    return np.where(np.abs(values) < width[0], 0.0, values)
 
 
 def g_sensitivity(reading: Reading, theta: Theta) -> Six:

@@ -254,6 +254,8 @@ _SPECIAL: Mapping[str, Callable[[Generator, Six, Sigma, float], Theta]] = {
     "clock_skew": lambda rng, *_: _either_sign(rng, 1e-3),
     "clock_jump": lambda rng, signal, noise, span: np.array([rng.uniform(0.25, 0.75) * span, *_either_sign(rng, 0.05)]),
     "gyro_delay": lambda rng, *_: _either_sign(rng, 5e-3),
+    "gyro_hysteresis": lambda rng, *_: np.array([rng.uniform(0.016, 0.024)]),
+    "accel_hysteresis": lambda rng, *_: np.array([rng.uniform(0.16, 0.24)]),
     "gyro_dead_band": lambda rng, *_: np.array([rng.uniform(0.04, 0.06)]),
     "low_pass": lambda rng, *_: np.array([rng.uniform(4.0, 6.0)]),
     "saturation": _limits,

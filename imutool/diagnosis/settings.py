@@ -168,9 +168,7 @@ class SearchSettings(Settings, frozen=True):
     slowest_hz: Positive = 0.5  # of a filter or a mount; a slower one is motion that the poses have lost
     ringing_segment_s: Positive = 8.0  # of the spectra in which a mount beyond the band has to ring
     ringing_power: Positive = 4.0  # of the readings that it may have there; right ones had at most 1.3
-    beyond_sim_noise: Positive = (
-        4.5  # of a simulation's sample, the largest of 25 000: a narrower dead band takes what is left of it
-    )
+    beyond_sim_noise: Positive = 4.5  # of a simulation's sample, the largest of 25 000: less width takes what is left of it
     white_chi_square: Positive = 1.15  # reduced: up to it the noise beside a simulation is taken as measured
     exchanged_effects: Count = 3  # up to which each is compared with replacements
     give_up_factor: Positive = 4.0  # over the needed squares: a fit as far off after a few steps gets no nearer

@@ -34,6 +34,8 @@ FIRST_ORDER, BY_DERIVATIVE = 0.2, 0.5
 EFFECTS: Mapping[str, tuple[Mapping[str, float], float]] = {
     "gyro_scale": ({"x": 0.05, "y": -0.1, "z": 0.08}, EXACT),
     "accel_scale": ({"x": 0.02, "y": -0.03, "z": 0.01}, EXACT),
+    "gyro_scale_asymmetry": ({"x": 0.1, "y": -0.05}, FIRST_ORDER),
+    "accel_scale_asymmetry": ({"x": 0.04, "y": -0.05}, FIRST_ORDER),
     "gyro_misalignment": ({"xy": 0.05, "yx": -0.04, "zx": 0.06}, EXACT),
     "accel_misalignment": ({"xz": 0.03, "zy": -0.02}, EXACT),
     "mount_rotation": ({"phi_x": 0.2, "phi_y": -0.1, "phi_z": 0.3}, EXACT),

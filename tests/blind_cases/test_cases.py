@@ -193,10 +193,12 @@ def test_a_vibration_is_a_sine_on_each_column() -> None:
 
 SENSOR_CASES: dict[str, tuple[list[float], np.ndarray]] = {
     "gyro_scale": ([0.1, 0.0, -0.2], np.concatenate([[0.03, 0.0, -0.4], NONE3])),
+    "gyro_scale_asymmetry": ([0.2, 0.2, -0.2], np.concatenate([[0.03, 0.05, -0.2], NONE3])),
     "gyro_misalignment": ([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], np.concatenate([[0.35, 0.89, -0.15], NONE3])),
     "gyro_g_sensitivity": ([1.0, 0, 0, 0, 1.0, 1.0, 0, 0, 0], np.concatenate([[1.0, 7.0, 0.0], NONE3])),
     "gyro_quadratic": ([1.0, 1.0, 0.1], np.concatenate([[0.09, 0.25, 0.4], NONE3])),
     "accel_scale": ([0.1, 0.1, -0.1], np.concatenate([NONE3, [0.1, -0.2, -0.9]])),
+    "accel_scale_asymmetry": ([0.2, 0.2, -0.2], np.concatenate([NONE3, [0.1, 0.2, -0.9]])),
     "accel_misalignment": ([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], np.concatenate([NONE3, [1.6, 3.9, -0.7]])),
     "accel_quadratic": ([0.1, 0.1, 0.01], np.concatenate([NONE3, [0.1, 0.4, 0.81]])),
 }
@@ -217,6 +219,13 @@ def test_drift_and_temperature_in_closed_form() -> None:
     assert np.abs(later[:, 4] - 3.0 * (1.0 - np.exp([0.0, -0.5, -1.0]))).max() < EXACT
     warm = CATALOGUE["temperature"].act(READING, np.arange(6.0)) - BOTH
     assert np.abs(warm - np.outer([0.0, 5.0, 15.0], np.arange(6.0))).max() < 1e-10
+
+
+def test_play_drags_a_reading_behind_its_motion() -> None:
+    rate = np.repeat(np.array([0.0, 0.3, 1.0, 0.8, -0.5, 0.1])[:, None], 6, axis=1)
+    held = CATALOGUE["gyro_hysteresis"].act(Reading(np.arange(6.0), rate, {}), np.array([0.25]))
+    assert np.abs(held[:, 0] - [0.0, 0.05, 0.75, 0.75, -0.25, -0.15]).max() < EXACT
+    assert (held[:, 3:] == rate[:, 3:]).all()
 
 
 def test_a_mount_turned_by_a_quarter_swaps_the_axes() -> None:

@@ -22,6 +22,7 @@ from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
+    "gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis",
     "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
     "clock_offset", "clock_skew", "clock_jump", "clock_wander", "gyro_delay", "gyro_dead_band", "low_pass", "saturation",
     "quantization", "gravity", "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples",

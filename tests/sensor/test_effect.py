@@ -164,7 +164,7 @@ def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect
 
 
 def test_the_catalogue_of_left_out_physics_is_there() -> None:
-    sensor = ("scale", "misalignment", "quadratic", "bias_drift")
+    sensor = ("scale", "scale_asymmetry", "misalignment", "quadratic", "hysteresis", "bias_drift")
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {
@@ -357,6 +357,26 @@ def test_a_late_gyro_is_the_turned_spectrum_of_its_mirrored_column(n: int, late:
     turned = act("mount_rotation", felt, 0.0, 0.0, 0.1)
     assert (act("gyro_delay", turned, 0.004).gyro[:, 2] == act("gyro_delay", felt, 0.004).gyro[:, 2]).all()
     assert act("gyro_delay", felt, late / felt.rate_hz).gyro is out.gyro  # a derivative asks for it again and again
+
+
+def test_a_hysteresis_holds_a_reading_until_the_rate_has_moved_on() -> None:
+    rate = np.array([0.0, 0.3, 1.0, 0.8, -0.5, -0.5, 0.1, 0.2])
+    felt = still(gyro=(0.0, 0.0, 0.0))
+    samples = felt.sample(felt.t_s[: len(rate)], felt.t_s[: len(rate)]).with_readings(
+        gyro=np.stack([rate, 0.0 * rate, -rate]).T
+    )
+    held = np.array([0.0, 0.05, 0.75, 0.75, -0.25, -0.25, -0.15, -0.05])
+    close(act("gyro_hysteresis", samples, 0.25).gyro, np.stack([held, 0.0 * rate, -held]).T)
+
+
+def test_a_hysteresis_starts_at_its_width_beside_a_bias_and_noise() -> None:
+    felt = lively()
+    read = act("accel_hysteresis", felt.sample(felt.t_s, felt.t_s), 0.1)
+    noisy = read.with_readings(accel=read.accel + np.random.default_rng(1).normal(0.3, 0.03, felt.accel.shape))
+    starts = only("accel_hysteresis").starts
+    assert starts is not None
+    (start,) = starts(felt, noisy)
+    assert start[0] == pytest.approx(0.1, rel=0.2)
 
 
 @pytest.mark.parametrize("width", [0.02, 0.3])

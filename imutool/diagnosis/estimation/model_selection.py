@@ -1,9 +1,8 @@
 """Model selection of effects: forward selection, exchange and elimination.
 
 Forward: each candidate is scored beside the effects so far; those of the best score are fitted in full, and the best comes in.
-Then back: an effect that the others have made superfluous goes, and one for which another serves better is exchanged. What
-stays is decided on all rows at once: dropping it must cost more than noise, for all that was tried, and it must help on unseen
-blocks. Candidates compare by log p-values of chi-square: twenty squares for one parameter are worth more than 25 for nine.
+Then back: an effect that the others have made superfluous goes, one for which another serves better is exchanged. What stays
+must cost more than noise on all rows, for all that was tried, and help on unseen blocks. Candidates compare by log p-values.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
+from imutool.diagnosis.estimation.noise_estimate import is_coloured_noise, with_bias_walk
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
     WANDER,
@@ -135,7 +134,7 @@ class _Search:
     @property
     def threshold(self) -> float:
         """Log p-value that a finding needs after the correction."""
-        return float(np.log(self.settings.false_discovery_rate / self.tried))
+        return float(np.log(self.settings.false_discovery_rate / max(1, self.tried)))  # a wrong reference leaves no candidate
 
     def removable(self, now: Fit) -> range:
         """Indices of effects but for those of every fit and the last, which has just come in."""
@@ -290,6 +289,7 @@ class _Search:
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
         no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or shrinks_motion(effect, theta, self.logs)
+        no_answer = no_answer or is_coloured_noise(effect, theta, whole)
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
         log_p = self.candidates.log_p(effect, gain[1])

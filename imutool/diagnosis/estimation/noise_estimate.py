@@ -24,7 +24,8 @@ from imutool.diagnosis.settings import BandSettings
 from imutool.errors import DataError
 from imutool.noise.bias_walk import WalkLikelihood, walk_likelihood
 from imutool.processes.forked import of_each
-from imutool.sensor.effect import Effect
+from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects import vibration
 
 RIDGE = 1e-8
 LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
@@ -145,6 +146,16 @@ def with_bias_walk(found: Fit) -> Fit:
         return found
     logs = [replace(log, whiten=replace(log.whiten, walk=walk)) for log, walk in zip(plain, walks, strict=True)]
     return fit(logs, found.chosen, part=found.part)
+
+
+def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
+    """Whether a line beside a simulation is coloured noise, which an autoregression smooths."""
+    exact, chance = [log for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
+    if effect.name != vibration.EFFECT.name or len(exact) < len(found.logs):
+        return False
+    others = tuple(entry for entry in found.chosen if entry[0] is not effect)
+    without = ((log.pair.real - expected(log.pair, others), 1.0 / log.pair.period_s) for log in exact)
+    return all(vibration.line_p_value(residual, rate_hz, theta[0]) > chance for residual, rate_hz in without)
 
 
 def squares_of_walk(found: Fit, like: Fit) -> float:

@@ -21,16 +21,18 @@ from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
-NEEDS_DELAY: Mapping[str, tuple[str, ...]] = {
-    "clock_offset": ("clock_skew", "clock_jump", "clock_wander", "low_pass", "mount_resonance")
-}
+NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", "low_pass", "mount_resonance")}
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
 STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
 UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
-DRIFTS = {"gyro_bias_drift": range(3), "accel_bias_drift": range(3, 6)}  # parameters of a temperature's for the same biases
+PLAINER = {  # of one that is no better: another effect, and its parameters, by index
+    **{"gyro_bias_drift": ("temperature", range(3)), "accel_bias_drift": ("temperature", range(3, 6))},
+    **{"gyro_scale_asymmetry": ("gyro_scale", range(3)), "accel_scale_asymmetry": ("accel_scale", range(3))},
+    "gyro_hysteresis": ("gyro_delay", range(1)),
+}
 SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth
 CLOCKS = (*STEADY, WANDER)
-FILTERS = ("low_pass", "mount_resonance", "gyro_delay")
+FILTERS = ("low_pass", "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
 REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 Starts = Mapping[str, Sequence[Theta]]
@@ -42,10 +44,7 @@ Starts = Mapping[str, Sequence[Theta]]
 def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:
     """Unobservable parameters `effect.parameter`, or `effect` where all of them are.
 
-    Such a parameter drowns in the noise at its plausible size.
-
-    A parameter at its plausible size adds squares to the white residuals, less those that a constant bias takes. Fewer than
-    `observable_squares` cannot be seen.
+    At its plausible size such a parameter adds fewer than `observable_squares` to the white residuals, beside a constant bias.
     """
     out: list[str] = []
     names = {effect.name for effect in candidates}
@@ -154,14 +153,14 @@ def _plainer(name: str, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequ
     """Effects that may stand for one: their free parameters, by index, and a start.
 
     A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift beside a temperature of the
-    log, three scales as one gravity within what the Earth has.
+    log, two gains of axes that hardly change their sign, three scales as one gravity within what the Earth has.
     """
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
     if name == "gyro_delay" and poses:
         return {"clock_offset": ([0], [-theta[0]])}
-    if name in DRIFTS:
-        return {"temperature": (DRIFTS[name], [0.0, 0.0, 0.0])}
+    if name in PLAINER:
+        return {PLAINER[name][0]: (PLAINER[name][1], np.zeros(len(PLAINER[name][1])).tolist())}
     g = GRAVITY_M_S2 * float(np.mean(theta))
     return {"gravity": (range(3), [g, 0.0, 0.0])} if name == "accel_scale" and len(theta) == 3 and abs(g) < SITES_M_S2 else {}
 
@@ -280,8 +279,9 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
     if effect.name == "mount_resonance":  # no spring takes back what it passes on
         return outside or bool(theta[2:].sum() < 0.0) or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
-    noise = max(float(log.pair.sim_noise[:3].max()) if isinstance(log.pair, Pair) else 0.0 for log in logs)
-    return outside or (effect.jumps and bool(theta[0] < settings.beyond_sim_noise * noise))  # takes what a filter left of it
+    noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
+    least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
+    return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
 
 
 def _rings_too_loud(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

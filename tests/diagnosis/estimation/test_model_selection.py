@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 from scipy.special import gammaincc
 from scipy.stats import chi2
 from support import planted
@@ -18,7 +19,8 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.noise_estimate import with_bias_walk
+from imutool.diagnosis.estimation.noise_estimate import whitened, with_bias_walk
+from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
@@ -39,6 +41,9 @@ SINGLE = {
     "mount_rotation": [0.03, -0.02, 0.04],
     "gyro_g_sensitivity": [1e-3, 0.0, 0.0, 0.0, -1e-3, 0.0, 0.0, 0.0, 2e-3],
     "gravity": [0.05, 0.02, -0.02],
+    "gyro_scale_asymmetry": [0.05, -0.04, 0.06],
+    "gyro_hysteresis": [0.01],
+    "gyro_delay": [0.004],
 }
 
 
@@ -99,6 +104,42 @@ def test_a_drift_is_a_drift_and_no_walk() -> None:
     found = asked(pair, beyond=False)
     assert names(found) == ["gyro_bias_drift"]
     assert sure(found, "gyro_bias_drift", drift)
+
+
+# ── two gains of an axis ──
+
+
+def test_two_gains_of_an_axis_that_never_changes_its_sign_are_a_scale() -> None:
+    pair = planted.pair(planted.rich(), {"accel_scale": [0.0, 0.0, 0.02]})
+    logs, named = [planted.weighed(pair)], planted.catalogue()
+    told = fit(logs, planted.acting({"accel_scale_asymmetry": [0.0] * 3}))
+    assert with_plainer_effects(logs, told, named).keys == ("accel_scale",)
+
+
+def test_two_gains_beside_a_scale_are_both_named() -> None:
+    found = asked(planted.pair(planted.shaken(), {"gyro_scale": [0.03] * 3, "gyro_scale_asymmetry": [0.06] * 3}), beyond=False)
+    assert sorted(names(found)) == ["gyro_scale", "gyro_scale_asymmetry"]
+    assert sure(found, "gyro_scale_asymmetry", [0.06] * 3)
+
+
+def test_a_wrong_reference_leaves_no_candidate_and_no_finding() -> None:
+    assert names(select_effects([planted.weighed(planted.pair(planted.rich()))], ())) == []
+
+
+# ── lines ──
+
+BAND_HZ, PASSED, WHITE = (18.0, 24.0), 2.0, 0.3
+
+
+@pytest.mark.parametrize("line_m_s2", [0.0, 0.03])
+def test_noise_that_a_filter_has_coloured_is_no_vibration_and_a_line_on_it_is_one(line_m_s2: float) -> None:
+    felt = planted.rich(duration_s=60.0)
+    white = planted.noise(6000, 51)
+    passed = sosfilt(butter(2, BAND_HZ, "bandpass", fs=planted.RATE_HZ, output="sos"), white, axis=0)
+    line = line_m_s2 * np.sin(2.0 * np.pi * 33.3 * felt.t_s)[:, None] * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
+    pair = planted.pair(felt, seed=51, added=PASSED * passed - (1.0 - WHITE) * white + line)
+    found = select_effects([whitened(pair, (), pair.settings.band)], catalogue.diagnosed(["vibration"]))
+    assert names(found) == (["vibration"] if line_m_s2 else [])
 
 
 # ── log_p_value ──

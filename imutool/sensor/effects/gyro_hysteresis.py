@@ -1,0 +1,63 @@
+"""Hysteresis of the gyro: its reading follows the rate a width behind.
+
+It stays where it is until the rate has moved on by that width.
+The play operator, y = clip(y before, omega - width, omega + width) (Krasnosel'skii and Pokrovskii, Systems with Hysteresis,
+1989, ch. 1); hysteresis error: IEEE 528. It lags by a width, and a `gyro_delay` by a time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, residual
+from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.units import Sensor
+
+LEAST = 1e-4  # of the plausible width, where a fit starts at least
+LOG_STEP = 0.02  # of the derivative by the width
+
+
+def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observable_if: str) -> Effect:
+    """Hysteresis of either sensor, of one width on all axes."""
+    part = 0 if sensor == "gyro" else 1
+
+    def forward(samples: SensorSamples, width: Theta) -> SensorSamples:
+        reading = play(getattr(samples, sensor), float(width[0]))
+        return samples.with_readings(gyro=reading) if sensor == "gyro" else samples.with_readings(accel=reading)
+
+    def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+        """The width by which the samples lag on the way up and on the way down."""
+        error, ideal = residual(motion, samples)[part], getattr(motion.sample(samples.stamp_s, samples.stamp_s), sensor)
+        behind = -float(np.mean((error - error.mean(axis=0)) * np.sign(np.gradient(ideal, axis=0))))
+        return [np.array([max(behind, LEAST * plausible)])]
+
+    return Effect(
+        f"{sensor}_hysteresis",
+        Stage.SENSOR,
+        (sensor,),
+        f"{sensor}(t) = {symbol} where it moves by less than width, else width behind it, on every axis",
+        (Parameter("width", unit, plausible, positive=True, step=LOG_STEP),),
+        observable_if,
+        forward,
+        linear=False,
+        starts=starts,
+    )
+
+
+def play(x: Float64[np.ndarray, "n 3"], width: float) -> Float64[np.ndarray, "n 3"]:
+    """Play of columns: from turn to turn of a column, it is what the last turn left, clipped."""
+    out = np.empty_like(x)
+    for column, reading in zip(x.T, out.T, strict=True):
+        rises = np.diff(column) > 0.0
+        turns = np.concatenate([[0], np.flatnonzero(rises[1:] != rises[:-1]) + 1])
+        left, at_turns = float(column[0]), []
+        for value in column[turns].tolist():
+            left = min(max(left, value - width), value + width)
+            at_turns.append(left)
+        since = np.repeat(at_turns, np.diff(np.append(turns, len(column))))
+        np.clip(since, column - width, column + width, out=reading)
+    return out
+
+
+EFFECT = hysteresis("gyro", "omega", "rad/s", 0.02, "it turns to and fro")
