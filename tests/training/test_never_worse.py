@@ -91,7 +91,9 @@ def test_a_gain_counts_beyond_its_scatter_from_log_to_log() -> None:
     assert beaten(errors, scattered)
     assert not beaten(errors, scattered, surely=2.0)
     worse_on_one = [0.8, 2.3, 1.1, 1.1]
-    assert keep(scores(constant=[1.0, 2.0, 1.5, 1.2], linear=worse_on_one), "gyro") == "constant", "by little more than its standard error"
+    assert keep(scores(constant=[1.0, 2.0, 1.5, 1.2], linear=worse_on_one), "gyro") == "constant", (
+        "by little more than its standard error"
+    )
 
 
 def contradictions(recordings: list[Recording]) -> list[Contradiction]:

@@ -134,7 +134,7 @@ class _Search:
     @property
     def threshold(self) -> float:
         """Log p-value that a finding needs after the correction."""
-        return float(np.log(self.settings.false_discovery_rate / max(1, self.tried)))  # a wrong reference leaves no candidate
+        return float(np.log(self.settings.false_discovery_rate / self.tried))
 
     def removable(self, now: Fit) -> range:
         """Indices of effects but for those of every fit and the last, which has just come in."""
