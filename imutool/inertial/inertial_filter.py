@@ -77,10 +77,10 @@ class FilterSettings(Settings, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class State:
-    """Filter state: pose, bias b in motion, offset d at rest, steady motion, covariance, other offsets.
+    """Filter state: pose, biases, steady motion, covariance and offsets of other sensors.
 
-    Biases are gyro (rad/s), then accel (m/s²). The steady motion is the pivot's place r (m) and the mean velocity c (m/s), in
-    body axes.
+    Biases are gyro (rad/s), then accel (m/s²): b in motion, and the offset d at rest. The steady motion is the pivot's place r
+    (m) and the mean velocity c (m/s), in body axes.
     """
 
     R_wb: Matrix3
@@ -133,15 +133,15 @@ class Step(NamedTuple):
 
 
 def start(accel: Vector3, bias: Vector6, std: Float64[np.ndarray, "12"], s: FilterSettings) -> State:
-    """First state of a log: levelled, with a bias, and the deviations of bias and offset at rest."""
+    """First state of a log: levelled, with a bias, and deviations of bias and offset."""
     P = np.diag(np.concatenate([np.zeros(9), std, np.repeat([s.pivot_m, s.speed_m_s], 3)]) ** 2)
     return level(accel, State(EYE, np.zeros(3), np.zeros(3), bias, np.zeros(6), np.zeros(6), P), s)
 
 
 def level(accel: Vector3, x: State, s: FilterSettings) -> State:
-    """Levelled state from the direction of the mean specific force; biases and steady motion are those of `x`.
+    """Levelled state from the direction of the mean specific force.
 
-    Heading 0, unknown velocity, at the origin.
+    Heading 0, unknown velocity, at the origin. Biases and steady motion are those of `x`.
     """
     force = accel - x.bias[3:]
     size = float(np.linalg.norm(force))

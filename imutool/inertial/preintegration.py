@@ -60,7 +60,7 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
 
 
 def exp_and_jacobian(xi: Vector3) -> tuple[Matrix3, Matrix3]:
-    """Rotation by a rotation vector and its left Jacobian, of a single vector: in floats, as one array costs as much as all."""
+    """Rotation by one rotation vector, and its left Jacobian; in floats, which are faster."""
     x, y, z = xi.tolist()
     square = x * x + y * y + z * z
     if square < SMALL_RAD2:

@@ -182,7 +182,7 @@ def _log_errors(
 
 
 def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
-    """Whether errors are smaller by `LEAST_GAIN` and by more than `surely` standard errors of their scatter between logs."""
+    """Whether errors are smaller by `LEAST_GAIN` and by `surely` standard errors over the logs."""
     gain = (errors - others)[np.isfinite(errors - others)]
     if not len(gain):
         return False
