@@ -6,6 +6,7 @@ A bag of ROS 2 before Iron holds no definitions, so that those of a driver's own
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from imutool.errors import DataError
 
 from ._ros_types import ros2_store
 
+TYPE = re.compile(r"\w+/msg/\w+")
 WORKSPACES = "AMENT_PREFIX_PATH"  # what `source install/setup.bash` sets
 
 
@@ -47,6 +49,8 @@ def definition_from_files(kind: str, beside: Path) -> tuple[bytes, str]:
 
 def _places(kind: str, beside: Path) -> Iterator[Path]:
     """Files that may define a type: `PACKAGE/msg/TYPE.msg` or `TYPE.msg` in the bag's folder, then in the workspaces."""
+    if not TYPE.fullmatch(kind):  # a bag may state any text, also one that leads to another folder
+        return
     package, _, name = kind.partition("/msg/")
     yield from (beside / package / "msg" / f"{name}.msg", beside / "msg" / f"{name}.msg", beside / f"{name}.msg")
     for prefix in filter(None, os.environ.get(WORKSPACES, "").split(os.pathsep)):

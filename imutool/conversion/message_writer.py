@@ -245,7 +245,7 @@ def _encode_table(columns: Shaped[np.ndarray, " n"]) -> UInt8[np.ndarray, "n L"]
         position += -(position - ENCAPSULATION) % kind.itemsize
         offsets.append(position)
         position += kind.itemsize * int(np.prod(shape, dtype=int))
-    position += not fields  # ROS 2 gives a message without fields one byte
+    position += 0 if fields else 1  # ROS 2 gives a message without fields one byte
     formats = [(kind.newbyteorder("<"), shape) for kind, shape in fields.values()]
     layout = np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": position})
     rows = np.zeros(len(columns), layout)

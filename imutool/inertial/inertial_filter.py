@@ -171,15 +171,16 @@ def motion_step(x: State, motion: Increment, rate: Vector3, missing_s: float, wa
     step = _predict(x, R, motion.v, motion.p, motion.by_bias, T, (turned, push), walk, resting=False)
     H = STOPPED.copy()
     H[:, STEADY] = steady = np.concatenate([R @ hat(rate), -R], axis=1)
-    return _velocity_update(step, H, step.expected.v_w + steady @ x.steady, 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T)
+    noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
+    return _with_velocity(step, H, step.expected.v_w + steady @ x.steady, noise, HUBER)
 
 
-def _velocity_update(step: Step, H: Float64[np.ndarray, "3 m"], v: Vector3, noise: float) -> Step:
-    """Update of a predicted state by a velocity v that is zero, with `noise` its variance per axis; Huber's weight."""
-    S = H @ step.expected.P[:SIZE, :SIZE] @ H.T
-    size = math.sqrt(float(v @ v) / (float(np.einsum("ii", S)) + 3.0 * noise))
-    after = update(step.expected, H, v, np.full(3, noise * max(1.0, size / HUBER) ** 2))
-    return step._replace(after=after, innovation=(v, S + noise * EYE))
+def _with_velocity(step: Step, H: Float64[np.ndarray, "3 m"], v: Vector3, noise: float, most: float) -> Step:
+    """Step after a velocity that is zero but for `noise` per axis; with less weight above `most` standard deviations."""
+    S = H @ step.expected.P[:SIZE, :SIZE] @ H.T + noise * EYE
+    size = math.sqrt(float(v @ v) / float(np.einsum("ii", S)))
+    after = update(step.expected, H, v, np.full(3, noise * max(1.0, size / most) ** 2))
+    return step._replace(after=after, innovation=(v, S))
 
 
 def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Walk, s: FilterSettings) -> Step:
@@ -192,7 +193,7 @@ def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: fl
     by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
     push = s.accel_density**2 * T
     step = _predict(x, x.R_wb, dv, 0.5 * T * dv, by_bias, T, (LEAST_VARIANCE, push), walk, resting=True)
-    step = _velocity_update(step, STOPPED, step.expected.v_w, s.rest_m_s**2)
+    step = _with_velocity(step, STOPPED, step.expected.v_w, s.rest_m_s**2, math.inf)
     rate = step.after.rest_bias(True)[:3] - mean[:3]
     return step._replace(after=update(step.after, STILL, rate, variance + s.rest_rad_s**2))
 

@@ -13,6 +13,8 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.converters._msg_files import definition_from_files
+
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE.register(get_types_from_msg("float64 load\nstring[] names\n", "my_robot/msg/Load"))
 TYPES = STORE.types
@@ -195,6 +197,13 @@ def test_definitions_come_from_msg_files_beside_the_bag_or_in_the_workspace(conv
     done = convert(bag, tmp_path / "b.mcap")
     assert done.returncode == 4
     assert "Load.msg: is no definition of my_robot/msg/Load" in done.stderr
+
+
+def test_a_type_that_leads_to_another_folder_opens_no_file(tmp_path):
+    (tmp_path / "Load.msg").write_text("float64 load\n")
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    assert definition_from_files("my_robot/msg/../Load", bag) == (b"", "my_robot/msg/../Load")
 
 
 def test_the_public_sample_arrives_whole(convert, tmp_path, data):

@@ -13,6 +13,7 @@ from imutool.inertial.inertial_filter import (
     BIAS,
     SIZE,
     STOPPED,
+    VELOCITY,
     FilterSettings,
     State,
     Step,
@@ -146,3 +147,12 @@ def test_smoothing_a_linear_case_is_least_squares() -> None:
     w = 1 / np.array([STD[0] ** 2, STD[6] ** 2 + 2 * inertial_filter.LEAST_VARIANCE, q, q, r, r])
     solved = np.linalg.solve(A.T @ (w[:, None] * A), A.T @ (w * y))
     np.testing.assert_allclose([s.bias[0] for s in smooth(found)], solved[:3], rtol=1e-3)
+
+
+def test_a_stop_counts_in_full_however_fast_the_estimate() -> None:
+    """At rest a large velocity is the filter's own error; in motion it may be the body's, and counts less."""
+    x = replace(start(), v_w=np.array([30.0, 0.0, 0.0]), steady=np.zeros(6))
+    P = x.P.copy()
+    P[VELOCITY, VELOCITY] = np.eye(3)
+    after = rest_step(replace(x, P=P), np.array([0.0, 0.0, 0.0, 0.5, -0.3, 9.7]), np.full(3, 1e-8), 0.5, WALK, S)
+    assert np.diag(after.after.P[VELOCITY, VELOCITY]).max() < 1.01 * S.rest_m_s**2
