@@ -172,22 +172,22 @@ def with_common_arm(
     settings: SearchSettings,
     is_significant: Callable[[Effect, float], bool],
 ) -> Fit:
-    """Fit with a lever arm instead of a size effect of three equal arms.
-
-    The rest of the size effect stays if it is significant.
-    """
+    """Fit with a lever arm instead of a size effect of three equal arms; with both if the rest is significant and smaller."""
     arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
     lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in now.keys]
     if not arms or not lever:
         return now
-    others, (size_effect, _) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
+    others, (size_effect, theta) = (*now.chosen[: arms[0]], *now.chosen[arms[0] + 1 :]), now.chosen[arms[0]]
     without = fit(logs, others, near=now)
     simple = fit(logs, (*others, (lever[0], lever[0].null_value.astype(float))), near=now)
     if without.objective - simple.objective < settings.common_arm_share * (without.objective - now.objective):
         return now
     rest = with_free(size_effect, range(6))  # of the x and y axes against z, whose arm is the lever arm
     both = fit(logs, (*simple.chosen, (rest, rest.null_value.astype(float))), near=simple)
-    return both if is_significant(rest, simple.objective - both.objective) else simple
+    if not is_significant(rest, simple.objective - both.objective):
+        return simple
+    positions = theta.reshape(3, 3)  # of each axis
+    return both if np.linalg.norm(positions.mean(axis=0)) > np.linalg.norm(positions.std(axis=0)) else now
 
 
 def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:

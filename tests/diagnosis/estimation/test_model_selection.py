@@ -505,6 +505,14 @@ def test_three_arms_that_agree_are_a_lever_arm_and_the_rest_a_size_effect(arms_m
     assert np.abs(arm.theta[:2]).max() < 0.02
 
 
+def test_two_axes_that_sit_together_far_from_the_third_are_a_size_effect_alone() -> None:
+    """On a floor that shakes a little the arm of x and y explains almost all; the three have none in common."""
+    together, apart, floor = [0.006, -0.02, 0.013], [-0.012, 0.04, -0.026], planted.shaken()
+    floor = replace(floor, gyro=floor.gyro * [0.1, 0.1, 1.0], alpha=floor.alpha * [0.1, 0.1, 1.0])
+    pair = planted.pair(floor, {"size_effect": [*together, *together, *apart]}, 9)
+    assert names(asked(pair, beyond=False)) == ["size_effect"]
+
+
 def test_a_name_that_leaves_no_more_takes_the_place_of_a_term() -> None:
     """On level ground five of six misalignments are noise, and one term alone costs less by BIC; the physics is the same."""
     pair = planted.pair(planted.planar(), {"accel_misalignment": [0.0, 0.0, 0.06, 0.0, 0.0, 0.0]})
