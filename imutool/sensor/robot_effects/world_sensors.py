@@ -5,7 +5,7 @@ Magnetometer: soft iron, misalignment and declination; a constant is hard iron. 
 the declination turns the field about the vertical of the world.
 
 Barometer: dynamic pressure and temperature. p = p_static + C rho v² / 2 (Bolanakis, MEMS barometers toward vertical position
-detection, 2017, section 4), and a share of the temperature. Its lag is the `low_pass` of any signal.
+detection, 2017, section 4), and a share of the temperature. Its lag is the `low_pass` of any signal, of both pressures.
 
 GNSS antenna: lever arm and latency. A position is p = p_body + R_wb r (Groves, Principles of GNSS, Inertial, and Multisensor
 Integrated Navigation Systems, section 14.3), sampled `delay` before its stamp.
@@ -14,14 +14,14 @@ Integrated Navigation Systems, section 14.3), sampled `delay` before its stamp.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Theta
-from imutool.sensor.robot_effects.signal_samples import SignalSamples
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale, delay_of_all
 from imutool.units import AXES
 
@@ -95,8 +95,8 @@ class _Temperature:
         return s.with_added(0, theta[0] * (values - values.mean()))
 
 
-def _dynamic(s: SignalSamples, theta: Theta) -> SignalSamples:
-    return s.with_added(0, theta[0] * 0.5 * AIR_KG_M3 * s.state["speed"] ** 2)
+def _dynamic(ideal: IdealSignal, theta: Theta) -> IdealSignal:
+    return replace(ideal, fine=ideal.fine + theta[0] * 0.5 * AIR_KG_M3 * ideal.state["speed"][:, None] ** 2)
 
 
 def barometer_effects(scale: Scale) -> Iterator[Effect]:
@@ -104,7 +104,7 @@ def barometer_effects(scale: Scale) -> Iterator[Effect]:
     if scale.state.get("speed", 0.0) > 0.0:
         number = (Parameter("coefficient", "-", 1.0),)
         text = "pressure += coefficient rho speed^2 / 2, rho = 1.225 kg/m³"
-        yield scale.effect("dynamic_pressure", (0,), text, number, _dynamic, "the speed varies")
+        yield scale.effect("dynamic_pressure", (0,), text, number, _dynamic, "the speed varies", stage=Stage.MOTION)
     for name in scale.state:
         if "temperature" in name.lower():
             number = (Parameter("slope", f"{scale.units[0]}/K", 50.0),)

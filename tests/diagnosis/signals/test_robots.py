@@ -65,6 +65,11 @@ def test_a_channel_that_drives_without_a_lag_gets_its_name_beside_a_slow_baromet
     within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
 
 
+def test_a_slow_barometer_is_slow_for_the_dynamic_pressure_too(tmp_path: Path) -> None:
+    conceal_robot(tmp_path, 41068, "flight", "pair")  # both effects
+    within(diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap"), tmp_path / "truth.json")
+
+
 def test_an_arm_is_diagnosed_from_the_command_line_with_its_page(imutool: Run, tmp_path: Path) -> None:
     """A dry friction in MuJoCo: the command finds topics and fields by itself, and the page draws them.
 
