@@ -25,6 +25,8 @@ ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two 
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
 CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
+OF_READING = ("gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_dead_band")
+NAMED_SHARE = 0.05
 OF_UNIT = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "mount_rotation")  # its own, or its mount's
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"
 
@@ -36,15 +38,16 @@ def shared(finding: Finding, sim_findings: Sequence[Finding]) -> bool:
 
 
 def is_of_digits(finding: Finding, digits: Finding) -> bool:
-    """Whether a term or curve of an axis' own reading is no more than its rounding.
+    """Whether a term, a curve or an effect of an axis' own reading is no more than its rounding.
 
-    It removes less than rounding adds, LSB / sqrt(12).
+    It removes less than rounding adds, LSB / sqrt(12); an effect with a name less than `NAMED_SHARE` of these squares.
     """
-    own = f"{READING.get(finding.signal, '')}_{finding.axis}"
-    if finding.kind != "unknown" or own not in finding.equation or f"{finding.signal}_lsb" not in digits.parameters:
+    own, lsb = f"{READING.get(finding.signal, '')}_{finding.axis}", digits.parameters.get(f"{finding.signal}_lsb")
+    is_term = finding.kind == "unknown" and own in finding.equation
+    if lsb is None or not (is_term or finding.effect in OF_READING):
         return False
     removed = finding.held_out.rms_before**2 - finding.held_out.rms_after**2
-    return removed < digits.parameters[f"{finding.signal}_lsb"].value ** 2 / 12.0
+    return removed < (1.0 if is_term else NAMED_SHARE) * lsb.value**2 / 12.0
 
 
 def remarks(findings: Sequence[Finding], sim_findings: Sequence[Finding]) -> Iterator[str]:
