@@ -135,7 +135,7 @@ class _Session:
         if not self._samples:
             why = f"; the first of {malformed.count} messages: {malformed.first}" if malformed.count else ""
             raise DataError(
-                f"the source sent no samples{why}", where="source", expected='{"t_ns": …, "gyro": […], "accel": […]}'
+                f"it sent no samples{why}", where="the stream", expected='{"t_ns": …, "gyro": […], "accel": […]}'
             )
         seconds = (self._last_ns - self._begin_ns) * 1e-9
         return StreamStatistics(
@@ -192,7 +192,7 @@ class _Session:
             start = auto(model, without_drift(model, seen))
         except DataError as error:
             fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
-            raise DataError("the stream does not start at rest", where="source", fix=fix) from error
+            raise DataError("it does not start at rest", where="the stream", fix=fix) from error
         self._how, self._std = start.how, start.std
         self._online = OnlineDebiaser(after_load(self._model, model.load_before), start)
         for sample in self._first:
