@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -169,11 +170,29 @@ def _text_messages(raw: bytes, remarks: Remarks) -> dict[str, Messages]:
         remarks.losses.append(f"{lost} lines of the log are no message that it describes")
     found = {}
     for name, rows in lines.items():
-        try:
-            found[name] = _messages(_from_text(formats[name], rows), places[name])
-        except (ValueError, OverflowError) as error:
-            remarks.losses.append(f"{len(rows)} messages {name} are left out: {error}")
+        errors: list[Exception] = []
+        parts = list(_sound_parts(formats[name], rows, places[name], errors))
+        if errors:
+            remarks.losses.append(f"{len(errors)} messages {name} are left out: {errors[0]}")
+        if parts:
+            arrays, kept = zip(*parts, strict=True)
+            found[name] = _messages(np.concatenate(arrays), [place for part in kept for place in part])
     return found
+
+
+def _sound_parts(
+    form: _Format, rows: list[list[str]], places: list[int], errors: list[Exception]
+) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Messages that the log's description holds, by halves: one number that cannot be read costs its own message alone."""
+    try:
+        yield _from_text(form, rows), places
+    except (ValueError, OverflowError) as error:
+        if len(rows) == 1:
+            errors.append(error)
+            return
+        half = len(rows) // 2
+        for part in (slice(None, half), slice(half, None)):
+            yield from _sound_parts(form, rows[part], places[part], errors)
 
 
 def _from_text(form: _Format, rows: list[list[str]]) -> np.ndarray:

@@ -11,8 +11,11 @@ import logging
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from functools import partial
+from io import BufferedReader, FileIO, StringIO
 from mmap import ACCESS_READ, mmap
+from os import fstat
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +34,7 @@ from ._source import find_files, head
 GENERAL = True
 MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"
 HEADER_BYTES = 16
+READS_A_BYTE = 2  # at most: where it finds damage, pyulog reads head and content of a message at each byte
 LEAST_IMU_HZ = 10.0  # slower logs of a sensor are samples for its temperature, not for its motion
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 UP_FROM_DOWN = np.array([1.0, 1.0, -1.0])
@@ -111,10 +115,26 @@ def _open(path: Path) -> Any:
     printing = logging.getLogger("pyulog")
     printing.setLevel(logging.ERROR)
     try:
-        with path.open("rb") as file:  # pyulog leaves a file that it refuses open
+        # pyulog leaves a file that it refuses open, and prints where our reports go
+        with _FiniteFile(FileIO(path)) as file, redirect_stdout(StringIO()):
             return ULog(file, None, True)
     except Exception as error:  # pyulog raises TypeError, struct.error, KeyError, IndexError: whatever the bytes lead to
         raise DataError(f"cannot be read as a ULog ({error or type(error).__name__})", where=path) from error
+
+
+class _FiniteFile(BufferedReader):
+    """File that ends the reading of a damaged log that pyulog 1.3 begins again and again."""
+
+    def __init__(self, raw: FileIO) -> None:
+        super().__init__(raw)
+        self._left = READS_A_BYTE * fstat(raw.fileno()).st_size + HEADER_BYTES
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Some bytes, until there were more readings than a file of this size can need."""
+        self._left -= 1
+        if self._left < 0:
+            raise EOFError("it begins again and again")
+        return super().read(size)
 
 
 def _is_cut(path: Path) -> bool:

@@ -37,6 +37,7 @@ PART_KEY = "imutool_part_of"  # channel metadata: one sensor of the IMU on that 
 RECORDED_KEY = "imutool_recorded_as"  # channel metadata: the original of the IMU on that topic
 KIND_KEY = "imutool_kind"  # channel metadata of poses: truth, estimate, odometry or unknown
 VELOCITY_KEY = "imutool_velocity_of"  # channel metadata: the world velocity of the poses on this topic
+CUT = "Cut the log before or after it"
 UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
@@ -97,8 +98,7 @@ class Topic:
         Raises:
             LogError: a payload that is no such message.
         """
-        for part, layout in schemas.runs(rows.payload, schemas.IMU, self._encoding):
-            cut = rows.where(part)
+        for cut, layout in _runs(rows, schemas.IMU, self._encoding):
             columns = decode_imu(cut.payload, self._encoding, layout)
             yield ImuBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
 
@@ -119,8 +119,7 @@ class Topic:
         Raises:
             LogError: a payload that is no such message, NaN or infinite values.
         """
-        for part, layout in schemas.runs(rows.payload, self.schema_name, self._encoding):
-            cut = rows.where(part)
+        for cut, layout in _runs(rows, self.schema_name, self._encoding):
             for columns in decode_poses(cut.payload, self.schema_name, self._encoding, layout):
                 check_finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
                 yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
@@ -131,8 +130,7 @@ class Topic:
         Raises:
             LogError: a payload that is no such message, NaN or infinite values.
         """
-        for part, layout in schemas.runs(rows.payload, self.schema_name, self.message_encoding):
-            cut = rows.where(part)
+        for cut, layout in _runs(rows, self.schema_name, self.message_encoding):
             columns = decode_scalars(cut.payload, self.schema_name, self.message_encoding, layout)
             check_finite(cut.sequence, values=columns.values)
             stamp_ns = cut.log_time if columns.stamp_ns is None else columns.stamp_ns
@@ -144,8 +142,24 @@ class Topic:
         Raises:
             LogError: a payload that is no such message.
         """
-        for part, layout in schemas.runs(rows.payload, schemas.TWIST, self.message_encoding):
-            yield decode_twist(rows.where(part).payload, self.message_encoding, layout)
+        for cut, layout in _runs(rows, schemas.TWIST, self.message_encoding):
+            yield decode_twist(cut.payload, self.message_encoding, layout)
+
+
+def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, schemas.Layout]]:
+    """Stretches of messages that share one layout.
+
+    Raises:
+        LogError: a payload that is no such message, or an encoding that is not known.
+    """
+    done = 0
+    try:
+        for part, layout in schemas.runs(rows.payload, schema_name, encoding):
+            done = part.stop
+            yield rows.where(part), layout
+    except LogError as error:
+        what = f"message {rows.sequence[done]} is no {schema_name}: {error.what}"
+        raise LogError(what, expected=error.expected, fix=error.fix or CUT) from error
 
 
 def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
@@ -161,7 +175,7 @@ def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarra
             raise LogError(
                 f"message {sequence[row]} has {name} {values[row].tolist()}",
                 expected="finite numbers",
-                fix="Cut the log before or after it",
+                fix=CUT,
             )
 
 

@@ -2,74 +2,21 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from support.flight_logs import DataFlash, write_dataflash
 
 from imutool.converters import dataflash
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
-CODES = {"I": "I", "H": "H", "Q": "Q", "B": "B", "f": "f", "c": "h", "C": "H", "n": "4s", "L": "i", "Z": "64s", "N": "16s"}
-
-
-class Writer:
-    """A DataFlash log: formats and messages as they come."""
-
-    def __init__(self) -> None:
-        self.raw, self.numbers, self.letters, self.lines = b"", {}, {}, []
-        self.form(128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89)
-
-    def form(self, number: int, name: str, letters: str, labels: str, size: int | None = None) -> None:
-        code = "<" + "".join(CODES.get(letter, "") for letter in letters)
-        self.numbers[name], self.letters[name] = (number, code), letters
-        size = struct.calcsize(code) + 3 if size is None else size
-        self.lines.append(f"FMT, {number}, {size}, {name}, {letters}, {labels}")
-        self.raw += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, size, name.encode(), letters.encode(), labels.encode())
-
-    def add(self, name: str, *values: object) -> None:
-        number, code = self.numbers[name]
-        self.raw += b"\xa3\x95" + bytes([number]) + struct.pack(code, *values)
-        texts = [as_text(value, letter) for value, letter in zip(values, self.letters[name], strict=True)]
-        self.lines.append(", ".join([name, *texts]))
-
-
-def as_text(value: Any, letter: str) -> str:
-    """Field as Mission Planner writes it into a .log."""
-    if isinstance(value, bytes):
-        return value.decode()
-    return f"{value / 1e7:.7f}" if letter == "L" else f"{value / 100:.2f}" if letter in "cC" else repr(value)
-
-
-def write_log(path: Path, text: bool = False) -> Path:
-    log = Writer()
-    log.form(1, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
-    log.form(2, "XKF1", "QBccCffffff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD")
-    log.form(3, "GPS", "QBL", "TimeUS,Status,Lat")
-    log.form(4, "PARM", "QNf", "TimeUS,Name,Value")
-    log.form(5, "MSG", "QZ", "TimeUS,Message")
-    log.add("PARM", 1, b"INS_GYRO_RATE", 2.0)
-    log.add("MSG", 2, b"ArduCopter V4.5")
-    for n in range(500):
-        t_us = 7_000_000 + 5000 * n
-        for instance in (0, 1):
-            log.add("IMU", t_us + instance, instance, 0.1, 0.2, 0.3, 1.0, 2.0, -9.75)
-        log.add("XKF1", t_us, 0, 0, 0, 4500, 0.5, 0.25, -0.125, 1.0, 2.0, -3.0)
-    log.add("GPS", 8_000_000, 3, 473_977_418)
-    if text:
-        path.write_text("\n".join([*log.lines, ""]))
-    else:
-        path.write_bytes(log.raw)
-    return path
-
 
 def test_a_log_in_text_gives_the_same_messages(tmp_path):
-    paths = write_log(tmp_path / "1.BIN"), write_log(tmp_path / "1.log", text=True)
+    paths = write_dataflash(tmp_path / "1.BIN"), write_dataflash(tmp_path / "1.log", text=True)
     binary, text = (dataflash.read_sequence(dataflash.sequences(path)[0]) for path in paths)
     assert text.imus.keys() == binary.imus.keys()
     for topic, imu in binary.imus.items():
@@ -82,16 +29,16 @@ def test_a_log_in_text_gives_the_same_messages(tmp_path):
 
 
 def test_lines_of_a_text_log_that_are_no_message_are_counted(tmp_path):
-    path = write_log(tmp_path / "1.log", text=True)
+    path = write_dataflash(tmp_path / "1.log", text=True)
     path.write_text(path.read_text() + "IMU, 12, 0, 0.1\nnoise\nGPS, 9000000, three, 47.3\n")
     log = dataflash.read_sequence(dataflash.sequences(path)[0])
     assert log.remarks.losses[0] == "2 lines of the log are no message that it describes"
-    assert log.remarks.losses[1].startswith("2 messages GPS are left out: invalid literal")
+    assert log.remarks.losses[1].startswith("1 messages GPS are left out: invalid literal")
     assert len(log.imus["/imu0"]) == 500
 
 
 def test_a_text_log_that_contradicts_itself_loses_that_message_alone(tmp_path):
-    path = write_log(tmp_path / "1.log", text=True)
+    path = write_dataflash(tmp_path / "1.log", text=True)
     whole = dataflash.read_sequence(dataflash.sequences(path)[0])
     path.write_text(
         path.read_text() + "FMT, 1a, none, ODD, Qc, TimeUS,V\nODD, 5, 1e30\nFMT, 9, 3, NAN, QC, TimeUS,V\nNAN, 5, nan\n"
@@ -103,6 +50,17 @@ def test_a_text_log_that_contradicts_itself_loses_that_message_alone(tmp_path):
     ]
 
 
+def test_a_number_that_cannot_be_read_costs_its_own_message_alone(tmp_path):
+    path = write_dataflash(tmp_path / "1.log", text=True)
+    lines = path.read_text().splitlines()
+    at = [n for n, line in enumerate(lines) if line.startswith("IMU,")][500]
+    lines[at] = lines[at].replace("0.2", "`0.2")
+    path.write_text("\n".join(lines))
+    log = dataflash.read_sequence(dataflash.sequences(path)[0])
+    assert log.remarks.losses == ["1 messages IMU are left out: could not convert string to float: '`0.2'"]
+    assert [len(imu) for imu in log.imus.values()] == [499, 500]
+
+
 def test_an_imu_of_other_fields_is_named_as_lost(tmp_path):
     path = tmp_path / "1.log"
     path.write_text("FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\nFMT, 9, 12, IMU, QB, TimeUS,I\nIMU, 100, 1\n")
@@ -112,7 +70,7 @@ def test_an_imu_of_other_fields_is_named_as_lost(tmp_path):
 
 
 def test_imus_poses_and_every_message_arrive(convert, imutool, tmp_path):
-    done = convert(write_log(tmp_path / "00000042.BIN"), tmp_path / "out.mcap")
+    done = convert(write_dataflash(tmp_path / "00000042.BIN"), tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr
     with Log(tmp_path / "out.mcap") as log:
         assert log.imu_topics == ["/imu0", "/imu1"]
@@ -137,7 +95,7 @@ def test_imus_poses_and_every_message_arrive(convert, imutool, tmp_path):
 
 
 def test_damage_is_passed_over_and_counted(convert, tmp_path):
-    log = write_log(tmp_path / "a.bin")
+    log = write_dataflash(tmp_path / "a.bin")
     raw = log.read_bytes()
     log.write_bytes(raw[:20_000] + bytes(33) + raw[20_000:-5])
     done = convert(log, tmp_path / "out.mcap")
@@ -148,7 +106,7 @@ def test_damage_is_passed_over_and_counted(convert, tmp_path):
 
 def write_older_log(path: Path, text: bool = False) -> Path:
     """Log as ArduPilot wrote it before 2015: times in ms, several messages without one, and a GPS with a time of the week."""
-    log = Writer()
+    log = DataFlash()
     log.form(1, "IMU", "Iffffff", "TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
     log.form(2, "IMU2", "Iffffff", "TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
     log.form(3, "EKF1", "IccCffffff", "TimeMS,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD")

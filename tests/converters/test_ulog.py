@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,94 +9,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
+from support.flight_logs import ATTITUDE, COMBINED, SENSOR, START_US, Ulog, ulog_flight
 
 from imutool.converters import ulog
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
-START_US = 5_000_000
-CODES = {"uint64_t": "Q", "int32_t": "i", "float": "f", "uint32_t": "I", "uint8_t": "B"}
-
-
-class Writer:
-    """A ULog: formats, then messages."""
-
-    def __init__(self) -> None:
-        self.raw = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", START_US) + self._record(b"B", bytes(40))
-        self.data = b""
-        self.formats: dict[str, str] = {}
-        self.ids = 0
-
-    @staticmethod
-    def _record(kind: bytes, content: bytes) -> bytes:
-        return struct.pack("<H", len(content)) + kind + content
-
-    def text(self, key: str, value: str) -> None:
-        name = f"char[{len(value)}] {key}".encode()
-        self.raw += self._record(b"I", bytes([len(name)]) + name + value.encode())
-
-    def parameter(self, key: str, value: float) -> None:
-        name = f"float {key}".encode()
-        self.raw += self._record(b"P", bytes([len(name)]) + name + struct.pack("<f", value))
-
-    def topic(self, name: str, fields: str, rows: list[tuple[Any, ...]], instance: int = 0) -> None:
-        code = "<"
-        for part in fields.split(";"):
-            kind, _, size = part.split()[0].partition("[")
-            code += f"{size.rstrip(']')}{CODES[kind]}"
-        if name not in self.formats:
-            self.raw += self._record(b"F", f"{name}:{fields};".encode())
-            self.formats[name] = fields
-        number, self.ids = self.ids, self.ids + 1
-        self.data += self._record(b"A", struct.pack("<BH", instance, number) + name.encode())
-        for row in rows:
-            self.data += self._record(b"D", struct.pack("<H", number) + struct.pack(code, *row))
-
-    def log(self, text: str, t_us: int) -> None:
-        self.data += self._record(b"L", b"4" + struct.pack("<Q", t_us) + text.encode())
-
-    def dropout(self, duration_ms: int) -> None:
-        self.data += self._record(b"O", struct.pack("<H", duration_ms))
-
-    def write(self, path: Path) -> Path:
-        path.write_bytes(self.raw + self.data)
-        return path
-
-
-COMBINED = (
-    "uint64_t timestamp;float[3] gyro_rad;uint32_t gyro_integral_dt;int32_t accelerometer_timestamp_relative;"
-    "float[3] accelerometer_m_s2;uint32_t accelerometer_integral_dt"
-)
-ATTITUDE = "uint64_t timestamp;float[4] q"
-POSITION = "uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz"
-SENSOR = "uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;float temperature"
-
-
-def flight() -> Writer:
-    """One second at rest, nose to the north-east, with simulated truth."""
-    writer = Writer()
-    writer.text("sys_name", "PX4")
-    writer.parameter("IMU_GYRO_CUTOFF", 40.0)
-    times = [START_US + 4000 * n for n in range(250)]
-    yaw = (float(np.cos(np.pi / 8)), 0.0, 0.0, float(np.sin(np.pi / 8)))
-    writer.topic("sensor_combined", COMBINED, [(t, 0.1, 0.2, 0.3, 4000, 0, 1.0, 2.0, -9.75, 4000) for t in times])
-    writer.topic("vehicle_attitude", ATTITUDE, [(t, *yaw) for t in times[::4]])
-    writer.topic("vehicle_attitude_groundtruth", ATTITUDE, [(t, *yaw) for t in times[::4]])
-    moves = [(t, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125) for t in times[::10]]
-    writer.topic("vehicle_local_position_groundtruth", POSITION, moves)
-    for instance in (0, 1):
-        for sensor, shift in (("sensor_gyro", 0), ("sensor_accel", 700)):
-            rows = [(t + shift, t + shift, float(instance), 1.0, 2.0, 25.0 + instance) for t in times]
-            writer.topic(sensor, SENSOR, rows, instance)
-    writer.topic("parameter_update", "uint64_t timestamp;uint32_t changes", [(0, 7)])
-    writer.log("Takeoff detected", times[50])
-    writer.dropout(12)
-    return writer
-
 
 @pytest.fixture
 def log(convert, tmp_path):
-    done = convert(flight().write(tmp_path / "flight.ulg"), tmp_path / "out.mcap")
+    done = convert(ulog_flight().write(tmp_path / "flight.ulg"), tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr
     return tmp_path / "out.mcap"
 
@@ -117,7 +37,7 @@ def test_imu_and_truth_are_written_in_flu_and_enu(log):
 
 
 def test_truth_whose_sample_time_is_not_set_keeps_the_times_of_its_messages(convert, tmp_path):
-    writer, fields = Writer(), "uint64_t timestamp;uint64_t timestamp_sample;"
+    writer, fields = Ulog(), "uint64_t timestamp;uint64_t timestamp_sample;"
     times = [START_US + 4000 * n for n in range(250)]
     writer.topic("sensor_combined", COMBINED, [(t, 0.1, 0.2, 0.3, 4000, 0, 1.0, 2.0, -9.75, 4000) for t in times])
     attitude, position = fields + "float[4] q", fields + "float x;float y;float z"
@@ -160,7 +80,7 @@ def test_every_topic_parameter_and_text_arrives(log):
 
 def test_the_samples_of_a_fifo_are_spread_over_its_time(convert, tmp_path):
     fifo = "uint64_t timestamp;uint64_t timestamp_sample;float dt;float scale;uint8_t samples;float[4] x;float[4] y;float[4] z"
-    writer = Writer()
+    writer = Ulog()
     for sensor in ("sensor_gyro_fifo", "sensor_accel_fifo"):
         rows = [
             (t, t, 1000.0, 0.5, 3, *(4.0 * n + i for i in range(4)), *[1.0] * 8)
@@ -186,8 +106,16 @@ def test_what_cannot_be_read_is_refused_in_one_sentence(convert, tmp_path, raw, 
     assert "Traceback" not in done.stderr
 
 
+def test_a_log_that_pyulog_would_read_for_ever_is_refused(convert, tmp_path):
+    (tmp_path / "a.ulg").write_bytes(ulog_flight().write(tmp_path / "b.ulg").read_bytes().replace(b"float vz;", b"floavz;", 1))
+    done = convert(tmp_path / "a.ulg", tmp_path / "a.mcap")
+    assert done.returncode == 4
+    assert "cannot be read as a ULog (it begins again and again)" in done.stderr
+    assert done.stdout == ""
+
+
 def test_a_file_that_ends_within_a_message_is_told(convert, tmp_path):
-    whole = flight().write(tmp_path / "a.ulg").read_bytes()
+    whole = ulog_flight().write(tmp_path / "a.ulg").read_bytes()
     (tmp_path / "a.ulg").write_bytes(whole[:-300])
     done = convert(tmp_path / "a.ulg", tmp_path / "a.mcap")
     assert done.returncode == 3
@@ -202,7 +130,7 @@ def test_two_instances_and_simulated_truth_hold_what_pyulog_reads(convert, tmp_p
 
     rng = np.random.default_rng(3)
     times = [START_US + 4000 * n for n in range(500)]
-    writer, position = Writer(), "vehicle_local_position_groundtruth"
+    writer, position = Ulog(), "vehicle_local_position_groundtruth"
     for instance in (0, 1):
         for sensor in ("sensor_gyro", "sensor_accel"):
             writer.topic(sensor, SENSOR, [(t, t, *rng.normal(size=3), 25.0) for t in times], instance)
@@ -262,5 +190,5 @@ def test_the_public_samples_hold_the_values_that_pyulog_reads(tmp_path, data, sa
 
 
 def test_a_ulog_is_known_by_its_content(tmp_path):
-    (sequence,) = ulog.sequences(flight().write(tmp_path / "download"))
+    (sequence,) = ulog.sequences(ulog_flight().write(tmp_path / "download"))
     assert ulog.read_sequence(sequence).name == "download"

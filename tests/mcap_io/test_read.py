@@ -177,6 +177,14 @@ def test_frames_that_change_within_a_topic_come_as_batches_of_their_own(foreign:
     assert [(b.frame_id, len(b.stamp_ns)) for b in batches] == [("a", 5), ("c", 2), ("a", 13)]
 
 
+def test_a_payload_that_is_no_message_is_refused_by_its_number(foreign: Foreign, make: Make) -> None:
+    messages = imu_messages(make)
+    *head, payload = messages[7]
+    messages[7] = (*head, payload[:12] + b"\xff" * 4 + payload[16:])  # the length of a text
+    with pytest.raises(LogError, match=r"message 7 is no sensor_msgs/msg/Imu: .*\. Cut the log before or after it"):
+        read(foreign(messages))
+
+
 def test_images_that_are_none_are_left_out_and_named(foreign: Foreign, make: Make, caplog: pytest.LogCaptureFixture) -> None:
     bad = [("/cam", schemas.IMAGE, START_NS + i, START_NS + i, i, bytes(range(40, 80))) for i in range(3)]
     with caplog.at_level(logging.WARNING):

@@ -134,9 +134,7 @@ class _Session:
         """
         if not self._samples:
             why = f"; the first of {malformed.count} messages: {malformed.first}" if malformed.count else ""
-            raise DataError(
-                f"it sent no samples{why}", where="the stream", expected='{"t_ns": …, "gyro": […], "accel": […]}'
-            )
+            raise DataError(f"it sent no samples{why}", where="the stream", expected='{"t_ns": …, "gyro": […], "accel": […]}')
         seconds = (self._last_ns - self._begin_ns) * 1e-9
         return StreamStatistics(
             samples=self._samples,

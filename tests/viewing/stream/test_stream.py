@@ -123,7 +123,7 @@ def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) 
     with pytest.raises(DataError, match=r"no samples; the first of 1 messages: no JSON: 'nonsense'"):
         run(iter([None]), api.load_model("static"), malformed)
     moving = imu.rows(slice(800, None))
-    with pytest.raises(DataError, match="the stream: it does not start at rest. Leave the sensor still for 2 s"):
+    with pytest.raises(DataError, match=r"the stream: it does not start at rest\. Leave the sensor still for 2 s"):
         run(stream(moving), api.load_model("static"), Malformed())
 
 
