@@ -13,8 +13,7 @@ import numpy as np
 from imutool.errors import DataError, not_installed
 
 from ._archive import refusing
-from ._table_headerless import name_headerless
-from ._table_labels import as_table
+from ._table_headerless import as_table, name_headerless
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 

@@ -21,8 +21,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._msg_files import definition_from_files
-from ._ros_types import need_rosbags, ros2_definition
+from ._ros_types import definition_from_files, need_rosbags, ros2_definition
 from ._source import find_files, find_folders, head
 
 GENERAL = True

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imutool.converters._msg_files import definition_from_files
+from imutool.converters._ros_types import definition_from_files
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE.register(get_types_from_msg("float64 load\nstring[] names\n", "my_robot/msg/Load"))

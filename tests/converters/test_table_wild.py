@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
-from imutool.converters._table_labels import as_table
-from imutool.converters._table_registers import raw_counts, unit_by_steps
+from imutool.converters._table_headerless import as_table
+from imutool.converters._table_units import raw_counts, unit_by_steps
 from imutool.errors import ConfigError
 
 COUNT = 300
