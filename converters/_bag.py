@@ -73,7 +73,7 @@ def _known_once(path: Path, mtime_ns: int, size: int) -> tuple[dict[str, str], s
 def recording_of(
     sequence: Sequence, dataset: str, sensor: str, known: bool, truths: dict[str, str], of_bag: tuple[str, ...], images: bool
 ) -> Recording:
-    """Recording of a data set's sequence: of its bag, with the truths `of_bag`, else of its ASL folder or archive."""
+    """Recording of a sequence: of a bag with the truths `of_bag`, else of an ASL folder."""
     if is_bag(sequence.path):
         return recording(sequence, dataset=dataset, sensor=sensor, known=known, truths=of_bag, images=images)
     return _asl.recording(sequence, dataset=dataset, sensor=sensor, known=known, truths=truths, images=images)
