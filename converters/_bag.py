@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from imutool.bag.scan import Bag
-from imutool.errors import ConfigError, DataError, LogError, not_installed
+from imutool.errors import ConfigError, DataError, LogError, required
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
 from . import Sequence, _asl
@@ -215,11 +215,8 @@ def _decoder(path: Path) -> Callable[[bytes, str], Any]:
     Raises:
         ConfigError: rosbags is not installed.
     """
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise not_installed("rosbags", "bags", where=path, user="reading ROS 1 bags") from error
-    store = get_typestore(Stores.ROS1_NOETIC)
+    typesys = required("rosbags.typesys", "bags", where=path, user="reading ROS 1 bags")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
 
     def decode(raw: bytes, kind: str) -> Any:
         try:

@@ -14,7 +14,7 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError, required
 from imutool.recording.message_log import MessageTopic
 
 HEADER, TIME, DURATION = "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
@@ -36,10 +36,7 @@ def need_rosbags(where: Path) -> None:
     Raises:
         ConfigError: it is not.
     """
-    try:
-        import rosbags.typesys  # noqa: F401
-    except ImportError as error:
-        raise not_installed("rosbags", "bags", where=where, user="reading ROS bags") from error
+    required("rosbags.typesys", "bags", where=where, user="reading ROS bags")
 
 
 def ros2_name(kind: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError, required
 
 from ._archive import refusing
 from ._table_headerless import as_table, name_headerless
@@ -195,13 +195,7 @@ def _check_size(path: Path, size: int) -> None:
 
 
 def _module(name: str, path: Path) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition(".")[0]
-        raise not_installed(package, "tables", where=path, user="reading it") from error
+    return required(name, "tables", where=path, user="reading it")
 
 
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {

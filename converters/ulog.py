@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError, required
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
 from imutool.recording.joined_imu import in_order, joined
@@ -102,17 +102,14 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def _open(path: Path) -> Any:
-    try:
-        from pyulog import ULog
-    except ImportError as error:
-        raise not_installed("pyulog", "ulog", where=path, user="reading ULogs") from error
+    pyulog = required("pyulog", "ulog", where=path, user="reading ULogs")
     if head(path, len(ENCRYPTED)) == ENCRYPTED:
         raise DataError("is encrypted", where=path, fix="Decrypt it with PX4's Tools/decrypt_ulog.py first")
     printing = logging.getLogger("pyulog")
     printing.setLevel(logging.ERROR)
     try:
         with path.open("rb") as file:  # pyulog leaves a file that it refuses open
-            return ULog(file, None, True)
+            return pyulog.ULog(file, None, True)
     except Exception as error:  # pyulog raises TypeError, struct.error, KeyError, IndexError: whatever the bytes lead to
         raise DataError(f"cannot be read as a ULog ({error or type(error).__name__})", where=path) from error
 

@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import ClassVar
+from importlib import import_module
+from typing import Any, ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
 # A path keeps one slash of a URL's two. What follows ? or # is a query of http, and of a store if it assigns something
@@ -95,6 +96,18 @@ def not_installed(
     why = "" if error is None or isinstance(error, ModuleNotFoundError) else f" ({error})"
     what = f"{user} needs {package}, which is not installed" if user else f"{package} is not installed"
     return ConfigError(what + why, where=where, fix=f"Install it with: pip install 'imutool[{extra}]'")
+
+
+def required(module: str, extra: str, *, package: str = "", where: object = None, user: str = "") -> Any:
+    """Import a module of an optional package.
+
+    Raises:
+        ConfigError: it cannot be imported (`not_installed`).
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise not_installed(package or module.partition(".")[0], extra, where=where, user=user, error=error) from error
 
 
 class DataError(ImutoolError):

@@ -22,6 +22,7 @@ from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import plain, say, tell_error
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
+from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
@@ -140,11 +141,7 @@ class Command(TyperCommand):
 
 def _is_report(place: str | Path | None) -> bool:
     """Whether a file is a JSON report of imutool."""
-    try:
-        with Path(place or "").open("rb") as file:
-            return b'"schema": "imutool.' in file.read(REPORT_HEAD)
-    except OSError:
-        return False
+    return b'"schema": "imutool.' in first_bytes(Path(place or ""), REPORT_HEAD)
 
 
 class App(typer.Typer):

@@ -11,8 +11,9 @@ import typer
 from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, Written, app, listing
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import progress, say, tell_error, tell_warning, write_json
+from imutool.conversion import Failure
 from imutool.errors import DataError
-from imutool.report import Report, Section
+from imutool.report import Report
 
 if TYPE_CHECKING:
     from imutool.conversion.run import ConvertReport
@@ -27,13 +28,6 @@ class Compression(StrEnum):
     zstd = "zstd"
     lz4 = "lz4"
     none = "none"
-
-
-class Failure(Section, frozen=True):
-    """Failed sequence, with the reason."""
-
-    name: str
-    message: str
 
 
 class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
@@ -107,8 +101,7 @@ def convert(
 
 def _tell(report: ConvertReport, json_to: str | None, *, overwrite: bool, quiet: bool) -> None:
     """Report written logs, notes, losses and failures; the exit code says which there are."""
-    failures = [Failure(failure.name, failure.message) for failure in report.failures]
-    summary = Conversion([str(path) for path in report.written], failures, report.notes, report.losses)
+    summary = Conversion([str(path) for path in report.written], report.failures, report.notes, report.losses)
     if not write_json(summary, json_to, overwrite=overwrite):
         for path in report.written:
             say(str(path))
