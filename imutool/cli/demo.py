@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written, app
+from imutool.cli.app import COMMON, Common, Written, app
 from imutool.cli.evaluate import Score
-from imutool.cli.terminal import epoch_line, err, figures, plain, progress, say, write_json
+from imutool.cli.terminal import epoch_line, err, figures, plain, say
 from imutool.errors import ConfigError, not_installed
 from imutool.report import Report
 
@@ -54,10 +54,7 @@ class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
 def demo(
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder."), FOLDER] = Path("demo-out"),
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Run a demo without download: convert, train, debias, evaluate, view.
 
@@ -65,13 +62,13 @@ def demo(
     """
 
     def announce(line: str) -> None:
-        if not quiet:
+        if not common.quiet:
             err.print(plain(line), highlight=False, soft_wrap=True)
 
-    with progress("Training", verbose, quiet) as tell:
-        done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
+    with common.progress("Training") as tell:
+        done = run(folder, announce, overwrite=common.overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
     files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
-    if not write_json(DemoReport(results=msgspec.convert(done.results, list[Score]), **files), json_to, overwrite=overwrite):
+    if not common.write(DemoReport(results=msgspec.convert(done.results, list[Score]), **files)):
         say("Pure integration of a flight the model has not seen, from its true start:")
         figures(done.results)
         say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")
