@@ -104,10 +104,12 @@ def required(module: str, extra: str, *, package: str = "", where: object = None
     Raises:
         ConfigError: it cannot be imported (`not_installed`).
     """
+    top = module.partition(".")[0]
     try:
+        import_module(top)
         return import_module(module)
     except ImportError as error:
-        raise not_installed(package or module.partition(".")[0], extra, where=where, user=user, error=error) from error
+        raise not_installed(package or top, extra, where=where, user=user, error=error) from error
 
 
 class DataError(ImutoolError):
