@@ -26,6 +26,7 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
+LOST = 3  # exit code of work that was done, with something of a log lost or a log quarantined
 # A path keeps one slash of a URL's two. What follows ? or # is a query of http, and of a store if it assigns something
 URL_LOGIN = re.compile(
     r"(\b(?!az:|abfs:)[a-z][a-z0-9+.-]*:/{1,2}|\b(?:az|abfs):/{1,2}(?=[^/\s?#]*:))[^/\s?#]*@", re.IGNORECASE

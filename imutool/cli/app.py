@@ -28,7 +28,6 @@ from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.report import Report
 
-LOST = 3  # the command did what it could, and something of the log is lost
 REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import COMMON, HTML, LOG, LOST, Common, Imus, Init, MaxChunk, Smooth, Written, app, listing
+from imutool.cli.app import COMMON, HTML, LOG, Common, Imus, Init, MaxChunk, Smooth, Written, app, listing
 from imutool.cli.terminal import out, plain, say, table, tell_losses
-from imutool.errors import ConfigError
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import to_location
 from imutool.report import UNSET, Report, UnsetType
 
@@ -120,7 +120,7 @@ def show(survey: Survey) -> None:
     if survey.findings:
         table(finding_rows(survey), keys=1)
     for reason in survey.reasons:
-        out.print(f"[red]not to be trusted:[/] {plain(reason)}", highlight=False, soft_wrap=True)
+        say(reason, "not to be trusted", "red")
 
 
 def finding_rows(survey: Survey) -> list[tuple[str, ...]]:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import COMMON, LOST, Common, Written, app, listing
+from imutool.cli.app import COMMON, Common, Written, app, listing
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import say, tell_error, tell_warning
 from imutool.conversion import Failure
-from imutool.errors import DataError
+from imutool.errors import LOST, DataError
 from imutool.report import Report
 
 if TYPE_CHECKING:

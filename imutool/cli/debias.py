@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from imutool.bias_start import Fitness
-from imutool.cli.app import COMMON, HTML, LOG, LOST, RRD, Common, Imus, Init, MaxChunk, Smooth, app
+from imutool.cli.app import COMMON, HTML, LOG, RRD, Common, Imus, Init, MaxChunk, Smooth, app
 from imutool.cli.terminal import say, tell_losses
-from imutool.errors import ConfigError
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import Location, to_location
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.viewing import Output

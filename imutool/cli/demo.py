@@ -13,7 +13,7 @@ import typer
 
 from imutool.cli.app import COMMON, Common, Written, app
 from imutool.cli.evaluate import Score
-from imutool.cli.terminal import epoch_line, err, figures, plain, say
+from imutool.cli.terminal import epoch_line, err, figures, say
 from imutool.errors import ConfigError, not_installed
 from imutool.report import Report
 
@@ -63,7 +63,7 @@ def demo(
 
     def announce(line: str) -> None:
         if not common.quiet:
-            err.print(plain(line), highlight=False, soft_wrap=True)
+            say(line, to=err)
 
     with common.progress("Training") as tell:
         done = run(folder, announce, overwrite=common.overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))

@@ -12,7 +12,7 @@ import typer
 from imutool.cli.app import COMMON, App, Common, Imu, Init, Smooth, Truth, Written, app, expanded, with_options
 from imutool.cli.debias import FORCE_HELP, VERIFY_HELP
 from imutool.cli.parameters import with_flags
-from imutool.cli.terminal import out, plain, say
+from imutool.cli.terminal import say
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
 from imutool.mcap_io.storage import output_conflicts
@@ -178,8 +178,8 @@ def diagnose(
 def _show(done: FleetReport, report: str | None) -> None:
     for result in done.not_whole[:SHOWN]:
         why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
-        why = plain(with_flags(why if result.source in why else f"{result.source}: {why}"))
-        out.print(f"[yellow]{result.earlier or result.status}:[/] {why}", highlight=False, soft_wrap=True)
+        why = why if result.source in why else f"{result.source}: {why}"
+        say(with_flags(why), result.earlier or result.status)
     if len(done.not_whole) > SHOWN:
         say("and more")
     if done.comparison is not None:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import COMMON, LOST, PNG, TOML, Common, MaxChunk, app
-from imutool.cli.terminal import out, plain, say, table, tell_losses
-from imutool.errors import ConfigError
+from imutool.cli.app import COMMON, PNG, TOML, Common, MaxChunk, app
+from imutool.cli.terminal import say, table, tell_losses
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import to_location
 from imutool.report import UnsetType, json_values
 
@@ -100,9 +100,9 @@ def _print(report: LogInfo, identified: IdentifiedNoise | None) -> None:
 
         table(noise_identification.rows(identified), keys=1)
         for remark in identified.remarks:
-            out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
+            say(remark, "noise", "cyan")
     for warning in report.warnings:
-        out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
+        say(warning, "warning")
     tell_losses(report.losses)
 
 

@@ -11,7 +11,7 @@ import msgspec
 import typer
 
 from imutool.cli.app import COMMON, RRD, Common, Imu, app
-from imutool.cli.terminal import err, plain, say, tell_warning
+from imutool.cli.terminal import err, out, say, tell_warning
 from imutool.errors import ConfigError
 from imutool.report import Report
 from imutool.viewing import Output
@@ -76,7 +76,7 @@ def live(
         tell_warning(f"messages without a sample: {malformed.count}, the first: {malformed.first}")
     if not common.write(LiveReport(origin, model, stream, shown)):
         for line in _lines(stream, shown):
-            err.print(plain(line), highlight=False, soft_wrap=True) if to_stdout else say(line)
+            say(line, to=err if to_stdout else out)
 
 
 def _view(connect: str | None, save: Path | None, overwrite: bool) -> AbstractContextManager[Live]:
