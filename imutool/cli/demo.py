@@ -18,8 +18,6 @@ from imutool.errors import ConfigError, not_installed
 from imutool.report import Report
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from imutool.recording import Recording
     from imutool.training.fit import Epoch
     from imutool.training.settings import TrainSettings
@@ -29,14 +27,6 @@ FOLDER = Written(files=("*",), keeps=True)
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5
 STEPS = 10  # of each stage: as good as 30 on flights of one minute
-IMU_HEADER = "#timestamp [ns]," + ",".join(
-    [f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz"] + [f"a_RS_S_{axis} [m s^-2]" for axis in "xyz"]
-)
-TRUTH_HEADER = "#timestamp," + ",".join(
-    [f" p_RS_R_{axis} [m]" for axis in "xyz"]
-    + [f" q_RS_{axis} []" for axis in "wxyz"]
-    + [f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"]
-)
 
 
 class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
@@ -166,16 +156,18 @@ def write_asl(recording: Recording, folder: Path) -> None:
 
     The folder has mav0/imu0 and mav0/state_groundtruth_estimate0.
     """
-    imu, truth = recording.imu, recording.truth
-    assert truth.v_w is not None
-    _write_csv(folder / "mav0" / "imu0" / "data.csv", IMU_HEADER, imu.t_ns, imu.gyro, imu.accel)
-    place = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    _write_csv(place, TRUTH_HEADER, truth.t_ns, truth.p_wb, truth.q_wb_wxyz, truth.v_w)
-
-
-def _write_csv(path: Path, header: str, t_ns: np.ndarray, *columns: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     import numpy as np
 
-    rows = zip(t_ns.tolist(), np.concatenate(columns, axis=1).tolist(), strict=True)
-    path.write_text("\n".join([header, *(f"{t},{','.join(map(repr, row))}" for t, row in rows)]) + "\n", encoding="ascii")
+    from imutool.exporting.euroc import IMU_COLUMNS, TRUTH_COLUMNS, TRUTH_FOLDER, rows
+
+    imu, truth = recording.imu, recording.truth
+    assert truth.v_w is not None
+    tables = (
+        ("imu0", IMU_COLUMNS, imu.t_ns, [imu.gyro, imu.accel]),
+        (TRUTH_FOLDER, TRUTH_COLUMNS[:11], truth.t_ns, [truth.p_wb, truth.q_wb_wxyz, truth.v_w]),  # without biases
+    )
+    for name, columns, t_ns, values in tables:
+        path = folder / "mav0" / name / "data.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = rows(t_ns.tolist(), np.concatenate(values, axis=1).tolist())
+        path.write_text(f"#{','.join(columns)}\n{''.join(lines)}", encoding="ascii")
