@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from imutool.bag.scan import Bag
-from imutool.errors import ConfigError, DataError, LogError, not_installed
+from imutool.errors import ConfigError, DataError, LogError, required
 from imutool.recording import Frames, Imu, Poses, Recording, Scalars
 
 from . import Sequence, _asl
 from ._ros_types import ros2_name
+from ._source import is_bag
 from ._table import Table
 
 logger = logging.getLogger(__name__)
@@ -67,6 +68,15 @@ def _known_once(path: Path, mtime_ns: int, size: int) -> tuple[dict[str, str], s
             lost = f"{bag.lost} stretches of it lost, the first: {bag.losses[0].reason}" if bag.lost else "nothing of it lost"
             wrong = f"the bag has no index; {count} messages were found chunk by chunk, {lost}"
         return {c.topic: ros2_name(c.kind) for _, c in sorted(bag.connections.items())}, wrong
+
+
+def recording_of(
+    sequence: Sequence, dataset: str, sensor: str, known: bool, truths: dict[str, str], of_bag: tuple[str, ...], images: bool
+) -> Recording:
+    """Recording of a sequence: of a bag with the truths `of_bag`, else of an ASL folder."""
+    if is_bag(sequence.path):
+        return recording(sequence, dataset=dataset, sensor=sensor, known=known, truths=of_bag, images=images)
+    return _asl.recording(sequence, dataset=dataset, sensor=sensor, known=known, truths=truths, images=images)
 
 
 def recording(
@@ -205,11 +215,8 @@ def _decoder(path: Path) -> Callable[[bytes, str], Any]:
     Raises:
         ConfigError: rosbags is not installed.
     """
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise not_installed("rosbags", "bags", where=path, user="reading ROS 1 bags") from error
-    store = get_typestore(Stores.ROS1_NOETIC)
+    typesys = required("rosbags.typesys", "bags", where=path, user="reading ROS 1 bags")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
 
     def decode(raw: bytes, kind: str) -> Any:
         try:

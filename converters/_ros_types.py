@@ -2,17 +2,19 @@
 
 A type that ROS 2 has with the same fields gets the definition of ROS 2, so that ROS 2 programs know it. Any other keeps the
 definition of its bag, with names that ROS 2 allows: `wheel_speed` for `wheelSpeed`. Needs rosbags.
+A bag of ROS 2 before Iron holds no definitions; those of a driver's own types are then in .msg files of its workspace.
 """
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from imutool.errors import not_installed
+from imutool.errors import DataError, required
 from imutool.recording.message_log import MessageTopic
 
 HEADER, TIME, DURATION = "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"
@@ -23,6 +25,8 @@ FIELD = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")
 TYPE = re.compile(r"[A-Z][A-Za-z0-9]*")
 CONSTANT_NAME = re.compile(r"[A-Z]([A-Z0-9_]?[A-Z0-9]+)*")
 CONSTANT = re.compile(r"^[ \t]*[a-z0-9]+[ \t]+\w+[ \t]*=.*$", re.MULTILINE)  # a line of a definition
+MSG_TYPE = re.compile(r"\w+/msg/\w+")
+WORKSPACES = "AMENT_PREFIX_PATH"  # what `source install/setup.bash` sets
 ToCdr = Callable[["bytes | memoryview"], "bytes | memoryview"]
 
 
@@ -32,10 +36,7 @@ def need_rosbags(where: Path) -> None:
     Raises:
         ConfigError: it is not.
     """
-    try:
-        import rosbags.typesys  # noqa: F401
-    except ImportError as error:
-        raise not_installed("rosbags", "bags", where=where, user="reading ROS bags") from error
+    required("rosbags.typesys", "bags", where=where, user="reading ROS bags")
 
 
 def ros2_name(kind: str) -> str:
@@ -59,6 +60,51 @@ def ros2_definition(kind: str) -> tuple[bytes, str] | None:
     if kind not in store.fielddefs:
         return None
     return store.generate_msgdef(kind, ros_version=2)[0].encode(), store.hash_rihs01(kind)
+
+
+def definition_from_files(kind: str, beside: Path) -> tuple[bytes, str]:
+    """Definition of a type from .msg files; else nothing and the first type without one.
+
+    Raises:
+        DataError: a file is no definition that ROS 2 reads.
+    """
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    found: dict[str, Any] = {}
+    wanted = [kind]
+    while wanted:
+        name = wanted.pop()
+        if name in found or name in ros2_store().fielddefs:
+            continue
+        path = next((path for path in _places(name, beside) if path.is_file()), None)
+        if path is None:
+            return b"", name
+        try:
+            found |= get_types_from_msg(path.read_text(), name)
+        except (TypesysError, UnicodeDecodeError) as error:
+            raise DataError(f"is no definition of {name} ({str(error).partition(chr(10))[0]})", where=path) from error
+        wanted += [part for _, field in found[name][1] for part in _types_of(field)]
+    store.register(found)
+    text: str = store.generate_msgdef(kind, ros_version=2)[0]
+    return text.encode(), ""
+
+
+def _places(kind: str, beside: Path) -> Iterator[Path]:
+    """Files that may define a type: `PACKAGE/msg/TYPE.msg` or `TYPE.msg` in the bag's folder, then in the workspaces."""
+    if not MSG_TYPE.fullmatch(kind):  # a bag may state any text, also one that leads to another folder
+        return
+    package, _, name = kind.partition("/msg/")
+    yield from (beside / package / "msg" / f"{name}.msg", beside / "msg" / f"{name}.msg", beside / f"{name}.msg")
+    for prefix in filter(None, os.environ.get(WORKSPACES, "").split(os.pathsep)):
+        yield Path(prefix) / "share" / package / "msg" / f"{name}.msg"
+
+
+def _types_of(field: Any) -> list[str]:
+    """Message types in the description of a field: itself, or that of its elements."""
+    if isinstance(field[1], str):
+        return [field[1]]
+    return _types_of(field[1][0]) if isinstance(field[1][0], tuple) else []
 
 
 class Ros1Types:

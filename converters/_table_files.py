@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError, required
 
 from ._archive import refusing
-from ._table_headerless import name_headerless
-from ._table_labels import as_table
+from ._table_headerless import as_table, name_headerless
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
@@ -196,13 +195,7 @@ def _check_size(path: Path, size: int) -> None:
 
 
 def _module(name: str, path: Path) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition(".")[0]
-        raise not_installed(package, "tables", where=path, user="reading it") from error
+    return required(name, "tables", where=path, user="reading it")
 
 
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {

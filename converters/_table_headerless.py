@@ -1,11 +1,18 @@
-"""Names for the columns of a table of text that has no header."""
+"""Names for the columns of text without a header: by its values, or by words in its rows.
+
+A board prints the words: `Acc X:-0.22, Acc Y:-0.11`; `ax=0.1 g ay=0.2 g`; `{'acc': {'x': 0.1, 'y': 0.2}, 't': 1}`;
+`Gyro: (0.1, 0.2, 0.3)`.
+"""
 
 from __future__ import annotations
 
 import json
 import re
+from collections import Counter
+from itertools import pairwise
 from typing import NamedTuple
 
+from ._table_names import unit_named
 from ._table_text import Columns
 from ._table_times import rises
 from ._table_units import gravity_units
@@ -20,6 +27,18 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
     *(f"linear_acceleration.{axis}" for axis in "xyz"),
     *(f"linear_acceleration_covariance{place}" for place in SQUARE),
 ]
+LOOKED_AT = 200  # first lines, which show the words between the numbers
+LEAST_ROWS, LEAST_SHARE = 5, 0.5  # of the lines looked at that have the same words
+LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
+LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
+NUMBER = re.compile(
+    r"(?<![\w.^/])(\d{4}-\d\d-\d\d[T ]\d\d?:\d\d:\d\d(?:[.,]\d+)?Z?|\d\d?:\d\d:\d\d(?:[.,]\d+)?"
+    r"|[-+]?(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?\d++)?+)(?![\w.^])"
+)
+LABEL = re.compile(r"[A-Za-zµ°][^:=]*[:=]\s*[\[({'\"]*\s*$")
+SIGN = re.compile(r"[-+]\s*$")  # apart from its number
+BETWEEN = re.compile(r"[:=,;|{}\[\]()<>'\"\t]+")
+AXIS = re.compile(r"[xyzw]", re.IGNORECASE)
 
 
 class _Halves(NamedTuple):
@@ -66,3 +85,47 @@ def name_headerless(columns: Columns) -> None:
     columns.texts = {name[column]: texts for column, texts in columns.texts.items()}
     columns.units = {name[column]: unit for column, unit in columns.units.items()}
     columns.remarks.notes.append(why)
+
+
+def as_table(text: str) -> tuple[str, int]:
+    """The text as a table, and the number of lines left out; empty without such rows."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    counts = Counter(words for line in lines[:LOOKED_AT] if (words := _words(line)))
+    words, count = max(counts.items(), key=lambda each: each[1], default=((), 0))
+    if count < max(LEAST_ROWS, LEAST_SHARE * len(lines[:LOOKED_AT])):
+        return "", 0
+    rows = ["\t".join(match[1] for match in NUMBER.finditer(line)) for line in lines if _words(line) == words]
+    return "\n".join(["\t".join(_names(words)), *rows]) + "\n", len(lines) - len(rows)
+
+
+def _words(line: str) -> tuple[str, ...]:
+    """What stands before each number and behind the last; empty where fewer than two numbers have a label."""
+    if len(line) > LONGEST_LINE:
+        return ()
+    words = tuple(NUMBER.split(line)[::2])
+    named = sum(bool(LABEL.search(text[-LONGEST_LABEL:])) for text in words[:-1])
+    return words if len(words) > LEAST_NUMBERS and named >= LEAST_LABELS and not any(map(SIGN.search, words)) else ()
+
+
+def _names(words: tuple[str, ...]) -> list[str]:
+    """Names of the numbers: an axis alone is of the group before it, and numbers that follow without a label are counted."""
+    group, label, place, names = "", "", 0, list[str]()
+    labels = [_label(text) for text in words]
+    for (own, _), (following, unit) in pairwise(labels):
+        if own:
+            is_axis = AXIS.fullmatch(own[-1])
+            group = " ".join(own[:-1] if is_axis else own) or group
+            label, place = f"{group} {own[-1]}".strip() if is_axis else group, 0
+        counted = label and (place or (not following and len(names) + 2 < len(words)))
+        name = f"{label}_{place}" if counted else label or f"number {len(names) + 1}"
+        names.append(f"{name} [{unit}]" if unit else name)
+        place += 1
+    return names
+
+
+def _label(text: str) -> tuple[list[str], str]:
+    """Words of a number's label, and the unit of the number before it, which may stand before any mark."""
+    own, *rest = BETWEEN.split(text, maxsplit=1)
+    unit = unit_named(own.strip())
+    parts = [part.strip() for part in BETWEEN.split("".join(rest) if unit else text)]
+    return [word for part in parts if part and part[-1].isalnum() for word in part.split()], unit

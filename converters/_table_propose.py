@@ -23,10 +23,19 @@ from ._table_names import (
     triples,
     unit_named,
 )
-from ._table_registers import COUNTS_A_DPS, raw_counts, unit_by_steps
 from ._table_text import Columns
 from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
-from ._table_units import ACCEL_SI, GYRO_SI, TIME_NS, USUAL_TIME_NS, gravity_units, is_motion_alone
+from ._table_units import (
+    ACCEL_SI,
+    COUNTS_A_DPS,
+    GYRO_SI,
+    TIME_NS,
+    USUAL_TIME_NS,
+    gravity_units,
+    is_motion_alone,
+    raw_counts,
+    unit_by_steps,
+)
 
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 SLOWEST_HZ = 0.01, 0.9  # of samples with a time since 1970, and of others

@@ -37,11 +37,6 @@ def recognises(sequence: Sequence) -> bool:
     return _asl.float_stamps(Tree(sequence))
 
 
-def is_known(sequence: Sequence) -> bool:
-    """Whether a sequence shows its origin: by its stamps, or by its bag's topics."""
-    return recognises(sequence)
-
-
 def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
     """Recording of one sequence.
 
@@ -49,10 +44,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         DataError: the sequence contradicts its format, with file and line.
         ConfigError: it is a bag and rosbags is not installed.
     """
-    known = is_known(sequence)
-    if is_bag(sequence.path):
-        return _bag.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=(), images=images)
-    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=TRUTHS, images=images)
+    known = recognises(sequence)  # by its stamps, or by its bag's topics
+    return _bag.recording_of(sequence, DATASET, SENSOR if known else "", known, TRUTHS, (), images)
 
 
 def read(source: Path) -> Iterator[Recording]:

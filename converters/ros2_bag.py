@@ -21,8 +21,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._msg_files import definition_from_files
-from ._ros_types import need_rosbags, ros2_definition
+from ._ros_types import definition_from_files, need_rosbags, ros2_definition
 from ._source import find_files, find_folders, head
 
 GENERAL = True
@@ -30,6 +29,7 @@ METADATA = "metadata.yaml"
 SQLITE = b"SQLite format 3\0"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 LISTED = re.compile(r"relative_file_paths:\s*\n((?:\s*- .*\n)+)")
+MALFORMED = (ValueError, KeyError, TypeError, AttributeError, AssertionError)  # of metadata that rosbags does not check
 ENCODINGS = {"MSG": "ros2msg", "IDL": "ros2idl"}
 
 
@@ -169,7 +169,7 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
                 reader.open()
                 stack.callback(reader.close)
             yield readers
-    except (ReaderError, apsw.Error, OSError, EOFError, zlib.error, ValueError, KeyError, AssertionError) as error:
+    except (ReaderError, apsw.Error, OSError, EOFError, zlib.error, *MALFORMED) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
         fix = "Save what is intact of each .mcap with imutool repair, and convert that" if any(path.glob("*.mcap")) else ""
         raise DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path, fix=fix) from error

@@ -57,11 +57,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> Recording:
         ConfigError: it is a bag and rosbags is not installed.
     """
     known = is_known(sequence)
-    if is_bag(sequence.path):
-        return _bag.recording(
-            sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=BAG_TRUTHS, images=images
-        )
-    return _asl.recording(sequence, dataset=DATASET, sensor=SENSOR if known else "", known=known, truths=TRUTHS, images=images)
+    return _bag.recording_of(sequence, DATASET, SENSOR if known else "", known, TRUTHS, BAG_TRUTHS, images)
 
 
 def read(source: Path) -> Iterator[Recording]:

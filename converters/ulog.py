@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import logging
 import re
-import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from functools import partial
 from io import BufferedReader, FileIO, StringIO
@@ -22,14 +21,15 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.errors import DataError, not_installed
+from imutool.errors import DataError, required
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
 from imutool.recording.joined_imu import in_order, joined
-from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks, Table
+from imutool.recording.message_log import MessageLog, Remarks, Table
 
 from . import Sequence
 from ._source import find_files, head
+from ._ulog_texts import log_topic, logged
 
 GENERAL = True
 MAGIC, ENCRYPTED = b"ULog\x01\x12\x35", b"ULogEnc"
@@ -40,12 +40,8 @@ FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 UP_FROM_DOWN = np.array([1.0, 1.0, -1.0])
 Q_ENU_FROM_NED_WXYZ = np.array([[0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0]])
 Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
+LATEST_US = 2**31 * 1_000_000  # that the stamp of a ROS 2 message holds
 NO_ACCEL = 0x7FFFFFFF  # accelerometer_timestamp_relative without an accelerometer
-LOG_DEFINITION = (
-    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
-    f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-)
-LOG_LEVELS = {"DEBUG": 10, "INFO": 20, "NOTICE": 20, "WARNING": 30, "ERROR": 40}  # of rcl_interfaces/Log; others are fatal
 Columns = dict[str, np.ndarray]
 
 
@@ -72,7 +68,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     several = {data.name for data in ulog.data_list if data.multi_id > 0}
     for data in ulog.data_list:
         name = f"{data.name}/{data.multi_id}" if data.name in several else data.name
-        if len(data.data["timestamp"]):
+        if len(data.data.get("timestamp", ())):
             topics[name] = data.data
     if not topics:
         raise DataError("holds no data", where=sequence.path, expected="a log with messages")
@@ -85,12 +81,15 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
         remarks.notes.append(f"PX4's dropouts: {len(ulog.dropouts)}, {lost_s:.3f} s in all: the topics have gaps there")
     if unstamped := sum(int((columns["timestamp"] == 0).sum()) for columns in topics.values()):
         remarks.notes.append(f"messages that PX4 gave no stamp: {unstamped}; they are logged at the start of the log")
-    poses = {topic: p for topic, p in _all_poses(topics, remarks).items() if p is not None}
+    poses = _all_poses(topics, remarks)
+    texts = [(m.timestamp * 1000, m.log_level_str(), m.message) for m in ulog.logged_messages if m.timestamp < LATEST_US]
+    if len(texts) < len(ulog.logged_messages):
+        remarks.losses.append(f"texts with an impossible time: {len(ulog.logged_messages) - len(texts)}")
     return MessageLog(
         sequence.name,
         sequence.path.name,
-        topics=(_log_topic(),) if ulog.logged_messages else (),
-        messages=partial(_logged, [(m.timestamp, m.log_level_str(), m.message) for m in ulog.logged_messages]),
+        topics=(log_topic(),) if texts else (),
+        messages=partial(logged, texts),
         imus=_imus(topics, remarks),
         poses=poses,
         tables={f"/{name}": _table(name, columns, 1000 * ulog.start_timestamp) for name, columns in topics.items()},
@@ -106,10 +105,7 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def _open(path: Path) -> Any:
-    try:
-        from pyulog import ULog
-    except ImportError as error:
-        raise not_installed("pyulog", "ulog", where=path, user="reading ULogs") from error
+    pyulog = required("pyulog", "ulog", where=path, user="reading ULogs")
     if head(path, len(ENCRYPTED)) == ENCRYPTED:
         raise DataError("is encrypted", where=path, fix="Decrypt it with PX4's Tools/decrypt_ulog.py first")
     printing = logging.getLogger("pyulog")
@@ -117,7 +113,7 @@ def _open(path: Path) -> Any:
     try:
         # pyulog leaves a file that it refuses open, and prints where our reports go
         with _FiniteFile(FileIO(path)) as file, redirect_stdout(StringIO()):
-            return ULog(file, None, True)
+            return pyulog.ULog(file, None, True)
     except Exception as error:  # pyulog raises TypeError, struct.error, KeyError, IndexError: whatever the bytes lead to
         raise DataError(f"cannot be read as a ULog ({error or type(error).__name__})", where=path) from error
 
@@ -157,8 +153,15 @@ def _metadata(sequence: Sequence, ulog: Any) -> dict[str, dict[str, str]]:
     }
 
 
+def _field(columns: Columns, name: str) -> np.ndarray:
+    """One field of a topic; damage and other versions of PX4 may leave it out."""
+    if name not in columns:
+        raise DataError(f"its topic has no field {name}")
+    return columns[name]
+
+
 def _ns(columns: Columns, name: str = "timestamp") -> Int64[np.ndarray, " n"]:
-    return columns[name].astype(np.int64) * 1000
+    return _field(columns, name).astype(np.int64) * 1000
 
 
 def _sample_ns(columns: Columns) -> Int64[np.ndarray, " n"]:
@@ -169,42 +172,47 @@ def _sample_ns(columns: Columns) -> Int64[np.ndarray, " n"]:
 
 
 def _vectors(columns: Columns, names: str) -> Float64[np.ndarray, "n k"]:
-    return np.stack([columns[name].astype(np.float64) for name in names.split()], axis=1)
+    return np.stack([_field(columns, name).astype(np.float64) for name in names.split()], axis=1)
 
 
 def _imus(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Imu]:
     """IMU of the estimator, and those of each sensor that is logged fast enough."""
     imus: dict[str, Imu] = {}
-    if (combined := topics.get("sensor_combined")) is not None:
-        gyro_ns = _ns(combined)
-        relative = combined["accelerometer_timestamp_relative"].astype(np.int64)
-        known = relative != NO_ACCEL
-        gyro = _vectors(combined, "gyro_rad[0] gyro_rad[1] gyro_rad[2]") * FLU_FROM_FRD
-        names = "accelerometer_m_s2[0] accelerometer_m_s2[1] accelerometer_m_s2[2]"
-        accel = _vectors(combined, names)[known] * FLU_FROM_FRD
-        _put(imus, "/imu", (gyro_ns, gyro, (gyro_ns + relative * 1000)[known], accel), remarks)
+    if "sensor_combined" in topics:
+        _put(imus, "/imu", partial(_combined, topics["sensor_combined"]), remarks)
     for name in sorted(topics):
-        gyro_name, number = re.fullmatch(r"sensor_gyro(?:_fifo)?(?:/(\d+))?", name), 0
-        accel_columns = topics.get(name.replace("gyro", "accel"))
-        if gyro_name is None or accel_columns is None:
-            continue
-        number = int(gyro_name[1] or 0)
-        gyro_ns, gyro = _samples(topics[name])
-        accel_ns, accel = _samples(accel_columns)
-        if len(gyro_ns) > 1 and (len(gyro_ns) - 1) * 1e9 >= LEAST_IMU_HZ * float(gyro_ns[-1] - gyro_ns[0]):
-            topic = f"/imu/{'fifo' if 'fifo' in name else 'sensor'}{number}"
-            _put(imus, topic, (gyro_ns, gyro, accel_ns, accel), remarks)
+        gyro_name, accel_name = re.fullmatch(r"sensor_gyro(?:_fifo)?(?:/(\d+))?", name), name.replace("gyro", "accel")
+        if gyro_name is not None and accel_name in topics:
+            topic = f"/imu/{'fifo' if 'fifo' in name else 'sensor'}{int(gyro_name[1] or 0)}"
+            _put(imus, topic, partial(_pair, topics[name], topics[accel_name]), remarks)
     if not imus:
         remarks.losses.append("the log has no IMU: neither sensor_combined, nor sensor_gyro and sensor_accel at 10 Hz or more")
     return imus
 
 
-def _put(imus: dict[str, Imu], topic: str, columns: tuple[Any, Any, Any, Any], remarks: Remarks) -> None:
+def _put(imus: dict[str, Imu], topic: str, found: Callable[[], tuple[Any, Any, Any, Any] | None], remarks: Remarks) -> None:
     try:
-        imus[topic], notes = joined(*columns, name=topic)
-        remarks.notes.extend(notes)
+        if (columns := found()) is not None:
+            imus[topic], notes = joined(*columns, name=topic)
+            remarks.notes.extend(notes)
     except DataError as error:
         remarks.losses.append(f"{topic} is left out: {error.what}")
+
+
+def _combined(columns: Columns) -> tuple[Any, Any, Any, Any]:
+    """Stamps and values of gyro and accelerometer, as the estimator takes them."""
+    gyro_ns, relative = _ns(columns), _field(columns, "accelerometer_timestamp_relative").astype(np.int64)
+    known = relative != NO_ACCEL
+    gyro, accel = (_vectors(columns, f"{n}[0] {n}[1] {n}[2]") * FLU_FROM_FRD for n in ("gyro_rad", "accelerometer_m_s2"))
+    return gyro_ns, gyro, (gyro_ns + relative * 1000)[known], accel[known]
+
+
+def _pair(gyro: Columns, accel: Columns) -> tuple[Any, Any, Any, Any] | None:
+    """Stamps and values of both sensors; None if the gyro is logged too slowly."""
+    gyro_ns, rates = _samples(gyro)
+    if len(gyro_ns) < 2 or (len(gyro_ns) - 1) * 1e9 < LEAST_IMU_HZ * float(gyro_ns[-1] - gyro_ns[0]):
+        return None
+    return (gyro_ns, rates, *_samples(accel))
 
 
 def _samples(columns: Columns) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
@@ -216,17 +224,21 @@ def _samples(columns: Columns) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndar
     taken = np.arange(size)[None, :] < counts[:, None]
     back = (counts[:, None] - 1 - np.arange(size)[None, :]) * columns["dt"].astype(np.float64)[:, None] * 1000.0
     t_ns = _sample_ns(columns)[:, None] - np.rint(back).astype(np.int64)
-    axes = [np.stack([columns[f"{axis}[{n}]"] for n in range(size)], axis=1) for axis in "xyz"]
-    values = np.stack(axes, axis=2).astype(np.float64) * columns["scale"].astype(np.float64)[:, None, None]
+    axes = [np.stack([_field(columns, f"{axis}[{n}]") for n in range(size)], axis=1) for axis in "xyz"]
+    values = np.stack(axes, axis=2).astype(np.float64) * _field(columns, "scale").astype(np.float64)[:, None, None]
     return t_ns[taken], values[taken] * FLU_FROM_FRD
 
 
-def _all_poses(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Poses | None]:
-    truth, ekf = "_groundtruth", ""
-    return {
-        "/ground_truth/pose": _poses(topics, truth, remarks),
-        "/ekf/pose": _poses(topics, ekf, remarks),
-    }
+def _all_poses(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Poses]:
+    found = {}
+    for topic, ending in (("/ground_truth/pose", "_groundtruth"), ("/ekf/pose", "")):
+        try:
+            poses = _poses(topics, ending, remarks)
+        except DataError as error:
+            remarks.losses.append(f"{topic} is left out: {error.what}")
+        else:
+            found |= {} if poses is None else {topic: poses}
+    return found
 
 
 def _poses(topics: dict[str, Columns], ending: str, remarks: Remarks) -> Poses | None:
@@ -276,24 +288,3 @@ def _table(name: str, columns: Columns, start_ns: int) -> Table:
     order = np.argsort(t_ns, kind="stable")
     message = "".join(part.capitalize() for part in name.partition("/")[0].split("_"))
     return Table(t_ns[order], rows[order], f"px4_msgs/msg/{message}")
-
-
-def _log_topic() -> MessageTopic:
-    return MessageTopic("/logged_messages", "rcl_interfaces/msg/Log", "ros2msg", LOG_DEFINITION.encode(), "cdr")
-
-
-def _logged(lines: list[tuple[int, str, str]]) -> Iterator[Message]:
-    """Text messages of PX4, as ROS 2 logs them."""
-    topic = _log_topic()
-    for timestamp, level, text in sorted(lines, key=lambda line: line[0]):
-        t_ns = int(timestamp) * 1000
-        payload = bytearray(b"\0\1\0\0") + struct.pack("<iIB", *divmod(t_ns, 10**9), LOG_LEVELS.get(level, 50))
-        for part in ("px4", text, "", ""):
-            _put_text(payload, part)
-        payload += bytes(-(len(payload) - 4) % 4) + struct.pack("<I", 0)
-        yield Message(topic, t_ns, t_ns, bytes(payload))
-
-
-def _put_text(payload: bytearray, text: str) -> None:
-    raw = text.encode("utf-8", "replace") + b"\0"
-    payload += bytes(-(len(payload) - 4) % 4) + struct.pack("<I", len(raw)) + raw

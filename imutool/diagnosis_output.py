@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -29,6 +28,7 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import Location, local
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
+from imutool.mcap_io.storage.target import writing
 from imutool.noise import datasheet
 from imutool.processes.forked import Forked
 from imutool.report import json_text
@@ -60,7 +60,7 @@ def refuse(folder: Path, *, overwrite: bool = False) -> None:
             f"holds a diagnosis already ({', '.join(existing)})", where=folder, fix="Choose another folder, or give `overwrite`"
         )
     above = next(parent for parent in folder.absolute().parents if parent.is_dir())
-    with _told(folder), TemporaryDirectory(dir=above, prefix=".imutool-"):
+    with writing(folder), TemporaryDirectory(dir=above, prefix=".imutool-"):
         pass  # even the superuser cannot write everywhere
 
 
@@ -86,7 +86,7 @@ def write(
     remove_abandoned(target)
     partial = temporary_path(target)
     complete = partial / target.name  # what is written names the folder as it will be called
-    with _told(folder):
+    with writing(folder):
         try:
             complete.mkdir(parents=True)
             remarks = _make(d, complete, logs, drawn)
@@ -274,14 +274,3 @@ def _move(complete: Path, folder: Path) -> None:
             (complete / name).replace(folder / name)
         else:
             (folder / name).unlink(missing_ok=True)
-
-
-@contextmanager
-def _told(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise ConfigError(
-            f"cannot be written ({reason})", where=folder, fix="Choose a place that can be written and has room"
-        ) from error

@@ -22,9 +22,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import ClassVar
+from importlib import import_module
+from typing import Any, ClassVar
 
 INTERRUPTED = 130  # exit code after Ctrl-C
+LOST = 3  # exit code of work that was done, with something of a log lost or a log quarantined
 # A path keeps one slash of a URL's two. What follows ? or # is a query of http, and of a store if it assigns something
 URL_LOGIN = re.compile(
     r"(\b(?!az:|abfs:)[a-z][a-z0-9+.-]*:/{1,2}|\b(?:az|abfs):/{1,2}(?=[^/\s?#]*:))[^/\s?#]*@", re.IGNORECASE
@@ -95,6 +97,20 @@ def not_installed(
     why = "" if error is None or isinstance(error, ModuleNotFoundError) else f" ({error})"
     what = f"{user} needs {package}, which is not installed" if user else f"{package} is not installed"
     return ConfigError(what + why, where=where, fix=f"Install it with: pip install 'imutool[{extra}]'")
+
+
+def required(module: str, extra: str, *, package: str = "", where: object = None, user: str = "") -> Any:
+    """Import a module of an optional package.
+
+    Raises:
+        ConfigError: it cannot be imported (`not_installed`).
+    """
+    top = module.partition(".")[0]
+    try:
+        import_module(top)
+        return import_module(module)
+    except ImportError as error:
+        raise not_installed(package or top, extra, where=where, user=user, error=error) from error
 
 
 class DataError(ImutoolError):

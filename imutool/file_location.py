@@ -44,6 +44,16 @@ COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"BZh": "bzip2",
 CACHE, CACHE_OPTIONS = "blockcache", {"maxblocks": 4}
 
 
+def first_bytes(path: Location, count: int) -> bytes:
+    """First bytes of a file; none of one that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            raw: bytes = file.read(count)
+            return raw
+    except OSError:
+        return b""
+
+
 class OpenFile(NamedTuple):
     """An open file or object, its size, and its `identity` when it was opened."""
 

@@ -107,6 +107,22 @@ def command() -> str:
     return str(Path(sys.executable).with_name("imutool"))
 
 
+@pytest.fixture
+def code(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Runs a command line in this process and returns its exit code."""
+    monkeypatch.setenv("COLUMNS", "80")
+
+    from imutool import cli
+
+    def run(*words: str | Path) -> int:
+        monkeypatch.setattr(sys, "argv", ["imutool", *map(str, words)])
+        with pytest.raises(SystemExit) as leaving:
+            cli.main()
+        return int(leaving.value.code or 0)
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Runs the command line in a folder and returns what it printed and its exit code.

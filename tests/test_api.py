@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.in_process import run_script
+from support.loaded import loaded
 
 import imutool
 from imutool.cleaning.survey import raw_batches
@@ -73,13 +74,11 @@ def test_the_types_that_tools_see_are_the_names_that_are_imported() -> None:
 
 
 def test_importing_the_package_imports_no_numpy_and_no_torch() -> None:
-    code = "import imutool, sys; print(sorted({'numpy', 'torch', 'msgspec', 'rerun'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.strip() == "[]"
+    assert loaded("import imutool", {"numpy", "torch", "msgspec", "rerun"}) == []
 
 
 def test_reading_and_writing_import_no_torch() -> None:
-    code = "import imutool, sys; imutool.read, imutool.write, imutool.info, imutool.clean; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    assert loaded("import imutool; imutool.read, imutool.write, imutool.info, imutool.clean", {"torch"}) == []
 
 
 def test_importing_takes_a_tenth_of_importing_torch(torch_import_s: float) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from support.in_process import run_script
+from support.saved_rrd import entities
 
 from imutool.cli.demo import write_asl
 from imutool.debiasing import debias
@@ -96,15 +97,6 @@ def test_the_papers_tables_are_made_in_one_command(tmp_path: Path, data: Path, e
     assert page.count("data:image/png;base64,") == 1
     assert "http" not in page
     assert example("reproduce_tables.py", data, "-o", "out", *words) == printed  # nothing is made twice
-
-
-def entities(path: Path) -> set[str]:
-    """What an .rrd holds."""
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(path)
-    (store,) = reader.recordings()
-    return {chunk.entity_path for chunk in reader.stream(store=store)}
 
 
 def test_a_log_is_looked_at_and_a_page_is_left(

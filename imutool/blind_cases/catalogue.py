@@ -12,8 +12,20 @@ import numpy as np
 from numpy.random import Generator
 
 from imutool.blind_cases import effects as forward
-from imutool.blind_cases import nonlinear_effects as nonlinear
-from imutool.blind_cases.effects import ACCEL, GYRO, TEMPERATURE, Model, Parameter, Reading, Six, Stage, Theta, Times, on
+from imutool.blind_cases.effects import (
+    ACCEL,
+    GYRO,
+    TEMPERATURE,
+    Model,
+    Parameter,
+    Reading,
+    Six,
+    Stage,
+    Theta,
+    Three,
+    Times,
+    on,
+)
 
 RATE_HZ = 50.0  # of the channels
 LONGEST_LAG_S = 0.3
@@ -64,6 +76,30 @@ def _by_scene(*_: Any) -> None:
     """Stamps and reference are the scene's."""
 
 
+def quadratic(values: Three, k: Theta, t_s: Times) -> Three:
+    """(1 + k v) v."""
+    return np.asarray(values * (1.0 + k * values))
+
+
+def two_gains(values: Three, a: Theta, t_s: Times) -> Three:
+    """(1 + a / 2) v where v is positive, (1 - a / 2) v where it is negative."""
+    return np.where(values > 0.0, values * (1.0 + 0.5 * a), values * (1.0 - 0.5 * a))
+
+
+def dead_band(values: Three, width: Theta, t_s: Times) -> Three:
+    """Zero below the width."""
+    return np.where(np.abs(values) < width[0], 0.0, values)
+
+
+def play(values: Three, width: Theta, t_s: Times) -> Three:
+    """What a reading is dragged along by, with so much play on both sides."""
+    out, dragged = np.empty_like(values), values[0]
+    for k, value in enumerate(values):
+        dragged = np.minimum(np.maximum(dragged, value - width[0]), value + width[0])
+        out[k] = dragged
+    return out
+
+
 _LINE = (
     _fixed("f", "Hz", 40.0),
     *_axes("rad/s", 0.1, "gyro_"),
@@ -84,15 +120,15 @@ CATALOGUE: Mapping[str, Model] = {
     model.name: model
     for model in (
         Model("gyro_scale", Stage.SENSOR, "gyro", _axes("-", 0.1), on(GYRO, forward.scale)),
-        Model("gyro_scale_asymmetry", Stage.SENSOR, "gyro", _axes("-", 0.1), on(GYRO, nonlinear.two_gains)),
+        Model("gyro_scale_asymmetry", Stage.SENSOR, "gyro", _axes("-", 0.1), on(GYRO, two_gains)),
         Model("gyro_misalignment", Stage.SENSOR, "gyro", _SQUARE, on(GYRO, forward.misalignment)),
         Model("gyro_g_sensitivity", Stage.SENSOR, "gyro", _G, forward.g_sensitivity),
-        Model("gyro_quadratic", Stage.SENSOR, "gyro", _axes("s/rad", 0.1), on(GYRO, nonlinear.quadratic)),
+        Model("gyro_quadratic", Stage.SENSOR, "gyro", _axes("s/rad", 0.1), on(GYRO, quadratic)),
         Model("gyro_bias_drift", Stage.SENSOR, "gyro", (*_axes("rad/s", 0.02), _TAU), on(GYRO, forward.warm_up)),
         Model("accel_scale", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, forward.scale)),
-        Model("accel_scale_asymmetry", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, nonlinear.two_gains)),
+        Model("accel_scale_asymmetry", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, two_gains)),
         Model("accel_misalignment", Stage.SENSOR, "accel", _SQUARE, on(ACCEL, forward.misalignment)),
-        Model("accel_quadratic", Stage.SENSOR, "accel", _axes("s^2/m", 6e-3), on(ACCEL, nonlinear.quadratic)),
+        Model("accel_quadratic", Stage.SENSOR, "accel", _axes("s^2/m", 6e-3), on(ACCEL, quadratic)),
         Model("accel_bias_drift", Stage.SENSOR, "accel", (*_axes("m/s^2", 0.5), _TAU), on(ACCEL, forward.warm_up)),
         Model("lever_arm", Stage.IDEAL, "accel", _axes("m", 0.3), forward.lever_arm),
         Model("mount_rotation", Stage.MOUNT, "both", _axes("rad", 0.2), forward.mount_rotation),
@@ -102,14 +138,14 @@ CATALOGUE: Mapping[str, Model] = {
         Model("clock_jump", Stage.CLOCK, "both", _JUMP, forward.clock_jump, smooth=False),
         Model("low_pass", Stage.BANDWIDTH, "both", (Parameter("f_c", "Hz", 5.0),), forward.low_pass, _quicker),
         Model("gyro_delay", Stage.BANDWIDTH, "gyro", (Parameter("tau", "s", 5e-3),), forward.gyro_delay),
-        Model("gyro_hysteresis", Stage.SENSOR, "gyro", (Parameter("width", "rad/s", 0.02),), on(GYRO, nonlinear.play)),
-        Model("accel_hysteresis", Stage.SENSOR, "accel", (Parameter("width", "m/s^2", 0.2),), on(ACCEL, nonlinear.play)),
+        Model("gyro_hysteresis", Stage.SENSOR, "gyro", (Parameter("width", "rad/s", 0.02),), on(GYRO, play)),
+        Model("accel_hysteresis", Stage.SENSOR, "accel", (Parameter("width", "m/s^2", 0.2),), on(ACCEL, play)),
         Model(
             "gyro_dead_band",
             Stage.SENSOR,
             "gyro",
             (Parameter("width", "rad/s", 0.05),),
-            on(GYRO, nonlinear.dead_band),
+            on(GYRO, dead_band),
             smooth=False,
         ),
         Model("saturation", Stage.CONVERTER, "both", _LIMITS, forward.saturation, clipping, smooth=False),

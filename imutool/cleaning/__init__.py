@@ -1,4 +1,4 @@
-"""Cleaning of a log's IMU: `survey` finds the defects, a `Cleaner` removes them."""
+"""Cleaning of a log's IMU: `look` finds the defects, a `Cleaner` removes them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from imutool.array_types import Bool
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.rule import CleaningSettings
-from imutool.cleaning.survey import Survey, UntrustedError, look, raw_batches, survey
+from imutool.cleaning.survey import Survey, UntrustedError, look, raw_batches
 from imutool.errors import LogError
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
@@ -24,7 +24,6 @@ __all__ = [
     "look",
     "raw_batches",
     "rows",
-    "survey",
 ]
 
 

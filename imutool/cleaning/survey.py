@@ -19,7 +19,6 @@ from imutool.cleaning.rules.gaps import MISSING
 from imutool.cleaning.samples import Motion, Samples, blocks
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.errors import LogError
-from imutool.file_location import Location
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
@@ -165,21 +164,10 @@ class CleaningReport(Report, frozen=True, kw_only=True, tag=SCHEMA):
     added: dict[str, int] | UnsetType = UNSET
 
 
-def survey(path: Location, topic: str | None = None, settings: CleaningSettings | None = None) -> Survey:
-    """Survey one IMU of a log.
-
-    Memory grows by about 6 kB for each second of the log (`tests/bench/clean.py`).
-
-    Raises:
-        ConfigError: the file cannot be opened, or a rule is not known.
-        LogError: no such IMU, several without `topic`, or a damaged log.
-    """
-    with Log(path) as log:
-        return look(log, topic or log.only_imu(), settings)
-
-
 def look(log: Log, topic: str, settings: CleaningSettings | None = None) -> Survey:
     """Survey one IMU of an open log.
+
+    Memory grows by about 6 kB for each second of the log (`tests/bench/clean.py`).
 
     Raises:
         ConfigError: a rule is not known.

@@ -5,11 +5,12 @@ from __future__ import annotations
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from inspect import Parameter
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, get_args
 
@@ -20,12 +21,13 @@ from typer.models import CommandFunctionType
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
 from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, instead_of, with_flags
-from imutool.cli.terminal import plain, say, tell_error
+from imutool.cli.terminal import log_to_stderr, plain, progress, say, tell_error, write_json
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
+from imutool.file_location import first_bytes
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
+from imutool.report import Report
 
-LOST = 3  # the command did what it could, and something of the log is lost
 REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
@@ -140,11 +142,7 @@ class Command(TyperCommand):
 
 def _is_report(place: str | Path | None) -> bool:
     """Whether a file is a JSON report of imutool."""
-    try:
-        with Path(place or "").open("rb") as file:
-            return b'"schema": "imutool.' in file.read(REPORT_HEAD)
-    except OSError:
-        return False
+    return b'"schema": "imutool.' in first_bytes(Path(place or ""), REPORT_HEAD)
 
 
 class App(typer.Typer):
@@ -156,8 +154,10 @@ class App(typer.Typer):
         """Register a function as a command."""
 
         def register(function: CommandFunctionType) -> CommandFunctionType:
-            kind = type("Command", (cls or Command,), {"function": staticmethod(function)})
-            return typer.Typer.command(self, name, cls=kind, **settings)(function)
+            command = expanded(function)
+            kind = type("Command", (cls or Command,), {"function": staticmethod(command)})
+            typer.Typer.command(self, name, cls=kind, **settings)(command)
+            return function
 
         return register
 
@@ -217,6 +217,55 @@ MaxChunk = Annotated[
 ]
 Verbose = Annotated[bool, typer.Option("-v", "--verbose", help="Print more.")]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print only results and errors.")]
+
+
+@dataclass(frozen=True)
+class Common:
+    """Options at the end of nearly every command: its parameter `common` stands for them."""
+
+    overwrite: Overwrite = False
+    json_to: Json = None
+    verbose: Verbose = False
+    quiet: Quiet = False
+
+    def log(self) -> None:
+        """Send log records to stderr."""
+        log_to_stderr(self.verbose, self.quiet)
+
+    def progress(self, what: str) -> AbstractContextManager[Callable[[int, int, str], None]]:
+        """Progress bar on stderr."""
+        return progress(what, self.verbose, self.quiet)
+
+    def write(self, report: Report, *, replace: bool = False) -> bool:
+        """Write the report where `--json` says; True if stdout holds it."""
+        return write_json(report, self.json_to, overwrite=self.overwrite or replace)
+
+
+COMMON = Common()
+
+
+def expanded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Function of a command with the options that `common` stands for."""
+    own = inspect.signature(function, eval_str=True).parameters
+    if "common" not in own:
+        return function
+    shared = inspect.signature(Common, eval_str=True).parameters
+
+    def command(**words: Any) -> Any:
+        common = Common(**{name: words.pop(name) for name in shared})
+        return function(**words, common=common)
+
+    options = [*(option for name, option in own.items() if name != "common"), *shared.values()]
+    return with_options(command, options, function)
+
+
+def with_options(command: Callable[..., Any], options: Iterable[Parameter], named: Callable[..., Any]) -> Callable[..., Any]:
+    """Function with these options and another's name and help, for typer."""
+    as_words = [option.replace(kind=Parameter.KEYWORD_ONLY) for option in options]
+    command.__module__, command.__name__, command.__doc__ = named.__module__, named.__name__, named.__doc__
+    command.__signature__ = inspect.Signature(as_words)  # type: ignore[attr-defined]
+    command.__annotations__ = {option.name: option.annotation for option in as_words}
+    return command
 
 
 def _fail(message: str, code: int) -> NoReturn:

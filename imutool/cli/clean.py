@@ -9,24 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import (
-    HTML,
-    LOG,
-    LOST,
-    Imus,
-    Init,
-    Json,
-    MaxChunk,
-    Overwrite,
-    Quiet,
-    Smooth,
-    Verbose,
-    Written,
-    app,
-    listing,
-)
-from imutool.cli.terminal import out, plain, progress, say, table, tell_losses, write_json
-from imutool.errors import ConfigError
+from imutool.cli.app import COMMON, HTML, LOG, Common, Imus, Init, MaxChunk, Smooth, Written, app, listing
+from imutool.cli.terminal import out, plain, say, table, tell_losses
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import to_location
 from imutool.report import UNSET, Report, UnsetType
 
@@ -54,10 +39,7 @@ def clean(
     init: Init = "auto",
     smooth: Smooth = False,
     max_chunk: MaxChunk = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Find the defects of a log's IMU, and say whether the log can be trusted.
 
@@ -67,19 +49,19 @@ def clean(
 
     rules = chosen(rule or (), no_rule or (), force, fix)
     given = {"--model": model, "--smooth": smooth, "--force": force, "--fix": fix}
-    given["--overwrite"] = overwrite and report_to is None and json_to is None
+    given["--overwrite"] = common.overwrite and report_to is None and common.json_to is None
     if target is None and (idle := [name for name, value in given.items() if value]):
         raise ConfigError(f"{idle[0]} needs OUT", where="clean", fix="Name the log to be written")
     if target is None:
         from imutool.api.cleaning import survey_imus
 
-        with progress("Looking through", verbose, quiet) as tell:
+        with common.progress("Looking through") as tell:
             found = survey_imus(source, imu or (), rules, max_chunk, tell)
         surveys, added, losses = list(found.surveys), found.added, found.losses
     else:
         from imutool.debiasing import debias
 
-        with progress("Cleaning", verbose, quiet) as tell:
+        with common.progress("Cleaning") as tell:
             report = debias(
                 to_location(source),
                 to_location(target),
@@ -87,7 +69,7 @@ def clean(
                 imus=imu or (),
                 init=init,
                 smooth=smooth,
-                overwrite=overwrite,
+                overwrite=common.overwrite,
                 clean=rules,
                 force=force,
                 max_chunk=max_chunk,
@@ -97,8 +79,8 @@ def clean(
     if report_to is not None:
         from imutool.viewing.html import cleaning_page
 
-        cleaning_page.write(surveys, report_to, overwrite=overwrite)
-    _tell(source, surveys, losses, target, added, json_to, overwrite)
+        cleaning_page.write(surveys, report_to, overwrite=common.overwrite)
+    _tell(source, surveys, losses, target, added, common)
 
 
 def _tell(
@@ -107,8 +89,7 @@ def _tell(
     losses: Losses,
     target: str | None,
     added: Mapping[str, int],
-    json_to: str | None,
-    overwrite: bool,
+    common: Common,
 ) -> None:
     """Report findings and output as JSON or text; with losses the exit code is 3."""
     from imutool.cleaning.survey import CleaningReport
@@ -120,7 +101,7 @@ def _tell(
         output=UNSET if target is None else target,
         added=UNSET if target is None else dict(added),
     )
-    if not write_json(report, json_to, overwrite=overwrite):
+    if not common.write(report):
         for survey in surveys:
             show(survey)
         if target is not None:
@@ -139,7 +120,7 @@ def show(survey: Survey) -> None:
     if survey.findings:
         table(finding_rows(survey), keys=1)
     for reason in survey.reasons:
-        out.print(f"[red]not to be trusted:[/] {plain(reason)}", highlight=False, soft_wrap=True)
+        say(reason, "not to be trusted", "red")
 
 
 def finding_rows(survey: Survey) -> list[tuple[str, ...]]:
@@ -189,10 +170,7 @@ def repair(
         Damaged, typer.Option(help="Damaged stretches: drop them, or keep their bytes as attachments (MCAP).")
     ] = Damaged.drop,
     max_chunk: MaxChunk = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Save the intact messages of a damaged log or ROS 1 bag, and report the losses.
 
@@ -201,13 +179,13 @@ def repair(
     from imutool.api.cleaning import repair as run
     from imutool.bag.repair import BagReport
 
-    with progress("Repairing", verbose, quiet) as tell:
+    with common.progress("Repairing") as tell:
         repaired = run(
             source,
             target,
             damaged=damaged.value,
             max_chunk=max_chunk,
-            overwrite=overwrite,
+            overwrite=common.overwrite,
             progress=lambda done, total: tell(done, total, ""),
         )
     report = Repair(
@@ -218,7 +196,7 @@ def repair(
         kept=UNSET if isinstance(repaired, BagReport) else repaired.kept,
         losses=repaired.plain() if isinstance(repaired, BagReport) else repaired.losses.plain(),
     )
-    if not write_json(report, json_to, overwrite=overwrite):
+    if not common.write(report):
         tell_losses(report.losses)
         counts = ", ".join(f"{count} on {topic}" for topic, count in report.messages.items()) or "no message"
         state = "the log was whole" if report.whole else "saved"

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import LOST, Json, Overwrite, Quiet, Verbose, Written, app, listing
+from imutool.cli.app import COMMON, Common, Written, app, listing
 from imutool.cli.parameters import with_flags
-from imutool.cli.terminal import progress, say, tell_error, tell_warning, write_json
-from imutool.errors import DataError
-from imutool.report import Report, Section
+from imutool.cli.terminal import say, tell_error, tell_warning
+from imutool.conversion import Failure
+from imutool.errors import LOST, DataError
+from imutool.report import Report
 
 if TYPE_CHECKING:
     from imutool.conversion.run import ConvertReport
@@ -27,13 +28,6 @@ class Compression(StrEnum):
     zstd = "zstd"
     lz4 = "lz4"
     none = "none"
-
-
-class Failure(Section, frozen=True):
-    """Failed sequence, with the reason."""
-
-    name: str
-    message: str
 
 
 class Conversion(Report, frozen=True, tag="imutool.conversion/1"):
@@ -77,15 +71,12 @@ def convert(
     fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames shown wrong by the motion.")] = False,
     restamp: Annotated[bool, typer.Option("--restamp", help="Put late stamps on the clock of the IMU.")] = False,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; by default one per processor.")] = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Convert any recording with an IMU to MCAP; the format is recognised."""
     from imutool.conversion.run import convert as run
 
-    with progress("Converting", verbose, quiet) as tell:
+    with common.progress("Converting") as tell:
         report = run(
             source,
             target,
@@ -93,7 +84,7 @@ def convert(
             sequences=sequence or (),
             compression=compression.value,
             images=not no_images,
-            overwrite=overwrite,
+            overwrite=common.overwrite,
             sensor=sensor,
             kinds=kind or (),
             mapping=map_,
@@ -102,17 +93,16 @@ def convert(
             workers=workers,
             progress=tell,
         )
-    _tell(report, json_to, overwrite=overwrite, quiet=quiet)
+    _tell(report, common)
 
 
-def _tell(report: ConvertReport, json_to: str | None, *, overwrite: bool, quiet: bool) -> None:
+def _tell(report: ConvertReport, common: Common) -> None:
     """Report written logs, notes, losses and failures; the exit code says which there are."""
-    failures = [Failure(failure.name, failure.message) for failure in report.failures]
-    summary = Conversion([str(path) for path in report.written], failures, report.notes, report.losses)
-    if not write_json(summary, json_to, overwrite=overwrite):
+    summary = Conversion([str(path) for path in report.written], report.failures, report.notes, report.losses)
+    if not common.write(summary):
         for path in report.written:
             say(str(path))
-    if not quiet:
+    if not common.quiet:
         for note in report.notes:
             tell_warning(note, "note")
     for loss in report.losses:
@@ -140,18 +130,15 @@ def export(
     noise: Annotated[
         str | None, typer.Option(metavar="NAME|F.toml", help="Noise for sensor.yaml or a simulator: a data sheet or a file.")
     ] = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Write a log as a EuRoC or rosbag2 folder, or a diagnosed sensor for a simulator."""
     from imutool.api.logs import export as run
 
-    with progress("Exporting", verbose, quiet) as tell:
-        report = run(log, target, format=format, imu=imu, noise=noise, overwrite=overwrite, progress=tell)
+    with common.progress("Exporting") as tell:
+        report = run(log, target, format=format, imu=imu, noise=noise, overwrite=common.overwrite, progress=tell)
     summary = Export(str(report.output), report.format, report.imu, report.written, report.left_out)
-    if write_json(summary, json_to, overwrite=overwrite):
+    if common.write(summary):
         return
     counts = ", ".join(name if "." in name else f"{count} on {name}" for name, count in report.written.items())
     say(f"{target}: {counts}" + (f"; IMU from {report.imu}" if report.imu else ""))

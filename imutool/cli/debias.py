@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from imutool.bias_start import Fitness
-from imutool.cli.app import HTML, LOG, LOST, RRD, Imus, Init, Json, MaxChunk, Overwrite, Quiet, Smooth, Verbose, app
-from imutool.cli.terminal import progress, say, tell_losses, write_json
-from imutool.errors import ConfigError
+from imutool.cli.app import COMMON, HTML, LOG, RRD, Common, Imus, Init, MaxChunk, Smooth, app
+from imutool.cli.terminal import say, tell_losses
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import Location, to_location
 from imutool.report import UNSET, Report, Section, UnsetType, json_values
 from imutool.viewing import Output
@@ -55,20 +55,18 @@ def debias(
     report_to: Annotated[Path | None, typer.Option("--report", metavar="F.html", help=REPORT_HELP), HTML] = None,
     max_chunk: MaxChunk = None,
     force: Annotated[bool, typer.Option("--force", help=FORCE_HELP)] = False,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Write a log with a debiased IMU topic; all other messages stay unchanged."""
-    _refuse_contradictions(target, in_place, overwrite and save_view is None and report_to is None and json_to is None)
+    unused = save_view is None and report_to is None and common.json_to is None
+    _refuse_contradictions(target, in_place, common.overwrite and unused)
     models = assigned(model or ())
     _require_matplotlib(report_to)
     from imutool.cleaning import CleaningSettings
     from imutool.debiasing import debias as run
 
-    live = _watching(source, target, view, connect, save_view, overwrite)
-    with progress("Debiasing", verbose, quiet) as tell, live as watch:
+    live = _watching(source, target, view, connect, save_view, common.overwrite)
+    with common.progress("Debiasing") as tell, live as watch:
         report = run(
             to_location(source),
             None if target is None else to_location(target),
@@ -80,17 +78,17 @@ def debias(
             max_chunk=max_chunk,
             clean=CleaningSettings() if clean else None,
             force=force,
-            overwrite=overwrite and not in_place,
+            overwrite=common.overwrite and not in_place,
             encoding=encoding,
             progress=lambda done, total: tell(done, total, ""),
             watch=watch,
         )
     summary = _summary(report, str(target or source), None if watch is None else watch.shown, report_to, clean)
-    if not (json_only := write_json(summary, json_to, overwrite=overwrite)):
+    if not (json_only := common.write(summary)):
         _say(report, summary)
     if report_to is not None:  # last: should it fail, the log is there all the same, and that has been said
-        with progress("Drawing", verbose, quiet):
-            _draw(to_location(target or source), report.fits, report_to, overwrite)
+        with common.progress("Drawing"):
+            _draw(to_location(target or source), report.fits, report_to, common.overwrite)
         if not json_only:
             say(f"Report: {report_to}")
     raise typer.Exit(LOST if report.lossy else 0)

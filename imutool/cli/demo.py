@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written, app
+from imutool.cli.app import COMMON, Common, Written, app
 from imutool.cli.evaluate import Score
-from imutool.cli.terminal import epoch_line, err, figures, plain, progress, say, write_json
+from imutool.cli.terminal import epoch_line, err, figures, say
 from imutool.errors import ConfigError, not_installed
 from imutool.report import Report
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from imutool.recording import Recording
     from imutool.training.fit import Epoch
     from imutool.training.settings import TrainSettings
@@ -29,14 +27,6 @@ FOLDER = Written(files=("*",), keeps=True)
 TRAINING_SEEDS = (1, 2, 3, 4)  # four flights of one sensor, each with a turn-on bias of its own
 TEST_SEED = 5
 STEPS = 10  # of each stage: as good as 30 on flights of one minute
-IMU_HEADER = "#timestamp [ns]," + ",".join(
-    [f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz"] + [f"a_RS_S_{axis} [m s^-2]" for axis in "xyz"]
-)
-TRUTH_HEADER = "#timestamp," + ",".join(
-    [f" p_RS_R_{axis} [m]" for axis in "xyz"]
-    + [f" q_RS_{axis} []" for axis in "wxyz"]
-    + [f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"]
-)
 
 
 class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
@@ -54,10 +44,7 @@ class DemoReport(Report, frozen=True, tag="imutool.demo/1"):
 @app.command(epilog="Example: [bold]imutool demo -o demo-out[/]")
 def demo(
     folder: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder."), FOLDER] = Path("demo-out"),
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Run a demo without download: convert, train, debias, evaluate, view.
 
@@ -65,13 +52,13 @@ def demo(
     """
 
     def announce(line: str) -> None:
-        if not quiet:
-            err.print(plain(line), highlight=False, soft_wrap=True)
+        if not common.quiet:
+            say(line, to=err)
 
-    with progress("Training", verbose, quiet) as tell:
-        done = run(folder, announce, overwrite=overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
+    with common.progress("Training") as tell:
+        done = run(folder, announce, overwrite=common.overwrite, progress=lambda epoch: tell(*epoch_line(epoch)))
     files = {name: str(getattr(done, name)) for name in ("log", "debiased", "model", "rrd", "png", "report")}
-    if not write_json(DemoReport(results=msgspec.convert(done.results, list[Score]), **files), json_to, overwrite=overwrite):
+    if not common.write(DemoReport(results=msgspec.convert(done.results, list[Score]), **files)):
         say("Pure integration of a flight the model has not seen, from its true start:")
         figures(done.results)
         say(f"Report: {done.report}. Error curves: {done.png}. In the viewer: rerun {done.rrd}")
@@ -169,16 +156,18 @@ def write_asl(recording: Recording, folder: Path) -> None:
 
     The folder has mav0/imu0 and mav0/state_groundtruth_estimate0.
     """
-    imu, truth = recording.imu, recording.truth
-    assert truth.v_w is not None
-    _write_csv(folder / "mav0" / "imu0" / "data.csv", IMU_HEADER, imu.t_ns, imu.gyro, imu.accel)
-    place = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-    _write_csv(place, TRUTH_HEADER, truth.t_ns, truth.p_wb, truth.q_wb_wxyz, truth.v_w)
-
-
-def _write_csv(path: Path, header: str, t_ns: np.ndarray, *columns: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     import numpy as np
 
-    rows = zip(t_ns.tolist(), np.concatenate(columns, axis=1).tolist(), strict=True)
-    path.write_text("\n".join([header, *(f"{t},{','.join(map(repr, row))}" for t, row in rows)]) + "\n", encoding="ascii")
+    from imutool.exporting.euroc import IMU_COLUMNS, TRUTH_COLUMNS, TRUTH_FOLDER, rows
+
+    imu, truth = recording.imu, recording.truth
+    assert truth.v_w is not None
+    tables = (
+        ("imu0", IMU_COLUMNS, imu.t_ns, [imu.gyro, imu.accel]),
+        (TRUTH_FOLDER, TRUTH_COLUMNS[:11], truth.t_ns, [truth.p_wb, truth.q_wb_wxyz, truth.v_w]),  # without biases
+    )
+    for name, columns, t_ns, values in tables:
+        path = folder / "mav0" / name / "data.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = rows(t_ns.tolist(), np.concatenate(values, axis=1).tolist())
+        path.write_text(f"#{','.join(columns)}\n{''.join(lines)}", encoding="ascii")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import Imu, Json, Overwrite, Quiet, Truth, Verbose, Written, app
+from imutool.cli.app import COMMON, Common, Imu, Truth, Written, app
 from imutool.cli.parameters import with_flags
-from imutool.cli.terminal import logger, progress, say, table, write_json
+from imutool.cli.terminal import logger, say, table
 
 if TYPE_CHECKING:
     from imutool.diagnosis.result import Diagnosis
@@ -59,10 +59,7 @@ def diagnose(
     ] = None,
     imu: Imu = None,
     truth: Truth = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Find physics that a simulation leaves out, by comparison with a recording.
 
@@ -75,7 +72,7 @@ def diagnose(
     from imutool.processes.forked import forking
 
     settings = load_settings(DiagnoseSettings, config, set_ or ())
-    with forking(), progress("Diagnosing", verbose, quiet) as tell:
+    with forking(), common.progress("Diagnosing") as tell:
         diagnosis, remarks = diagnosis_output.diagnose(
             reals,
             sim,
@@ -86,12 +83,12 @@ def diagnose(
             settings=settings,
             close=close,
             metric=None if metric is None else script_metric(metric, reals[0]),
-            overwrite=overwrite,
+            overwrite=common.overwrite,
             tell=tell,
         )
     for remark in remarks:
         logger.warning("%s", remark)
-    if not write_json(diagnosis.report, json_to, overwrite=overwrite):
+    if not common.write(diagnosis.report):
         _say(diagnosis, folder)
 
 
@@ -129,10 +126,7 @@ def audit(
     ] = "none",
     imu: Imu = None,
     truth: Truth = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Find the errors of a simulator's IMU, without a recording.
 
@@ -142,9 +136,9 @@ def audit(
     from imutool.diagnosis.audit import audit as run
     from imutool.diagnosis.audit import lines
 
-    with progress("Auditing", verbose, quiet) as tell:
+    with common.progress("Auditing") as tell:
         tell(0, 1, "reading")
         report = run(sim, real, noise=noise, imu=imu, truth=truth)
-    if not write_json(report, json_to, overwrite=overwrite):
+    if not common.write(report):
         for line in lines(report):
             say(with_flags(line))

@@ -12,23 +12,8 @@ import typer
 from msgspec import convert, field
 
 from imutool.bias_start import Fitness
-from imutool.cli.app import (
-    Aid,
-    Imu,
-    Init,
-    Json,
-    Logs,
-    Models,
-    Overwrite,
-    Quiet,
-    ReportPage,
-    Smooth,
-    Truth,
-    Verbose,
-    Written,
-    app,
-)
-from imutool.cli.terminal import figures, progress, say, table, write_json
+from imutool.cli.app import COMMON, Aid, Common, Imu, Init, Logs, Models, ReportPage, Smooth, Truth, Written, app
+from imutool.cli.terminal import figures, say, table
 from imutool.errors import ImutoolError
 from imutool.report import UNSET, Report, Section, UnsetType
 
@@ -98,10 +83,7 @@ def evaluate(
     ] = None,
     aligned: Annotated[bool, typer.Option("--aligned", help=ALIGNED_HELP)] = False,
     report: ReportPage = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Integrate the IMU from the true start, raw and debiased, and compare it with the truth.
 
@@ -117,13 +99,13 @@ def evaluate(
     results: list[dict[str, Any]] = []
     loaded, asked = [], aid or ("stops" if zupt else None)
     errors: list[ImutoolError] = []
-    with progress("Evaluating", verbose, quiet) as tell:
+    with common.progress("Evaluating") as tell:
         for done, log in enumerate(logs):
             tell(done, len(logs), log.name)
             first = len(results)
             refused: dict[str, ImutoolError] = {}
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
-            more: dict[str, Any] = {"trajectories": trajectories, "overwrite": overwrite, "refused": refused.__setitem__}
+            more: dict[str, Any] = {"trajectories": trajectories, "overwrite": common.overwrite, "refused": refused.__setitem__}
             results += run(log, models=model or (), aid=asked, **read, **more)
             errors += [_of_model(name, error) for name, error in refused.items()]
             if report is not None:
@@ -132,9 +114,9 @@ def evaluate(
                 loaded.append(replace(run_data, notes=(*run_data.notes, *_fits(results[first:]))))
         if report is not None:
             tell(len(logs), len(logs), "drawing")
-            pages.write_page(loaded, report, overwrite=overwrite)
+            pages.write_page(loaded, report, overwrite=common.overwrite)
         tell(len(logs), len(logs), "")
-    if not write_json(Evaluation(convert(results, list[Score])), json_to, overwrite=overwrite):
+    if not common.write(Evaluation(convert(results, list[Score]))):
         rows = [{**row, "model": f"{row['model']} aided"} if row["estimate"] == "aided" else row for row in results]
         figures(rows, aligned=aligned)
         for sentence in [*_used(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
@@ -191,10 +173,7 @@ def vio(
         list[str] | None,
         typer.Option("--set", metavar="key=value", help="Change a setting of imutool.vio.run.VioSettings. Repeatable."),
     ] = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Score a visual-inertial estimate on the log's IMU, raw and with each model.
 
@@ -209,12 +188,12 @@ def vio(
     settings = load(VioSettings, None, [*(f"{key}={value}" for key, value in given.items()), *(set_ or ())])
     states = (True, False) if bias_states is None else (bias_states,)
     results = []
-    with progress("Estimating", verbose, quiet) as tell:
+    with common.progress("Estimating") as tell:
         for log in logs:
             results += run(
                 log, models=model or (), init=init, truth=truth, imu=imu, bias_states=states, settings=settings, progress=tell
             )
-    if write_json(VioReport(results), json_to, overwrite=overwrite):
+    if common.write(VioReport(results)):
         return
     for rows in tabulate(results):
         table(rows, keys=3)

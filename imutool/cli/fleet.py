@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import App, Imu, Init, Json, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
+from imutool.cli.app import COMMON, App, Common, Imu, Init, Smooth, Truth, Written, app, expanded, with_options
 from imutool.cli.debias import FORCE_HELP, VERIFY_HELP
 from imutool.cli.parameters import with_flags
-from imutool.cli.terminal import out, plain, progress, say, write_json
+from imutool.cli.terminal import say
 from imutool.errors import ConfigError
 from imutool.fleet.task import Settings
 from imutool.mcap_io.storage import output_conflicts
@@ -36,7 +36,8 @@ RESUME = "Continue an earlier run: skip finished logs."
 CODES = "\n\nExit code: 0 all logs are intact; 3 data were lost or quarantined; else the largest code of the failed logs."
 
 
-def _common(
+def _run(
+    settings: Settings,
     source: Annotated[str, typer.Argument(metavar="SRC", help="A folder, pattern, log or URL.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL; every log keeps its path below SRC."), FOLDER],
     *,
@@ -49,29 +50,43 @@ def _common(
     workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
     memory: Annotated[str, typer.Option("--memory-per-task", metavar="SIZE", help="Memory for each log: 800M, 2G.")] = "1G",
     retries: Annotated[int, typer.Option(min=0, help="Number of retries after a worker died.")] = 3,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
-    """Options of every fleet command."""
+    """Run a command; its parameters but the settings are options of every fleet command."""
+    from imutool.file_location import to_location
+    from imutool.fleet.engine import ProcessEngine, RayEngine
+    from imutool.fleet.run import run
+
+    limits: dict[str, Any] = {"workers": workers, "memory_bytes": memory_bytes(memory), "retries": retries}
+    page = None if report is None else to_location(report)
+    with common.progress(f"Fleet {settings.command}") as tell:
+        done = run(
+            source,
+            target,
+            settings,
+            lambda: ProcessEngine(**limits) if address is None else RayEngine(address, **limits),
+            resume=resume,
+            overwrite=common.overwrite,
+            recheck=recheck,
+            page=page,
+            tell=tell,
+        )
+    if not common.write(done.summary(), replace=resume):
+        _show(done, report)
+    raise typer.Exit(done.progress.exit_code)
 
 
 def _command(example: str) -> Callable[[Callable[..., Settings]], Callable[..., Settings]]:
     """Decorator that makes a fleet command of a function from its own options to settings."""
 
     def made(settings_of: Callable[..., Settings]) -> Callable[..., Settings]:
-        shared, own = (inspect.signature(f, eval_str=True).parameters for f in (_common, settings_of))
+        run, own = (inspect.signature(f, eval_str=True).parameters for f in (expanded(_run), settings_of))
 
         def command(**words: Any) -> None:
-            _run(settings_of(**{name: words.pop(name) for name in own}), **words)
+            expanded(_run)(settings=settings_of(**{name: words.pop(name) for name in own}), **words)
 
-        order = [shared["source"], shared["target"], *own.values(), *list(shared.values())[2:]]
-        as_options = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in order]
-        command.__name__, command.__doc__ = settings_of.__name__, settings_of.__doc__
-        command.__signature__ = inspect.Signature(as_options)  # type: ignore[attr-defined]
-        command.__annotations__ = {parameter.name: parameter.annotation for parameter in as_options}
-        fleet.command(epilog=f"Example: [bold]imutool fleet {example}[/]{CODES}")(command)
+        options = [run["source"], run["target"], *own.values(), *list(run.values())[3:]]
+        fleet.command(epilog=f"Example: [bold]imutool fleet {example}[/]{CODES}")(with_options(command, options, settings_of))
         return settings_of
 
     return made
@@ -160,51 +175,11 @@ def diagnose(
     )
 
 
-def _run(
-    settings: Settings,
-    *,
-    source: str,
-    target: str,
-    address: str | None,
-    resume: bool,
-    recheck: bool,
-    report: str | None,
-    workers: int | None,
-    memory: str,
-    retries: int,
-    overwrite: bool,
-    json_to: str | None,
-    verbose: bool,
-    quiet: bool,
-) -> None:
-    from imutool.file_location import to_location
-    from imutool.fleet.engine import ProcessEngine, RayEngine
-    from imutool.fleet.run import run
-
-    limits: dict[str, Any] = {"workers": workers, "memory_bytes": memory_bytes(memory), "retries": retries}
-    page = None if report is None else to_location(report)
-    with progress(f"Fleet {settings.command}", verbose, quiet) as tell:
-        done = run(
-            source,
-            target,
-            settings,
-            lambda: ProcessEngine(**limits) if address is None else RayEngine(address, **limits),
-            resume=resume,
-            overwrite=overwrite,
-            recheck=recheck,
-            page=page,
-            tell=tell,
-        )
-    if not write_json(done.summary(), json_to, overwrite=overwrite or resume):
-        _show(done, report)
-    raise typer.Exit(done.progress.exit_code)
-
-
 def _show(done: FleetReport, report: str | None) -> None:
     for result in done.not_whole[:SHOWN]:
         why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
-        why = plain(with_flags(why if result.source in why else f"{result.source}: {why}"))
-        out.print(f"[yellow]{result.earlier or result.status}:[/] {why}", highlight=False, soft_wrap=True)
+        why = why if result.source in why else f"{result.source}: {why}"
+        say(with_flags(why), result.earlier or result.status)
     if len(done.not_whole) > SHOWN:
         say("and more")
     if done.comparison is not None:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose, Written
+from imutool.cli.app import COMMON, Common, Written
 from imutool.cli.fleet import fleet
-from imutool.cli.terminal import progress, say, table, tell_warning, write_json
+from imutool.cli.terminal import say, table, tell_warning
 from imutool.errors import ConfigError
 from imutool.report import Report, Section
 
@@ -65,10 +65,7 @@ def view(
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the catalog; else a free one.")] = None,
     cache: Annotated[Path | None, typer.Option(metavar="DIR", help=CACHE_HELP), LAYERS] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Number of logs at once; by default one per core.")] = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Serve a fleet as a Rerun catalog, and open its worst logs; until Ctrl-C.
 
@@ -82,7 +79,7 @@ def view(
     logs = rerun_layers.logs_of(folders)
     store = cache or folders[0] / rerun_catalog.FOLDER
     built: list[Layers] = []
-    with progress("Reading", verbose, quiet) as tell:
+    with common.progress("Reading") as tell:
         for done in rerun_layers.build(logs, store, workers=workers):
             built.append(done)
             tell(len(built), len(logs), done.name)
@@ -101,7 +98,7 @@ def view(
             worst=[WorstLog(*segment) for segment in segments],
             not_shown=[NotShown(log.name, log.trouble) for log in built if log.trouble],
         )
-        if not write_json(report, json_to, overwrite=overwrite):
+        if not common.write(report):
             _show(report, rerun_catalog.MEASURES[measure].meaning)
         sys.stdout.flush()  # a program that reads it through a pipe wants the address now
         if not list_only:

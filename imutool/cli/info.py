@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from msgspec.structs import replace
 
-from imutool.cli.app import LOST, PNG, TOML, Json, MaxChunk, Overwrite, Quiet, Verbose, app
-from imutool.cli.terminal import log_to_stderr, out, plain, say, table, tell_losses, write_json
-from imutool.errors import ConfigError
+from imutool.cli.app import COMMON, PNG, TOML, Common, MaxChunk, app
+from imutool.cli.terminal import say, table, tell_losses
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import to_location
 from imutool.report import UnsetType, json_values
 
@@ -44,15 +44,12 @@ def info(
         bool, typer.Option("--quick", help="Read only the chunks with IMU messages; this may miss damage.")
     ] = False,
     max_chunk: MaxChunk = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Report the topics, quality and damage of a log; with --noise, also its IMU noise."""
     from imutool.log_info.report import LogInfos
 
-    log_to_stderr(verbose, quiet)
+    common.log()
     asked = {"--model": model, "--imu": imu, "--truth": truth, "--noise-plot": noise_plot, "--noise-toml": noise_toml}
     if not noise and (idle := [name for name, value in asked.items() if value is not None]):
         raise ConfigError(f"{idle[0]} needs --noise", where="info", fix="Add --noise")
@@ -61,8 +58,8 @@ def info(
     described = [_described(log, quick, max_chunk, noise, {"imu": imu, "truth": truth, "model": model}) for log in logs]
     reports = [report for report, _ in described]
     if (identified := described[0][1]) is not None:
-        _write_noise(identified, noise_plot, noise_toml, overwrite)
-    if not write_json(reports[0] if len(reports) == 1 else LogInfos(reports), json_to, overwrite=overwrite):
+        _write_noise(identified, noise_plot, noise_toml, common.overwrite)
+    if not common.write(reports[0] if len(reports) == 1 else LogInfos(reports)):
         for log, (report, identified) in zip(logs, described, strict=True):
             say(f"{log}: {_span(report)}")
             _print(report, identified)
@@ -103,9 +100,9 @@ def _print(report: LogInfo, identified: IdentifiedNoise | None) -> None:
 
         table(noise_identification.rows(identified), keys=1)
         for remark in identified.remarks:
-            out.print(f"[cyan]noise:[/] {plain(remark)}", highlight=False, soft_wrap=True)
+            say(remark, "noise", "cyan")
     for warning in report.warnings:
-        out.print(f"[yellow]warning:[/] {plain(warning)}", highlight=False, soft_wrap=True)
+        say(warning, "warning")
     tell_losses(report.losses)
 
 

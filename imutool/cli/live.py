@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from imutool.cli.app import RRD, Imu, Json, Overwrite, Quiet, Verbose, app
-from imutool.cli.terminal import err, log_to_stderr, plain, say, tell_warning, write_json
+from imutool.cli.app import COMMON, RRD, Common, Imu, app
+from imutool.cli.terminal import err, out, say, tell_warning
 from imutool.errors import ConfigError
 from imutool.report import Report
 from imutool.viewing import Output
@@ -48,10 +48,7 @@ def live(
     save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save what is shown to a file."), RRD] = None,
     no_view: Annotated[bool, typer.Option("--no-view", help="Show nothing; with --print, for another program.")] = False,
     to_stdout: Annotated[bool, typer.Option("--print", help="Print each debiased sample as a line of JSON.")] = False,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Debias a stream of samples as it comes, show it, and measure the delay.
 
@@ -64,7 +61,7 @@ def live(
     from imutool.viewing.stream.session import run
     from imutool.viewing.stream.sources import open_source
 
-    log_to_stderr(verbose, quiet)
+    common.log()
     malformed = Malformed()
     origin = source or log
     if origin is None or (source and log):
@@ -72,14 +69,14 @@ def live(
     found = load_model(model)
     channel = scale_of(found).channel if found.temperature_parameters() else None
     samples = open_source(origin, malformed, imu=imu, speed=speed, temperature=channel)
-    with _view(connect, save, overwrite) if not no_view else nullcontext() as show:
+    with _view(connect, save, common.overwrite) if not no_view else nullcontext() as show:
         stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds)
     shown = [] if show is None else show.shown
     if malformed.count:
         tell_warning(f"messages without a sample: {malformed.count}, the first: {malformed.first}")
-    if not write_json(LiveReport(origin, model, stream, shown), json_to, overwrite=overwrite):
+    if not common.write(LiveReport(origin, model, stream, shown)):
         for line in _lines(stream, shown):
-            err.print(plain(line), highlight=False, soft_wrap=True) if to_stdout else say(line)
+            say(line, to=err if to_stdout else out)
 
 
 def _view(connect: str | None, save: Path | None, overwrite: bool) -> AbstractContextManager[Live]:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from msgspec.structs import astuple
 
-from imutool.cli.app import Json, Overwrite, Quiet, Verbose, app
+from imutool.cli.app import COMMON, Common, Quiet, Verbose, app
 from imutool.cli.terminal import log_to_stderr, say, table, write_json
 from imutool.report import REPORTS, Report, Section, json_schema
 
@@ -29,17 +29,17 @@ class Models(Report, frozen=True, tag="imutool.models/1"):
 
 
 @app.command(epilog="Example: [bold]imutool models --json -[/]")
-def models(overwrite: Overwrite = False, json_to: Json = None, verbose: Verbose = False, quiet: Quiet = False) -> None:
+def models(common: Common = COMMON) -> None:
     """List the models that come with imutool: method, sensor, data set and rate."""
     from imutool.bias.model_file import header_of, library
 
-    log_to_stderr(verbose, quiet)
+    common.log()
     entries = []
     for path in sorted(library().glob("*.safetensors")):
         about = header_of(path)
         rate_hz = round(float(about["rate_hz"]), 1)
         entries.append(ModelEntry(path.stem, about["method"], about.get("sensor"), about.get("dataset"), rate_hz))
-    if write_json(Models(entries), json_to, overwrite=overwrite):
+    if common.write(Models(entries)):
         return
     if entries:
         table([ModelEntry.__struct_fields__, *(tuple(map(str, astuple(model))) for model in entries)], keys=1)

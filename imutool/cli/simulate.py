@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from imutool.cli.app import LOG, Json, Overwrite, Quiet, Truth, Verbose, app
-from imutool.cli.terminal import log_to_stderr, logger, progress, say, write_json
+from imutool.cli.app import COMMON, LOG, Common, Json, Quiet, Truth, Verbose, app
+from imutool.cli.terminal import log_to_stderr, logger, say, write_json
 from imutool.errors import ConfigError
 from imutool.report import Report, Section
 
@@ -54,15 +54,12 @@ def simulate(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     truth: Truth = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Simulate an IMU along the poses of a log, with a sensor's physics and noise."""
     from imutool.sensor.simulate import simulate as run
 
-    with progress("Simulating", verbose, quiet) as tell:
+    with common.progress("Simulating") as tell:
         simulation = run(
             trajectory,
             target,
@@ -71,14 +68,14 @@ def simulate(
             rate_hz=rate,
             seed=seed,
             truth=truth,
-            overwrite=overwrite,
+            overwrite=common.overwrite,
             progress=tell,
         )
         for remark in simulation.remarks:
             logger.warning("%s", remark)
     values = {key: value for key, value in simulation.plain().items() if key != "schema"}
     report = SimulationReport(**values | {"motion": MotionQuality(**values["motion"])})
-    if write_json(report, json_to, overwrite=overwrite):
+    if common.write(report):
         return
     acting = [effect["name"] for effect in report.physics["effect"] if not effect["column"]]
     acting += [f"a curve of {curve['variable']}" for curve in report.physics["unknown"]]

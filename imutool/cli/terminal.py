@@ -52,28 +52,29 @@ def plain(text: str) -> str:
     return shown.replace("[", r"\[")
 
 
-def say(line: str) -> None:
-    """Print a line of results; it is never folded."""
-    out.print(plain(line), highlight=False, soft_wrap=True)
+def say(line: str, word: str = "", color: str = "yellow", *, to: Console = out) -> None:
+    """Print a line of results, behind a coloured word if one is given; never folded."""
+    marked = f"[{color}]{word}:[/] " if word else ""
+    to.print(f"{marked}{plain(line)}", highlight=False, soft_wrap=True)
 
 
 def tell_error(message: str) -> None:
     """Print a line that begins with "error:" on stderr, and cut a very long text."""
     if len(message) > LONGEST:
         message = f"{message[: LONGEST // 2]} … {message[-LONGEST // 2 :]}"
-    err.print(f"[bold red]error:[/] {plain(redact(message))}", highlight=False, soft_wrap=True)
+    say(redact(message), "error", "bold red", to=err)
 
 
 def tell_warning(message: str, word: str = "warning") -> None:
     """Print a line that begins with "warning:" or another word on stderr."""
-    err.print(f"[yellow]{word}:[/] {plain(message)}", highlight=False, soft_wrap=True)
+    say(message, word, to=err)
 
 
 def tell_losses(losses: Mapping[str, Any]) -> None:
     """Print a log's losses (`mcap_io.recovery.losses.Losses.plain`), one line a stretch."""
     for line in describe(losses):
         kind, _, rest = with_flags(line).partition(": ")
-        out.print(f"[yellow]{kind}:[/] {plain(rest)}", highlight=False, soft_wrap=True)
+        say(rest, kind)
 
 
 def table(rows: Sequence[Sequence[str]], *, keys: int) -> None:
@@ -143,7 +144,7 @@ class _Lines(logging.Handler):
     """Handler that prints log records on stderr, above the progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        err.print(plain(with_flags(f"{record.levelname.lower()}: {record.getMessage()}")), highlight=False, soft_wrap=True)
+        say(with_flags(f"{record.levelname.lower()}: {record.getMessage()}"), to=err)
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import typer
 
 from imutool import registry
-from imutool.cli.app import MODEL, Imu, Json, Logs, Overwrite, Quiet, Truth, Verbose, app, listing
-from imutool.cli.terminal import epoch_line, progress, say, table, write_json
+from imutool.cli.app import COMMON, MODEL, Common, Imu, Logs, Truth, app, listing
+from imutool.cli.terminal import epoch_line, say, table
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
 
@@ -41,10 +41,7 @@ def train(
     imu: Imu = None,
     truth: Truth = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted training from its checkpoint.")] = False,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method)  # refuse a wrong name before reading any log
@@ -60,7 +57,7 @@ def train(
             logging.getLogger("imutool").warning("left to the neural ODE: %s", ", ".join(left))
     words += [*(set_ or ()), *([f"seed={seed}"] if seed is not None else ())]
     settings = load(settings_of(method), config, [full_name(method, word) for word in words])
-    with forking(), progress("Training", verbose, quiet) as tell:
+    with forking(), common.progress("Training") as tell:
         trained = run(
             logs,
             model,
@@ -70,11 +67,11 @@ def train(
             imu=imu,
             truth=truth,
             resume=resume,
-            overwrite=overwrite,
+            overwrite=common.overwrite,
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
-    if not write_json(training_report(model, trained.card), json_to, overwrite=overwrite or resume):
-        if "left_out" in trained.card and not quiet:
+    if not common.write(training_report(model, trained.card), replace=resume):
+        if "left_out" in trained.card and not common.quiet:
             with redirect_stdout(sys.stderr):  # how the model was chosen is no result
                 left_out_table(trained.card["left_out"])
                 for line in lines_of_choice(trained.card):

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from imutool.cli.app import HTML, Aid, Imu, Init, Json, Logs, Models, Overwrite, Quiet, Smooth, Truth, Verbose, Written, app
-from imutool.cli.terminal import progress, say, write_json
+from imutool.cli.app import COMMON, HTML, Aid, Common, Imu, Init, Logs, Models, Smooth, Truth, Written, app
+from imutool.cli.terminal import say
 from imutool.mcap_io.storage import output_conflicts
 from imutool.report import Report
 from imutool.viewing import Output
@@ -58,10 +58,7 @@ def view(
         Path | None, typer.Option(metavar="DIR", help="Draw pictures, LOG-errors.png and so on; without Rerun."), PICTURES
     ] = None,
     html: Annotated[Path | None, typer.Option(metavar="F.html", help="Write an HTML page, without Rerun."), HTML] = None,
-    overwrite: Overwrite = False,
-    json_to: Json = None,
-    verbose: Verbose = False,
-    quiet: Quiet = False,
+    common: Common = COMMON,
 ) -> None:
     """Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files.
 
@@ -75,16 +72,16 @@ def view(
     aligned = alignment(align)
     read = partial(load, models=model or (), init=init, smooth=smooth, imu=imu, truth=truth, aid=aid)
     read = partial(read, align=aligned, findings=findings)
-    asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, overwrite)
+    asked = RequestedOutputs(save, connect, web, port, export_web, png, html, at, source, common.overwrite)
     with Outputs(asked) as outputs:
-        with progress("Reading", verbose, quiet) as tell:
+        with common.progress("Reading") as tell:
             data = []
             for done, log in enumerate(logs):
                 tell(done, len(logs), log.name)
                 data.append(read(log))
         shown = outputs.show(data)
         report = View([str(log) for log in logs], shown, **outputs.versions())
-        if not write_json(report, json_to, overwrite=overwrite):
+        if not common.write(report):
             for output in shown:
                 say(output.said)
         sys.stdout.flush()  # whoever reads it through a pipe wants the address now

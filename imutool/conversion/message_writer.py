@@ -8,7 +8,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,12 +18,22 @@ from imutool.array_types import Shaped, UInt8
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.errors import DataError, not_installed
 from imutool.file_location import Location
-from imutool.mcap_io.codec import messages, schemas
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 from imutool.mcap_io.codec.reflection import Reflected, reflect
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
-from imutool.mcap_io.write import BODY, CHUNK_BYTES, RECORD, WORLD, Series, chunks, scalar_series, velocity_series
+from imutool.mcap_io.write import (
+    BODY,
+    CHUNK_BYTES,
+    RECORD,
+    WORLD,
+    MessageBuffer,
+    Series,
+    chunks,
+    scalar_series,
+    velocity_series,
+)
 from imutool.recording import nanoseconds
 from imutool.recording.columns import MOST_GAP_S, clock_jumps, jump_warnings
 from imutool.recording.message_log import MessageLog, MessageTopic, Table, named_kind
@@ -40,27 +50,6 @@ ENCAPSULATION = 4  # bytes ahead of a CDR message; alignment counts from behind 
 
 
 _encode_body = partial(encode_imu, frame_id=BODY)
-
-
-@dataclass
-class _Buffer:
-    """Messages that become one chunk."""
-
-    packed: bool
-    parts: list[bytes | memoryview] = field(default_factory=list)
-    channels: list[int] = field(default_factory=list)
-    times: list[int] = field(default_factory=list)
-    offsets: list[int] = field(default_factory=list)
-    size: int = 0
-
-    def pop(self) -> tuple[Chunk, str | None]:
-        """Hand over the messages as a chunk with its compression."""
-        channels, times = np.array(self.channels, np.uint16), np.array(self.times, np.int64)
-        chunk = Chunk(b"".join(self.parts), channels, times, np.array(self.offsets, np.int64))
-        for column in (self.parts, self.channels, self.times, self.offsets):
-            column.clear()
-        self.size = 0
-        return chunk, "none" if self.packed else None
 
 
 def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", overwrite: bool = False) -> None:
@@ -98,8 +87,8 @@ class _Stream:
     def __init__(self, log: LogWriter, source: MessageLog, pairs: SensorPairs) -> None:
         self._log, self._source, self._pairs = log, source, pairs
         self._channels: dict[MessageTopic, int] = {}
-        self._buffers: dict[int, _Buffer] = {}  # by channel
-        self._shared = _Buffer(packed=False), _Buffer(packed=False)  # of sensors, and of all others that are small
+        self._buffers: dict[int, MessageBuffer] = {}  # by channel
+        self._shared = MessageBuffer(packed=False), MessageBuffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
         self._reflected: dict[int, tuple[int, Reflected]] = {}  # channel of the CDR, by that of the original
         self._lacking = Counter[str]()  # messages without a sample, by topic
@@ -127,7 +116,7 @@ class _Stream:
         number = self._channels[topic] = self._log.define(marked)
         name = schemas.canonical(topic.schema_name)
         if name in BULKY:
-            self._buffers[number] = _Buffer(packed=name in PACKED)
+            self._buffers[number] = MessageBuffer(packed=name in PACKED)
         else:
             self._buffers[number] = self._shared[0 if name in SENSORS else 1]
         return number
@@ -158,15 +147,10 @@ class _Stream:
         for name, count in self._lacking.items():
             self._source.remarks.losses.append(f"messages of {name} without a sample: {count}; see {name}/as_recorded")
 
-    def _put(self, number: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> _Buffer:
+    def _put(self, number: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> MessageBuffer:
         buffer = self._buffers[number]
-        sequence = self._sequence[number]
-        self._sequence[number] = sequence + 1
-        buffer.parts += messages.message_head(number, sequence, log_time, publish_time, len(payload)), payload
-        buffer.channels.append(number)
-        buffer.times.append(log_time)
-        buffer.offsets.append(buffer.size)
-        buffer.size += messages.MESSAGE.itemsize + len(payload)
+        buffer.add(number, self._sequence[number], log_time, publish_time, payload)
+        self._sequence[number] += 1
         return buffer
 
     def _put_as_cdr(self, number: int, topic: MessageTopic, log_time: int, publish_time: int, payload: bytes) -> None:

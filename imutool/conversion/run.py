@@ -13,12 +13,13 @@ from pathlib import Path
 from types import ModuleType
 
 from imutool import registry
+from imutool.conversion import Failure
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.unread_formats import ENOUGH, describe_unread
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
-from imutool.file_location import local
+from imutool.file_location import first_bytes, local
 from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
@@ -26,14 +27,6 @@ from imutool.recording.message_log import MessageLog
 AUTO = "auto"
 SUFFIX = ".mcap"
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Failed sequence, with the reason."""
-
-    name: str
-    message: str
 
 
 @dataclass(frozen=True)
@@ -148,7 +141,7 @@ def _find(source: Path, format: str) -> _Sequences:
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
     if not claims:
-        what, fix = ("", "") if source.is_dir() else describe_unread(_start(source))
+        what, fix = ("", "") if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
         raise DataError(
             f"no sequence found: {what}" if what else "no sequence found",
             where=source,
@@ -163,15 +156,6 @@ def _find(source: Path, format: str) -> _Sequences:
         [job for jobs in claims.values() for job in jobs],
         [error for place, error in errors.items() if not claims[place]],
     )
-
-
-def _start(path: Path) -> bytes:
-    """First bytes of a file; none of one that cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(ENOUGH)
-    except OSError:
-        return b""
 
 
 def _converters(format: str) -> list[tuple[str, ModuleType]]:

@@ -206,8 +206,8 @@ class _Asl:
         with (self.root / folder / "data.csv").open("w", encoding="ascii", newline="\n") as file:
             file.write(f"#{','.join(columns)}\n")
             for block in range(0, len(t_ns), BLOCK_ROWS):
-                rows = slice(block, block + BLOCK_ROWS)
-                file.writelines(_rows(t_ns[rows].tolist(), values[rows].tolist()))
+                part = slice(block, block + BLOCK_ROWS)
+                file.writelines(rows(t_ns[part].tolist(), values[part].tolist()))
                 self.tell(min(block + BLOCK_ROWS, len(t_ns)), len(t_ns), folder)
         self.written[f"{folder}/data.csv"] = len(t_ns)
 
@@ -215,7 +215,7 @@ class _Asl:
         (self.root / name).write_text(text, encoding="utf-8", newline="\n")
 
 
-def _rows(stamps: Iterable[int], values: Iterable[Iterable[float]]) -> Iterator[str]:
+def rows(stamps: Iterable[int], values: Iterable[Iterable[float]]) -> Iterator[str]:
     """Lines of a table; `repr` is the shortest text that reads back to the same number."""
     for stamp, row in zip(stamps, values, strict=True):
         yield f"{stamp},{','.join(map(repr, row))}\n"

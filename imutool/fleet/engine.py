@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 import msgspec
 
-from imutool.errors import ConfigError, LogError, not_installed, redact
+from imutool.errors import ConfigError, LogError, redact, required
 from imutool.fleet.one_log import work
 from imutool.fleet.task import Result, Task
 from imutool.processes import system
@@ -286,9 +286,7 @@ def _refuse_silence(address: str) -> None:
 
 
 def _ray() -> Any:
-    try:
-        import ray
-        import ray.exceptions
-    except ImportError as error:
-        raise not_installed("ray", "fleet", user="a cluster") from error
+    required("ray.exceptions", "fleet", user="a cluster")
+    import ray
+
     return ray

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from imutool.cleaning import UntrustedError
-from imutool.errors import ConfigError, ImutoolError, LogError, ModelError
+from imutool.errors import LOST, ConfigError, ImutoolError, LogError, ModelError
 from imutool.file_location import Location, identity, to_location
 from imutool.fleet.sources import partial_files, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
@@ -25,7 +25,6 @@ from imutool.mcap_io.storage.target import Target
 from imutool.processes.system import peak_bytes, user
 from imutool.report import UNSET, Report, UnsetType, json_text, json_values
 
-LOST = 3  # exit code: something of the log was lost
 MOST_LOSSES = 20  # stretches listed for a log; its metadata and its repair list all
 MOST_LETTERS = 300  # of what a page says
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from imutool import __version__
-from imutool.errors import not_installed
+from imutool.errors import required
 from imutool.file_location import Location
 from imutool.fleet.robots import FleetDiagnosis
 from imutool.fleet.task import Result
@@ -58,13 +58,10 @@ def arrow() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise not_installed("pyarrow", "fleet", user="a fleet") from error
-    assert pq.__name__, "pyarrow.parquet is what is used of it"
-    return pa
+    required("pyarrow.parquet", "fleet", user="a fleet")
+    import pyarrow
+
+    return pyarrow
 
 
 def write(results: Iterable[Result], path: Location) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from imutool.errors import ConfigError
+from imutool.errors import LOST, ConfigError
 from imutool.file_location import Location, to_location
 from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
@@ -25,7 +25,6 @@ from imutool.fleet.sources import Found, find, partial_files, remove_files
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
 from imutool.report import UNSET
 
-LOST = 3  # something of a log was lost, or a log was quarantined
 COMPARED = "fleet.json"
 TITLE = b"<title>Fleet "
 MOST_LISTED = 1000  # of the results with a problem, in JSON

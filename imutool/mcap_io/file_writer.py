@@ -160,16 +160,7 @@ class LogWriter:
         if any(channel.topic == topic for channel in self.contents.channels.values()):
             raise DataError(f"two channels would be written to {topic}", expected="one topic each")
         described = {"offered_qos_profiles": QOS, "topic_type_hash": schema.TYPE_HASHES[schema_name]}
-        record = Channel(
-            id=free_id(self.contents.channels, "channel"),
-            topic=topic,
-            message_encoding="cdr",
-            metadata=described | dict(metadata or {}),
-            schema_id=self._schema(schema_name),
-        )
-        self.contents.channels[record.id] = record
-        self.target.write(records.build(record))
-        return record.id
+        return self._channel(topic, "cdr", described | dict(metadata or {}), self._schema(schema_name))
 
     def define(self, topic: MessageTopic) -> int:
         """Defines a topic with the schema and encoding of its source; returns its channel id.
@@ -177,16 +168,14 @@ class LogWriter:
         Raises:
             DataError: no id is left.
         """
-        record = Channel(
-            id=free_id(self.contents.channels, "channel"),
-            topic=topic.name,
-            message_encoding=topic.message_encoding,
-            metadata=_described(topic),
-            schema_id=self._schema_of(topic),
-        )
-        self.contents.channels[record.id] = record
+        return self._channel(topic.name, topic.message_encoding, _described(topic), self._schema_of(topic))
+
+    def _channel(self, topic: str, encoding: str, metadata: dict[str, str], schema_id: int) -> int:
+        number = free_id(self.contents.channels, "channel")
+        record = Channel(id=number, topic=topic, message_encoding=encoding, metadata=metadata, schema_id=schema_id)
+        self.contents.channels[number] = record
         self.target.write(records.build(record))
-        return record.id
+        return number
 
     def _schema_of(self, topic: MessageTopic) -> int:
         """Id of a topic's schema; 0 where the source has none. A type known here may come without its definition."""

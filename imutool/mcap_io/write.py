@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -157,37 +158,51 @@ def chunks(group: Sequence[Series]) -> Iterator[Chunk]:
         yield Chunk(data.tobytes(), channels, times[first:last], offsets)
 
 
+@dataclass
+class MessageBuffer:
+    """Messages that become one chunk."""
+
+    packed: bool  # already: compressing them again costs time and saves nothing
+    parts: list[bytes | memoryview] = field(default_factory=list)
+    channels: list[int] = field(default_factory=list)
+    times: list[int] = field(default_factory=list)
+    offsets: list[int] = field(default_factory=list)
+    size: int = 0
+
+    def add(self, channel: int, sequence: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> None:
+        """Take in a message."""
+        self.parts += messages.message_head(channel, sequence, log_time, publish_time, len(payload)), payload
+        self.channels.append(channel)
+        self.times.append(log_time)
+        self.offsets.append(self.size)
+        self.size += messages.MESSAGE.itemsize + len(payload)
+
+    def pop(self) -> tuple[Chunk, str | None]:
+        """Hand over the messages as a chunk with its compression."""
+        channels, times = np.array(self.channels, np.uint16), np.array(self.times, np.int64)
+        chunk = Chunk(b"".join(self.parts), channels, times, np.array(self.offsets, np.int64))
+        for column in (self.parts, self.channels, self.times, self.offsets):
+            column.clear()
+        self.size = 0
+        return chunk, "none" if self.packed else None
+
+
 def _images(log: LogWriter, topic: str, frames: Frames) -> Iterator[tuple[Chunk, str | None]]:
     """The chunks of one camera; images are fetched when their chunk is due."""
-    channel = log.channel(topic, schemas.IMAGE)
-    packing = "none" if frames.format.lower() in PACKED_IMAGES else None
-    return ((chunk, packing) for chunk in _image_chunks(channel, topic, frames))
+    channel, buffer = log.channel(topic, schemas.IMAGE), MessageBuffer(frames.format.lower() in PACKED_IMAGES)
+    return _image_chunks(channel, buffer, topic, frames)
 
 
-def _image_chunks(channel: int, topic: str, frames: Frames) -> Iterator[Chunk]:
+def _image_chunks(channel: int, buffer: MessageBuffer, topic: str, frames: Frames) -> Iterator[tuple[Chunk, str | None]]:
     frame_id = topic.strip("/").split("/")[0]
-    parts: list[bytes] = []
-    times: list[int] = []
-    offsets: list[int] = []
-    size = 0
     for sequence, (t_ns, image) in enumerate(frames.each()):
         if t_ns < 0:
             raise DataError(f"an image of {topic} has the time {t_ns} ns", expected="no time before 1970")
-        payload = encode_image(t_ns, image, frame_id, frames.format)
-        parts.append(messages.message_record(channel, sequence, t_ns, payload))
-        times.append(t_ns)
-        offsets.append(size)
-        size += len(parts[-1])
-        if size >= CHUNK_BYTES:
-            yield _chunk_of(channel, parts, times, offsets)
-            parts, times, offsets, size = [], [], [], 0
-    if parts:
-        yield _chunk_of(channel, parts, times, offsets)
-
-
-def _chunk_of(channel: int, parts: list[bytes], times: list[int], offsets: list[int]) -> Chunk:
-    channels = np.full(len(parts), channel, np.uint16)
-    return Chunk(b"".join(parts), channels, np.array(times, np.int64), np.array(offsets, np.int64))
+        buffer.add(channel, sequence, t_ns, t_ns, encode_image(t_ns, image, frame_id, frames.format))
+        if buffer.size >= CHUNK_BYTES:
+            yield buffer.pop()
+    if buffer.parts:
+        yield buffer.pop()
 
 
 def own_and_user_metadata(

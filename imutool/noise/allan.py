@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Bool, Float64
-from imutool.errors import not_installed
+from imutool.errors import required
 from imutool.units import Sensor
 
 LONGEST = 4  # averaging times up to the stretch over this: beyond, a single disagreement decides
@@ -79,11 +79,7 @@ def library() -> ModuleType:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import allantools
-    except ImportError as error:
-        raise not_installed("allantools", "noise", where="noise", user="an Allan deviation") from error
-    module: ModuleType = allantools
+    module: ModuleType = required("allantools", "noise", where="noise", user="an Allan deviation")
     return module
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool import config
 from imutool.array_types import Float64, Int64
-from imutool.errors import NumericsError, not_installed
+from imutool.errors import NumericsError, required
 from imutool.inertial.strapdown import StartPose
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, seconds
 from imutool.vio.camera import EUROC, Frame
@@ -74,11 +74,7 @@ def load() -> Any:
     Raises:
         ConfigError: it is not.
     """
-    try:
-        import gtsam
-    except ImportError as error:
-        raise not_installed("GTSAM", "vio", where="imutool vio") from error
-    return gtsam
+    return required("gtsam", "vio", package="GTSAM", where="imutool vio")
 
 
 def estimate(

@@ -6,7 +6,7 @@ FETCH.
 
 `python tests/bench/clean.py [--minutes 10 60]` measures the cost.
 
-For each length: CPU seconds of `imutool.cleaning.survey`, beside a pass that only reads and decodes the same IMU messages, and
+For each length: CPU seconds of `imutool.cleaning.look`, beside a pass that only reads and decodes the same IMU messages, and
 beside `imutool.log_info.inspection.inspect`, which holds the columns; each in a process of its own, with the memory it takes
 at most beyond what the imports take. The log is in the page cache. Poses stand beside the IMU at 20 Hz.
 """
@@ -24,7 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
-from imutool.cleaning import survey
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from imu_defects import survey
+
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
@@ -35,7 +38,8 @@ PIECE_S = 60.0  # of motion, again and again
 PASS = """
 import json, re, sys, time
 from pathlib import Path
-from imutool import clean, info
+from imutool.cleaning import look, raw_batches
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 import scipy.spatial.transform, imutool.cleaning.rules.axes
 
@@ -44,10 +48,14 @@ def peak_mb():  # not ru_maxrss, which a process takes over from the one that st
 
 def read(path):
     with Log(path) as log:
-        for batch in clean.raw_batches(log, "/imu0"):
+        for batch in raw_batches(log, "/imu0"):
             batch.gyro.sum()
 
-run = {"read": read, "survey": clean.survey, "info": info.inspect}[sys.argv[1]]
+def survey(path):
+    with Log(path) as log:
+        look(log, "/imu0")
+
+run = {"read": read, "survey": survey, "info": inspect}[sys.argv[1]]
 before, began = peak_mb(), time.process_time()
 run(Path(sys.argv[2]))
 print(json.dumps({"cpu_s": time.process_time() - began, "more_mb": peak_mb() - before}))

@@ -14,9 +14,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from imu_defects import late, messages, repeated, with_values, without
+from imu_defects import late, messages, repeated, survey, with_values, without
 
-from imutool.cleaning import survey
 from imutool.cleaning.survey import examine
 from imutool.cleaning.truth import read_truth
 from imutool.mcap_io.codec.decode import ImuBatch

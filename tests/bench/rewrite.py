@@ -35,7 +35,7 @@ from mcap.writer import CompressionType, Writer
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
-from imutool.mcap_io.codec.messages import message_record, message_rows
+from imutool.mcap_io.codec.messages import message_head, message_rows
 from imutool.mcap_io.codec.records import crc32
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
@@ -125,7 +125,8 @@ def write_apart(path: Path, gb: float, packing: str, *, data_crc: bool) -> None:
             times = START_NS + PERIOD_NS * IMU_PER_IMAGE * np.arange(k, k + pairs).repeat(2)
             data = [blob for j in range(k, k + pairs) for blob in (packed[j % KEPT], plain[j % KEPT])]
             parts = [
-                message_record(camera, k + j // 2, int(t), blob) for j, (t, blob) in enumerate(zip(times, data, strict=True))
+                message_head(camera, k + j // 2, int(t), int(t), len(blob)) + blob
+                for j, (t, blob) in enumerate(zip(times, data, strict=True))
             ]
             offsets = np.cumsum([0, *map(len, parts[:-1])])
             log.chunk(Chunk(b"".join(parts), np.full(len(parts), camera, np.uint16), times, offsets))

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
+from support.small_tensors import one_thread  # noqa: F401  (a fixture)
 
 from imutool import registry
 from imutool.bias.networks.network import BiasNetwork, Segment
 
 RATE_HZ = 200.0
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Tensors here are small: threads that wait for one another would cost more than they bring."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def _build(method: str, seed: int = 0, **settings: object) -> BiasNetwork:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.imu_defects import messages, repeated, with_values, without, write_log
+from support.imu_defects import messages, repeated, survey, with_values, without, write_log
 
-from imutool.cleaning import CleaningSettings, survey
+from imutool.cleaning import CleaningSettings
 from imutool.cleaning.survey import raw_batches
 from imutool.debiasing import debias
 from imutool.errors import LogError

@@ -31,20 +31,6 @@ COMMANDS = [
 ]
 
 
-@pytest.fixture
-def code(monkeypatch: pytest.MonkeyPatch) -> Code:
-    """Runs a command line in this process and returns its exit code."""
-    monkeypatch.setenv("COLUMNS", "80")
-
-    def run(*words: str | Path) -> int:
-        monkeypatch.setattr(sys, "argv", ["imutool", *map(str, words)])
-        with pytest.raises(SystemExit) as leaving:
-            cli.main()
-        return int(leaving.value.code or 0)
-
-    return run
-
-
 # ── codes ──
 
 

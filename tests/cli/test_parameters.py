@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from support.loaded import loaded_by_command
 
 from imutool import cli
 from imutool.cli import overview
@@ -56,34 +57,23 @@ def test_a_wrong_option_is_told_with_what_serves_its_purpose(tmp_path: Path, imu
 
 
 def test_help_and_a_command_import_what_they_need() -> None:
-    seen = "import sys; sys.argv = ['imutool', WORDS]; from imutool.cli import main\ntry: main()\nexcept SystemExit: pass\n"
-    seen += "print(sorted({'numpy', 'typer', 'scipy', 'pydantic', 'imutool.cli.train', 'rich.progress'} & set(sys.modules)))"
-    for words, modules in (("'--help'", []), ("'debias', 'missing.mcap', 'out.mcap', '-q'", ["numpy", "typer"])):
-        done = subprocess.run([sys.executable, "-c", seen.replace("WORDS", words)], capture_output=True, text=True, check=True)
-        assert done.stdout.splitlines()[-1] == str(modules)
+    seen = {"numpy", "typer", "scipy", "pydantic", "imutool.cli.train", "rich.progress"}
+    assert loaded_by_command(["--help"], seen) == []
+    assert loaded_by_command(["debias", "missing.mcap", "out.mcap", "-q"], seen) == ["numpy", "typer"]
 
 
 def test_debias_of_a_log_with_poses_does_without_what_takes_long_to_import(tmp_path: Path) -> None:
     write(flight(2, duration_s=20.0), tmp_path / "flight.mcap")
-    words = ["imutool", "debias", str(tmp_path / "flight.mcap"), str(tmp_path / "out.mcap"), "-q", "--force"]
-    seen = f"import sys; sys.argv = {[*words, '--model', 'euroc-adis16448-linear']}; from imutool.cli import main\n"
-    slow = {"scipy", "torch", "jaxtyping", "asyncio", "importlib.metadata", "numpy.ma"}
-    seen += f"try: main()\nexcept SystemExit: pass\nprint(sorted({slow} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, check=True)
+    words = ["debias", tmp_path / "flight.mcap", tmp_path / "out.mcap", "-q", "--force", "--model", "euroc-adis16448-linear"]
+    assert loaded_by_command(words, {"scipy", "torch", "jaxtyping", "asyncio", "importlib.metadata", "numpy.ma"}) == []
     assert (tmp_path / "out.mcap").exists()
-    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_repair_and_clean_do_without_scipy(tmp_path: Path) -> None:
     write(flight(2, duration_s=20.0), tmp_path / "flight.mcap")
     for word in ("repair", "clean"):
-        words = ["imutool", word, str(tmp_path / "flight.mcap"), str(tmp_path / f"{word}.mcap")]
-        seen = f"import sys; sys.argv = {words}; from imutool.cli import main\ntry: main()\nexcept SystemExit: pass\n"
-        done = subprocess.run(
-            [sys.executable, "-c", f"{seen}print('scipy' in sys.modules)"], capture_output=True, text=True, check=True
-        )
+        assert loaded_by_command([word, tmp_path / "flight.mcap", tmp_path / f"{word}.mcap"], {"scipy"}) == []
         assert (tmp_path / f"{word}.mcap").exists()
-        assert done.stdout.splitlines()[-1] == "False"
 
 
 def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import types
 import zipfile
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import pool_functions
+from support.loaded import loaded
 from support.processes import below
 
 import imutool as imutool_api
@@ -269,12 +269,8 @@ def test_what_two_converters_claim_must_be_decided(source, tmp_path, monkeypatch
 
 
 def test_converting_needs_no_torch():
-    import subprocess
-
-    heavy = "('torch', 'rosbags', 'rerun', 'matplotlib')"
-    code = f"import imutool.conversion.run, imutool.log_info.inspection, sys; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    code = "import imutool.conversion.run, imutool.log_info.inspection"
+    assert loaded(code, {"torch", "rosbags", "rerun", "matplotlib"}) == []
 
 
 @pytest.mark.parametrize(

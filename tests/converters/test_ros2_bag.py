@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imutool.converters._msg_files import definition_from_files
+from imutool.converters._ros_types import definition_from_files
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE.register(get_types_from_msg("float64 load\nstring[] names\n", "my_robot/msg/Load"))
@@ -125,6 +125,16 @@ def test_a_cut_bag_is_refused_in_one_sentence(convert, tmp_path, storage, suffix
     assert "cannot be read as a ROS 2 bag" in done.stderr
     assert ("each .mcap with imutool repair" in done.stderr) == (suffix == "mcap")
     assert not (tmp_path / "a.mcap").exists()
+
+
+def test_metadata_of_another_type_is_refused_in_one_sentence(convert, tmp_path):
+    bag = write_bag(tmp_path / "walk", StoragePlugin.SQLITE3)
+    text = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(text.replace("nanoseconds: ", "nanoseconds: about ", 1))
+    done = convert(bag, tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "cannot be read as a ROS 2 bag" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def change(bag: Path, statement: str) -> None:

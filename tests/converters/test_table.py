@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.tables import write_csv
 
 from imutool.converters import table
 from imutool.mcap_io.read import read
@@ -23,12 +24,6 @@ GYRO = RNG.normal(0, 0.003, (COUNT, 3))
 ACCEL = RNG.normal(0, 0.02, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
 G = 9.80665
 CERTAIN = ["timestamp [ns]", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"accel_{a} [m/s^2]" for a in "xyz")]
-
-
-def write_csv(path: Path, names: list[str], columns: list[np.ndarray], mark: str = ",") -> Path:
-    rows = [mark.join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True)]
-    path.write_text("\n".join([mark.join(names), *rows]) + "\n")
-    return path
 
 
 def arrays(gyro: np.ndarray = GYRO, accel: np.ndarray = ACCEL, t: np.ndarray = T_NS) -> list[np.ndarray]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import h5py
 import numpy as np
 import pytest
+from support.tables import write_csv
 
 from imutool.converters import table
 from imutool.converters._table_dates import calendar_times
@@ -27,17 +26,11 @@ SIX = [*((f"gyr_{a}", "rad/s") for a in "xyz"), *((f"acc_{a}", "m/s^2") for a in
 IMU_NAMES = [*(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"accel_{a} [m/s^2]" for a in "xyz")]
 
 
-def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
-    rows = (",".join(map(repr, row)) for row in zip(*(column.tolist() for column in columns), strict=True))
-    path.write_text("\n".join([",".join(names), *rows]) + "\n")
-    return path
-
-
 @pytest.mark.parametrize(("counts", "step"), [("100 us", 50), ("us", 5_000)])
 def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds_or_microseconds(tmp_path, counts, step):
     names = ["PacketCounter", "SampleTimeFine", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
     columns = [np.arange(COUNT), 12_345 + step * np.arange(COUNT), *ACCEL.T, *GYRO.T]
-    log = table.read_sequence(table.sequences(written(tmp_path / "xsens.csv", names, columns))[0])
+    log = table.read_sequence(table.sequences(write_csv(tmp_path / "xsens.csv", names, columns))[0])
     assert np.array_equal(np.diff(log.imus["/imu0"].t_ns), np.full(COUNT - 1, 5_000_000))
     assert f"'SampleTimeFine' counts {counts}, as an Xsens sensor does" in log.remarks.notes
 
@@ -46,7 +39,7 @@ def test_the_counter_of_an_xsens_counts_tenths_of_milliseconds_or_microseconds(t
 def test_millidegrees_and_axes_behind_a_capital_are_known(tmp_path, time):
     names = [time, *(f"UncompAccel_{k}" for k in range(3)), *(f"UncompGyro_{k} [mdps]" for k in range(3))]
     columns = [T_NS - START_NS + 5_000_000_000, *ACCEL.T, *np.rad2deg(GYRO * 1e3).T]
-    imu = table.read_sequence(table.sequences(written(tmp_path / "vn.csv", names, columns))[0]).imus["/imu0"]
+    imu = table.read_sequence(table.sequences(write_csv(tmp_path / "vn.csv", names, columns))[0]).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, GYRO, rtol=1e-12)
     np.testing.assert_allclose(imu.accel, ACCEL, rtol=1e-12)
 
@@ -57,7 +50,7 @@ def test_the_stamp_of_a_message_counts_before_the_time_of_its_arrival(tmp_path, 
     names = ["%time", "field.header.seq", "field.header.stamp"]
     names += [*(f"field.angular_velocity.{a}" for a in "xyz"), *(f"field.linear_acceleration.{a}" for a in "xyz")]
     columns = [late_ns, np.arange(COUNT), T_NS if stamp == "set" else 0 * T_NS, *GYRO.T, *ACCEL.T]
-    imu = table.read_sequence(table.sequences(written(tmp_path / "echo.csv", names, columns))[0]).imus["/imu0"]
+    imu = table.read_sequence(table.sequences(write_csv(tmp_path / "echo.csv", names, columns))[0]).imus["/imu0"]
     assert np.array_equal(imu.t_ns, T_NS if stamp == "set" else late_ns)
 
 
@@ -67,16 +60,16 @@ TWO_COLUMNS = [("sec", "nanosec"), ("header.stamp.secs", "header.stamp.nsecs"), 
 @pytest.mark.parametrize("names", TWO_COLUMNS)
 def test_a_stamp_in_two_columns_is_one_time(tmp_path, names):
     columns = [T_NS + 900_000_000, T_NS // 10**9, T_NS % 10**9, *GYRO.T, *ACCEL.T]
-    path = written(tmp_path / "two.csv", ["time", *names, *IMU_NAMES], columns)
+    path = write_csv(tmp_path / "two.csv", ["time", *names, *IMU_NAMES], columns)
     log = table.read_sequence(table.sequences(path)[0], mapping=None)
     expected = T_NS if names[0].startswith("header") else T_NS + 900_000_000  # else the first time counts
     assert np.array_equal(log.imus["/imu0"].t_ns, expected)
-    bare = table.read_sequence(table.sequences(written(path, [*names, *IMU_NAMES], columns[1:]))[0])
+    bare = table.read_sequence(table.sequences(write_csv(path, [*names, *IMU_NAMES], columns[1:]))[0])
     assert np.array_equal(bare.imus["/imu0"].t_ns, T_NS)
 
 
 def test_nanoseconds_without_their_second_are_no_time(tmp_path):
-    path = written(tmp_path / "half.csv", ["nanosec", *IMU_NAMES], [T_NS % 10**9, *GYRO.T, *ACCEL.T])
+    path = write_csv(tmp_path / "half.csv", ["nanosec", *IMU_NAMES], [T_NS % 10**9, *GYRO.T, *ACCEL.T])
     with pytest.raises(ConfigError, match="no column that rises looks like a time"):
         table.read_sequence(table.sequences(path)[0])
 
@@ -92,7 +85,7 @@ POSES = {
 def test_poses_on_the_time_of_the_imu_are_poses(tmp_path, names):
     columns, kind = POSES[names]
     angles = ["orientation_x", "orientation_y", "orientation_z"] if names == "angles beside" else []
-    path = written(
+    path = write_csv(
         tmp_path / "sim.csv",
         ["t_ns", *IMU_NAMES, *columns, *angles, "voltage"],
         [T_NS, *GYRO.T, *ACCEL.T, *P.T, *Q_WXYZ.T, *[P[:, 0]] * len(angles), P[:, 0]],
@@ -117,7 +110,7 @@ def test_an_array_of_quaternions_is_poses_by_the_order_in_its_name(tmp_path):
 
 
 def test_an_orientation_alone_stays_numbers(tmp_path):
-    path = written(
+    path = write_csv(
         tmp_path / "ahrs.csv", ["t_ns", *IMU_NAMES, *(f"q{a}" for a in "wxyz")], [T_NS, *GYRO.T, *ACCEL.T, *Q_WXYZ.T]
     )
     log = table.read_sequence(table.sequences(path)[0])
@@ -148,7 +141,7 @@ def test_axes_below_a_sensor_are_of_it_and_orientations_of_a_motion_capture_are_
 
 def test_a_motion_capture_without_any_pose_is_no_truth(tmp_path):
     names = ["t_ns", *IMU_NAMES, *(f"vicon_orientation_{a}" for a in "wxyz")]
-    path = written(tmp_path / "rest.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *np.zeros((4, COUNT))])
+    path = write_csv(tmp_path / "rest.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *np.zeros((4, COUNT))])
     log = table.read_sequence(table.sequences(path)[0])
     assert log.poses == {}
     assert f"/ground_truth/pose: {COUNT} samples that are not finite are left out" in log.remarks.notes
@@ -255,7 +248,7 @@ def test_gravity_in_hundredths_is_asked_about_where_two_units_fit():
 def test_times_before_the_start_are_moved(tmp_path):
     t_s = np.arange(COUNT) / 200.0 - 1.25  # before a launch
     log = table.read_sequence(
-        table.sequences(written(tmp_path / "log.csv", ["time [s]", *IMU_NAMES], [t_s, *GYRO.T, *ACCEL.T]))[0]
+        table.sequences(write_csv(tmp_path / "log.csv", ["time [s]", *IMU_NAMES], [t_s, *GYRO.T, *ACCEL.T]))[0]
     )
     assert log.imus["/imu0"].t_ns[[0, -1]].tolist() == [750_000_000, 2_745_000_000]
     assert any("2 s later in the log" in note for note in log.remarks.notes)
@@ -278,7 +271,7 @@ def test_several_imus_of_one_table_are_several_imus_of_one_log(tmp_path, written
     right = GYRO[::-1][:length], ACCEL[::-1][:length]
     if written_by == "one clock":
         names = ["t_ns", *(f"{of}_{s} [{u}]" for of in ("left", "right") for s, u in SIX)]
-        path = written(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *right[0].T, *right[1].T])
+        path = write_csv(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *right[0].T, *right[1].T])
     else:
         path = tmp_path / "gait.h5"
         with h5py.File(path, "w") as file:
@@ -304,7 +297,7 @@ def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
     named = [
         form.format(s=s, a=a, n=n) + f" [{u}]" for n in (1, 2) for s, u in (("gyr", "rad/s"), ("acc", "m/s^2")) for a in "xyz"
     ]
-    path = written(tmp_path / "two.csv", ["t_ns", *named], [T_NS, *GYRO.T, *ACCEL.T, *GYRO[::-1].T, *ACCEL[::-1].T])
+    path = write_csv(tmp_path / "two.csv", ["t_ns", *named], [T_NS, *GYRO.T, *ACCEL.T, *GYRO[::-1].T, *ACCEL[::-1].T])
     imus = table.read_sequence(table.sequences(path)[0]).imus
     assert [*imus] == ["/imu1/imu", "/imu2/imu"]
     np.testing.assert_allclose(imus["/imu1/imu"].accel, ACCEL)
@@ -313,7 +306,7 @@ def test_imus_that_are_numbered_are_several_imus_of_one_log(tmp_path, form):
 
 def test_an_acceleration_without_a_number_does_not_stand_for_one_with_them(tmp_path):
     names = ["t_ns", *(f"accel_{a} [m/s^2]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz"), *IMU_NAMES[:3]]
-    path = written(tmp_path / "phone.csv", names, [T_NS, *(np.nan * ACCEL).T, *ACCEL.T, *GYRO.T])
+    path = write_csv(tmp_path / "phone.csv", names, [T_NS, *(np.nan * ACCEL).T, *ACCEL.T, *GYRO.T])
     np.testing.assert_allclose(table.read_sequence(table.sequences(path)[0]).imus["/imu0"].accel, ACCEL)
 
 
@@ -324,7 +317,7 @@ def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path
         *(f"{without}_{a} [m/s^2]" for a in "xyz"),
         *(f"{s}_{a} [{u}]" for s, u in (("acc", "m/s^2"), ("gyr", "rad/s")) for a in "xyz"),
     ]
-    path = written(tmp_path / "phone.csv", names, [T_NS, *(ACCEL - [0.0, 0.0, 9.81]).T, *ACCEL.T, *GYRO.T])
+    path = write_csv(tmp_path / "phone.csv", names, [T_NS, *(ACCEL - [0.0, 0.0, 9.81]).T, *ACCEL.T, *GYRO.T])
     log = table.read_sequence(table.sequences(path)[0])
     np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
     assert any("acc_x [m/s^2]/y/z is the one with gravity" in note for note in log.remarks.notes)
@@ -339,7 +332,7 @@ def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_re
     ]  # fmt: skip
     user = ACCEL - [0.0, 0.0, 9.81]
     columns = [T_NS, s, *(-ACCEL / 9.80665).T, s + late_s, *GYRO.T, *(GYRO + 1.0).T, *(-user / 9.80665).T]
-    log = table.read_sequence(table.sequences(written(tmp_path / "sensorlog.csv", names, columns))[0])
+    log = table.read_sequence(table.sequences(write_csv(tmp_path / "sensorlog.csv", names, columns))[0])
     imu = log.imus["/imu0"]
     np.testing.assert_allclose(imu.gyro[0], GYRO[0])
     assert imu.t_ns[0] == 98_765_001_000_000
@@ -349,7 +342,7 @@ def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_re
 
 def test_one_map_holds_for_several_imus_whose_unit_is_open(tmp_path):
     names = ["t_ns", *(f"{of}_{s}" for of in ("left", "right") for s, _ in SIX)]
-    path = written(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *(2.0 * GYRO).T, *ACCEL.T])
+    path = write_csv(tmp_path / "gait.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *(2.0 * GYRO).T, *ACCEL.T])
     with pytest.raises(ConfigError, match="state no unit of the gyro") as refused:
         table.read_sequence(table.sequences(path)[0])
     proposed = refused.value.fix.split("\n\n", 1)[1]
@@ -361,7 +354,7 @@ def test_one_map_holds_for_several_imus_whose_unit_is_open(tmp_path):
 
 
 def test_a_map_without_columns_needs_names_that_show_several_imus(tmp_path):
-    path = written(tmp_path / "one.csv", ["t_ns", *IMU_NAMES], [T_NS, *GYRO.T, *ACCEL.T])
+    path = write_csv(tmp_path / "one.csv", ["t_ns", *IMU_NAMES], [T_NS, *GYRO.T, *ACCEL.T])
     (tmp_path / "map.toml").write_text('time = "t_ns"\ntime_unit = "ns"\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n')
     with pytest.raises(ConfigError, match="do not show several IMUs"):
         table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml")
@@ -379,7 +372,7 @@ def test_a_map_without_columns_needs_names_that_show_several_imus(tmp_path):
 def test_a_stated_unit_that_no_sensor_reaches_is_doubted(tmp_path, gyro_unit, accel_unit, doubts):
     turning = 90.0 * np.sin(np.arange(COUNT) / 20.0)[:, None] * [1.0, 0.5, 0.2]
     names = ["t_s", *(f"gyro_{a} [{gyro_unit}]" for a in "xyz"), *(f"acc_{a} [{accel_unit}]" for a in "xyz")]
-    path = written(tmp_path / "phone.csv", names, [np.arange(COUNT) / 100.0, *turning.T, *(ACCEL / 9.80665).T])
+    path = write_csv(tmp_path / "phone.csv", names, [np.arange(COUNT) / 100.0, *turning.T, *(ACCEL / 9.80665).T])
     notes = table.read_sequence(table.sequences(path)[0]).remarks.notes
     doubted = [note for note in notes if "is the unit right" in note]
     assert len(doubted) == len(doubts)
@@ -388,14 +381,14 @@ def test_a_stated_unit_that_no_sensor_reaches_is_doubted(tmp_path, gyro_unit, ac
 
 def test_axes_in_different_units_are_not_taken_for_one_unit(tmp_path):
     names = ["t_s", "gyro_x [rad/s]", "gyro_y [rad/s]", "gyro_z [deg/s]", *(f"acc_{a} [m/s^2]" for a in "xyz")]
-    path = written(tmp_path / "mixed.csv", names, [np.arange(COUNT) / 100.0, *GYRO.T, *ACCEL.T])
+    path = write_csv(tmp_path / "mixed.csv", names, [np.arange(COUNT) / 100.0, *GYRO.T, *ACCEL.T])
     with pytest.raises(ConfigError, match=r"gyro_z \[deg/s\] state different units"):
         table.read_sequence(table.sequences(path)[0])
 
 
 def test_a_time_that_a_program_has_rounded_is_named(tmp_path):
     names = ["timestamp", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
-    path = written(tmp_path / "excel.csv", names, [np.repeat([1.7e12, 1.70001e12], COUNT // 2), *GYRO.T, *ACCEL.T])
+    path = write_csv(tmp_path / "excel.csv", names, [np.repeat([1.7e12, 1.70001e12], COUNT // 2), *GYRO.T, *ACCEL.T])
     with pytest.raises(ConfigError, match=f"'timestamp' is named as a time and does not rise: 2 different values in {COUNT}"):
         table.read_sequence(table.sequences(path)[0])
 
@@ -426,7 +419,7 @@ def test_what_ros_echoes_of_an_imu_is_one(tmp_path):
 @pytest.mark.parametrize("first", ["gyro", "accel"])
 def test_a_time_and_six_axes_without_a_header_are_an_imu_by_its_gravity(tmp_path, first):
     sides = [GYRO, ACCEL] if first == "gyro" else [ACCEL, GYRO]
-    path = written(tmp_path / "raw.csv", [], [T_NS, *sides[0].T, *sides[1].T])
+    path = write_csv(tmp_path / "raw.csv", [], [T_NS, *sides[0].T, *sides[1].T])
     with pytest.raises(ConfigError, match="no unit of the gyro") as asked:  # which at rest nothing shows
         table.read_sequence(table.sequences(path)[0])
     assert 'accel = ["accel_x", "accel_y", "accel_z"]\naccel_unit = "m/s^2"' in str(asked.value)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
+from support.tables import write_csv
 
 from imutool.converters import table
 from imutool.errors import ConfigError
@@ -30,12 +31,6 @@ NEXT_NS = round(1e9 / RATE_HZ)
 
 def read(path: Path, mapping: Path | None = None) -> Any:
     return table.read_sequence(table.sequences(path)[0], mapping=mapping)
-
-
-def written(path: Path, above: str, names: list[str], columns: list[np.ndarray]) -> Path:
-    rows = (",".join(map(repr, row)) for row in zip(*(column.tolist() for column in columns), strict=True))
-    path.write_text(above + "\n".join([",".join(names), *rows]) + "\n")
-    return path
 
 
 @pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms", "Fs_imu", "gyro_rate_hz"])
@@ -78,7 +73,7 @@ def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the
     names = ["PacketCounter", *(f"Acc_{a}" for a in "XYZ"), *(f"Gyr_{a} [rad/s]" for a in "XYZ")]
     received = np.delete(np.arange(COUNT), slice(2000, 2010))
     columns = [(65_000 + received) % 65_536, *ACCEL[received].T, *GYRO[received].T]
-    path = written(tmp_path / "mtw.txt", "// Start Time: Unknown\n// Update Rate: 250.0Hz\n", names, columns)
+    path = write_csv(tmp_path / "mtw.txt", names, columns, above="// Start Time: Unknown\n// Update Rate: 250.0Hz\n")
     log = read(path)
     assert np.array_equal(log.imus["/imu0"].t_ns, NEXT_NS * received)
     assert log.scalars == {}
@@ -86,7 +81,7 @@ def test_a_counter_that_begins_again_tells_missing_samples_at_the_rate_above_the
 
 def test_a_counter_is_no_time_and_the_map_that_is_proposed_asks_for_the_rate(tmp_path):
     names = ["sample", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
-    path = written(tmp_path / "count.csv", "", names, [np.arange(COUNT), *ACCEL.T, *GYRO.T])
+    path = write_csv(tmp_path / "count.csv", names, [np.arange(COUNT), *ACCEL.T, *GYRO.T])
     with pytest.raises(ConfigError, match="'sample' counts the samples, and no number in the file is named") as refused:
         read(path)
     proposed = refused.value.fix.split("\n\n", 1)[1]
@@ -97,7 +92,7 @@ def test_a_counter_is_no_time_and_the_map_that_is_proposed_asks_for_the_rate(tmp
 
 def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
     names = [*(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
-    path = written(tmp_path / "bare.csv", "", names, [*ACCEL.T, *GYRO.T])
+    path = write_csv(tmp_path / "bare.csv", names, [*ACCEL.T, *GYRO.T])
     with pytest.raises(ConfigError, match="no column that rises looks like a time") as refused:
         read(path)
     assert "# without a column of times: rate_hz = 100.0" in refused.value.fix
@@ -110,7 +105,7 @@ def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
 @pytest.mark.parametrize("wrong", ['time_unit = "s"\n', "rate_hz = -5\n", 'rate_hz = 100\ntime = "t"\ntime_unit = "s"\n'])
 def test_a_map_has_a_time_or_a_positive_rate(tmp_path, wrong):
     names = ["t", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a}" for a in "xyz")]
-    path = written(tmp_path / "bare.csv", "", names, [T_S, *ACCEL.T, *GYRO.T])
+    path = write_csv(tmp_path / "bare.csv", names, [T_S, *ACCEL.T, *GYRO.T])
     columns = (
         'gyro = ["gyr_x", "gyr_y", "gyr_z"]\ngyro_unit = "rad/s"\naccel = ["acc_x", "acc_y", "acc_z"]\naccel_unit = "m/s^2"\n'
     )

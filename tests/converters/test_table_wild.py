@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.converters._table_labels import as_table
-from imutool.converters._table_registers import raw_counts, unit_by_steps
+from imutool.converters._table_headerless import as_table
+from imutool.converters._table_units import raw_counts, unit_by_steps
 from imutool.errors import ConfigError
 
 COUNT = 300
@@ -18,12 +19,6 @@ T_S = np.arange(COUNT) * 0.01
 COUNTS = np.round(RNG.normal(0.0, 12.0, (COUNT, 3)))  # of a gyro at rest
 ACCEL_G = np.round(RNG.normal(0.0, 0.01, (COUNT, 3)) + np.array([0.1, -0.2, 0.97]), 4)
 NAMES = ["t", *(f"a{a}" for a in "xyz"), *(f"g{a}" for a in "xyz")]
-
-
-def written(path: Path, names: list[str], columns: list[np.ndarray]) -> Path:
-    rows = (",".join(map(repr, row)) for row in zip(*(np.asarray(column).tolist() for column in columns), strict=True))
-    path.write_text("\n".join([",".join(names), *rows]) + "\n")
-    return path
 
 
 def read(path: Path):
@@ -43,7 +38,7 @@ def read(path: Path):
 )
 def test_the_steps_of_a_register_show_the_unit_of_the_gyro(tmp_path, unit, step, places):
     gyro = np.round(COUNTS * step + 0.3 * step, places)
-    log = read(written(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *gyro.T]))
+    log = read(write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *gyro.T]))
     size = {"deg/s": np.pi / 180, "mdeg/s": np.pi / 180e3, "rad/s": 1.0}[unit]
     np.testing.assert_allclose(log.imus["/imu0"].gyro, gyro * size, rtol=1e-9)
     assert any(f" {unit}, as a common sensor does" in note for note in log.remarks.notes)
@@ -60,7 +55,7 @@ def test_other_steps_show_no_unit(grid, spread):
 
 def test_a_stated_unit_against_the_steps_is_asked(tmp_path):
     names = ["time", *(f"angular_velocity_{a}" for a in "xyz"), *(f"linear_acceleration_{a}" for a in "xyz")]
-    path = written(tmp_path / "ros.csv", names, [T_S, *(COUNTS / 16).T, *(9.8 * ACCEL_G).T])
+    path = write_csv(tmp_path / "ros.csv", names, [T_S, *(COUNTS / 16).T, *(9.8 * ACCEL_G).T])
     with pytest.raises(ConfigError, match=r"say rad/s, and the gyro counts in steps of 0.0625 deg/s") as caught:
         read(path)
     assert 'gyro_unit = "rad/s"  # please confirm: rad/s or deg/s or mdeg/s?' in str(caught.value)
@@ -70,7 +65,7 @@ def test_a_stated_unit_against_the_steps_is_asked(tmp_path):
 def test_a_time_since_1970_may_be_slow(tmp_path, start, step_s, unit):
     size = {"s": 1.0, "ms": 1e-3, "ns": 1e-9}[unit]
     t = start + np.arange(COUNT) * round(step_s / size, 9)
-    log = read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T]))
+    log = read(write_csv(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T]))
     assert np.allclose(np.diff(log.imus["/imu0"].t_ns) * 1e-9, step_s, atol=1e-4)
 
 
@@ -83,7 +78,7 @@ def test_a_last_column_that_has_a_name_and_no_values_keeps_the_header(tmp_path):
 
 @pytest.mark.parametrize("step", [1, 0.5])
 def test_a_step_of_a_second_or_of_a_millisecond_is_asked(tmp_path, step):
-    path = written(tmp_path / "imu.csv", ["timestamp", *NAMES[1:]], [np.arange(COUNT) * step, *ACCEL_G.T, *(COUNTS * 0.07).T])
+    path = write_csv(tmp_path / "imu.csv", ["timestamp", *NAMES[1:]], [np.arange(COUNT) * step, *ACCEL_G.T, *(COUNTS * 0.07).T])
     with pytest.raises(ConfigError, match=r"a step of .* fits s and ms"):
         read(path)
 
@@ -91,7 +86,7 @@ def test_a_step_of_a_second_or_of_a_millisecond_is_asked(tmp_path, step):
 def test_several_rows_with_one_stamp_propose_their_rate(tmp_path):
     t = 1.7e9 + np.arange(COUNT) // 10 * 0.1
     with pytest.raises(ConfigError) as caught:
-        read(written(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
+        read(write_csv(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
     assert "# rate_hz = 103.1  # in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
 
 
@@ -117,7 +112,7 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
     ],
 )
 def test_names_of_other_programs(tmp_path, gyro, accel):
-    path = written(tmp_path / "imu.csv", ["time_s", *gyro, *accel], [T_S, *COUNTS.T, *(9.80665 * ACCEL_G).T])
+    path = write_csv(tmp_path / "imu.csv", ["time_s", *gyro, *accel], [T_S, *COUNTS.T, *(9.80665 * ACCEL_G).T])
     (imu,) = read(path).imus.values()
     np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
@@ -126,13 +121,13 @@ def test_names_of_other_programs(tmp_path, gyro, accel):
 def test_forces_are_no_accelerations(tmp_path):
     names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"F{a}" for a in "xyz")]
     with pytest.raises(ConfigError, match="no unit of the accel"):
-        read(written(tmp_path / "force.csv", names, [T_S, *COUNTS.T, *(55.0 * ACCEL_G).T]))
+        read(write_csv(tmp_path / "force.csv", names, [T_S, *COUNTS.T, *(55.0 * ACCEL_G).T]))
 
 
 @pytest.mark.parametrize(("counts", "full"), [(16384, 2), (8192, 4), (4096, 8), (2048, 16)])
 def test_raw_counts_are_asked_with_the_range_that_they_fit(tmp_path, counts, full):
     raw = np.round(ACCEL_G * counts).astype(int)
-    path = written(tmp_path / "raw.csv", NAMES, [T_S, *raw.T, *COUNTS.astype(int).T])
+    path = write_csv(tmp_path / "raw.csv", NAMES, [T_S, *raw.T, *COUNTS.astype(int).T])
     with pytest.raises(ConfigError, match="raw counts of a range of") as caught:
         read(path)
     line = (
@@ -175,8 +170,8 @@ def test_other_rows_name_no_numbers(row):
 def test_a_column_that_rises_is_no_time_unless_it_is_the_first(tmp_path, name):
     columns = [*ACCEL_G.T, *(COUNTS * 0.07).T, 20.0 + T_S]
     with pytest.raises(ConfigError, match="no column that rises looks like a time"):
-        read(written(tmp_path / "imu.csv", [*NAMES[1:], name], columns))
-    imu = read(written(tmp_path / "imu.csv", ["GPST", *NAMES[1:]], [columns[-1], *columns[:-1]])).imus["/imu0"]
+        read(write_csv(tmp_path / "imu.csv", [*NAMES[1:], name], columns))
+    imu = read(write_csv(tmp_path / "imu.csv", ["GPST", *NAMES[1:]], [columns[-1], *columns[:-1]])).imus["/imu0"]
     assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
 
 
@@ -202,13 +197,14 @@ def test_a_wider_table_without_header_gets_a_guess_to_confirm(tmp_path):
 
 def test_axes_in_letters_come_before_numbered_columns_of_the_same_word(tmp_path):
     names = ["t_ms", *NAMES[1:], "a0", "a1", "a2"]
-    path = written(tmp_path / "audio.csv", names, [1e3 * T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *RNG.normal(600, 9, (3, COUNT))])
+    columns = [1e3 * T_S, *ACCEL_G.T, *(COUNTS * 0.07).T, *RNG.normal(600, 9, (3, COUNT))]
+    path = write_csv(tmp_path / "audio.csv", names, columns)
     np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
 
 
 def test_a_first_column_of_row_numbers_hides_no_time(tmp_path):
     names = ["", "Stop_watch", *NAMES[1:]]
-    path = written(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
+    path = write_csv(tmp_path / "pandas.csv", names, [np.arange(COUNT), T_S, *ACCEL_G.T, *(COUNTS * 0.07).T])
     assert np.array_equal(np.diff(read(path).imus["/imu0"].t_ns), np.full(COUNT - 1, 10_000_000))
 
 
@@ -216,11 +212,10 @@ def test_imus_on_a_body_become_one_each_and_statistics_none(tmp_path):
     places = ["chest", "left_leg", "right_leg"]
     names = ["Millis", *(f"{sensor}{a}_{place}" for place in places for sensor in ("Accel", "Gyro") for a in "XYZ")]
     columns = [1e3 * T_S, *(part for _ in places for part in (*ACCEL_G.T, *(COUNTS * 0.07).T))]
-    assert {*read(written(tmp_path / "body.csv", names, columns)).imus} == {f"/{place}/imu" for place in places}
+    assert {*read(write_csv(tmp_path / "body.csv", names, columns)).imus} == {f"/{place}/imu" for place in places}
+    names = [name.replace("chest", "mean").replace("leg", "std") for name in names]
     with pytest.raises(ConfigError, match="0 triples of columns look like the gyro"):
-        read(
-            written(tmp_path / "features.csv", [name.replace("chest", "mean").replace("leg", "std") for name in names], columns)
-        )
+        read(write_csv(tmp_path / "features.csv", names, columns))
 
 
 @pytest.mark.parametrize("names", [NAMES, ["time", *(f"linear_acceleration_{a}" for a in "xyz"), *NAMES[4:]]])
@@ -228,9 +223,9 @@ def test_a_motion_without_gravity_is_asked_though_it_is_as_long_as_gravity_in_g(
     motion = RNG.normal(0.0, 0.65, (COUNT, 3))
     assert abs(np.median(np.linalg.norm(motion, axis=1)) - 1.0) < 0.15
     with pytest.raises(ConfigError, match=r"gravity was taken out|no unit of the accel"):
-        read(written(tmp_path / "walk.csv", names, [T_S, *motion.T, *(COUNTS * 0.07).T]))
+        read(write_csv(tmp_path / "walk.csv", names, [T_S, *motion.T, *(COUNTS * 0.07).T]))
     turning = np.linalg.qr(np.random.default_rng(2).normal(size=(COUNT, 3, 3)))[0][:, 0] * RNG.normal(1.0, 0.2, (COUNT, 1))
-    read(written(tmp_path / "tumble.csv", NAMES, [T_S, *turning.T, *(COUNTS * 0.07).T]))
+    read(write_csv(tmp_path / "tumble.csv", NAMES, [T_S, *turning.T, *(COUNTS * 0.07).T]))
 
 
 def test_a_unit_that_another_time_contradicts_is_asked(tmp_path):
@@ -243,7 +238,7 @@ def test_a_unit_that_another_time_contradicts_is_asked(tmp_path):
     (tmp_path / "node.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
     with pytest.raises(ConfigError, match=r"'NodeTimestamp' would count ms, but by 'Date' 11.96 s pass and not 1.794 s"):
         read(tmp_path / "node.csv")
-    log = read(written(tmp_path / "apple.csv", ["timeIntervalSince1970", *NAMES[1:]], [1.7e9 + T_S, *ACCEL_G.T, *gyro.T]))
+    log = read(write_csv(tmp_path / "apple.csv", ["timeIntervalSince1970", *NAMES[1:]], [1.7e9 + T_S, *ACCEL_G.T, *gyro.T]))
     assert len(log.imus["/imu0"]) == COUNT
 
 

@@ -114,6 +114,19 @@ def test_a_log_that_pyulog_would_read_for_ever_is_refused(convert, tmp_path):
     assert done.stdout == ""
 
 
+def test_fields_and_times_that_cannot_be_are_told_and_the_rest_is_converted(convert, tmp_path):
+    log = ulog_flight()
+    log.log("from the end of time", 2**31 * 1_000_000)
+    (tmp_path / "a.ulg").write_bytes(
+        log.write(tmp_path / "b.ulg").read_bytes().replace(b"float[3] gyro_rad", b"float[3] gyro_bad")
+    )
+    done = convert(tmp_path / "a.ulg", tmp_path / "a.mcap")
+    assert done.returncode == 3
+    assert "/imu is left out: its topic has no field gyro_rad[0]" in done.stderr
+    assert "texts with an impossible time: 1" in done.stderr
+    assert len(read(tmp_path / "a.mcap", imu="/imu/sensor0").imu) > 200
+
+
 def test_a_file_that_ends_within_a_message_is_told(convert, tmp_path):
     whole = ulog_flight().write(tmp_path / "a.ulg").read_bytes()
     (tmp_path / "a.ulg").write_bytes(whole[:-300])

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.writer import Writer
+from support.imu_defects import survey
 
-from imutool.cleaning import survey
 from imutool.cli.info import imu_rows, topic_rows
 from imutool.converters import fetch, tum_vi
 from imutool.errors import LogError

@@ -9,7 +9,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from imutool.cleaning.survey import raw_batches
+from imutool.cleaning.survey import Survey, look, raw_batches
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
@@ -33,6 +33,12 @@ def messages(log: Path, topic: str = "/imu0") -> ImuBatch:
     return ImuBatch(
         *(np.concatenate(columns) for columns in zip(*(part[:6] for part in parts), strict=True)), parts[0].frame_id
     )
+
+
+def survey(log: Path) -> Survey:
+    """Survey the only IMU of a log."""
+    with Log(log) as opened:
+        return look(opened, opened.only_imu())
 
 
 def pick(batch: ImuBatch, index: np.ndarray) -> ImuBatch:

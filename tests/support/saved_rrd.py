@@ -17,6 +17,13 @@ from imutool.viewing.rerun import scene
 TIMELINES = ("elapsed", "ros2_timestamp", "message_log_time")
 
 
+def entities(path: Path) -> set[str]:
+    """Entities on which a file has data."""
+    reader = RrdReader(path)
+    (store,) = reader.recordings()
+    return {chunk.entity_path for chunk in reader.stream(store=store)}
+
+
 @dataclass
 class Entity:
     """All that a file says of one entity, temporal columns by their chunk's timelines, in the order of their rows."""

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import torch
+from support.small_tensors import one_thread  # noqa: F401  (a fixture)
 
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor.made_up_flight import FlightSettings as Flight
@@ -17,15 +17,6 @@ from imutool.sensor.made_up_flight import TriadSettings, flight, trajectory
 PERFECT = TriadSettings(
     noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
 )
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Tensors here are small: threads that wait for one another would cost more than they bring."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool import cli
 from imutool.cli import evaluate as scores
 from imutool.config import plain
 from imutool.errors import DataError
@@ -24,20 +23,6 @@ from imutool.recording import Imu, Poses, Recording
 from imutool.vio.run import SCHEMA, VioSettings, from_first_pose, plan, tabulate, vio
 
 SHORT = VioSettings(duration_s=7.0)
-
-
-@pytest.fixture
-def code(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Runs a command line in this process and returns its exit code."""
-    monkeypatch.setenv("COLUMNS", "100")
-
-    def run(*words: str | Path) -> int:
-        monkeypatch.setattr(sys, "argv", ["imutool", *map(str, words)])
-        with pytest.raises(SystemExit) as leaving:
-            cli.main()
-        return int(leaving.value.code or 0)
-
-    return run
 
 
 @pytest.fixture(scope="module")

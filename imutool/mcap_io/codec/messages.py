@@ -257,11 +257,6 @@ def message_head(channel: int, sequence: int, log_time: int, publish_time: int, 
     return _MESSAGE_HEAD.pack(Opcode.MESSAGE, FIXED + size, channel, sequence, log_time, publish_time)
 
 
-def message_record(channel: int, sequence: int, time_ns: int, payload: bytes) -> bytes:
-    """One Message record with one time, for the few large ones."""
-    return message_head(channel, sequence, time_ns, time_ns, len(payload)) + payload
-
-
 def scatter(data: UInt8[np.ndarray, " b"], offsets: Int64[np.ndarray, " n"], rows: UInt8[np.ndarray, "n M"]) -> None:
     """Puts each row at its own offset; the rows must not overlap there."""
     width = rows.shape[1]

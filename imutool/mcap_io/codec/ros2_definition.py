@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from imutool.errors import LogError
 from imutool.mcap_io.codec.formats import DEEPEST, MOST_FIELDS
+from imutool.mcap_io.codec.schemas import ByteWalk
 
 NUMBERS = {
     **dict.fromkeys(("bool", "byte", "char", "uint8"), "u1"),
@@ -135,27 +136,21 @@ def decodes(payload: bytes, schema_name: str, text: bytes) -> bool:
     return 0 <= len(payload) - walk.position < PADDING
 
 
-class Walk:
-    """A walk over one message, in order.
-
-    `constants` are the bytes that another message must share to have the same layout; `texts` are path, place and bytes of each
-    text.
+class Walk(ByteWalk):
+    """A walk over one message, in order; `texts` are path, place and bytes of each text.
 
     Raises:
         LogError: not plain CDR, or the message ends before its fields do.
     """
 
+    message: bytes
+
     def __init__(self, payload: bytes, definition: Definition, encoding: str = "cdr") -> None:
-        self.payload, self.definition, self.position, self.order = payload, definition, 0, "<"
-        self.constants: list[tuple[int, bytes]] = []
+        super().__init__(encoding, payload)
+        if not self.ros1 and len(payload) < self.start:
+            raise LogError(f"payload starts with {payload.hex(' ')}", expected="plain CDR: 00 00 or 00 01")
+        self.definition = definition
         self.texts: list[tuple[str, int, bytes]] = []
-        self._is_cdr = encoding == "cdr"
-        if not self._is_cdr:
-            return
-        if payload[:2] not in (b"\0\0", b"\0\1") or len(payload) < 4:
-            raise LogError(f"payload starts with {payload[:4].hex(' ')}", expected="plain CDR: 00 00 or 00 01")
-        self.position, self.order = 4, "<" if payload[1] else ">"
-        self.constants.append((0, payload[:2]))
 
     def leaves(self) -> Iterator[Leaf]:
         """Every number of the message, rows of numbers as one."""
@@ -163,25 +158,25 @@ class Walk:
 
     def _message(self, kind: str, path: str) -> Iterator[Leaf]:
         fields = self.definition[kind]
-        if not fields and self._is_cdr:
-            self._skip(1)  # what is empty is written as one byte
+        if not fields and not self.ros1:
+            self.skip(1)  # what is empty is written as one byte
         for field in fields:
             yield from self._field(field, f"{path}.{field.name}" if path else field.name)
 
     def _field(self, field: Field, path: str) -> Iterator[Leaf]:
         count = field.length
         if count == 0:
-            count = self._word()
+            count = self.word()
         if field.kind in NUMBERS:
             kind = NUMBERS[field.kind]
             if count is None or count:
-                self._align(int(kind[1]))
-            at = self._skip(int(kind[1]) * (1 if count is None else count))
+                self.align(int(kind[1]))
+            at = self.skip(int(kind[1]) * (1 if count is None else count))
             yield Leaf(path, at, kind, count)
         elif field.kind == TEXT:
             for _ in range(self._bounded(1 if count is None else count)):
-                at = self._skip(self._word())
-                self.texts.append((path, at, self.payload[at : self.position]))
+                at = self.skip(self.word())
+                self.texts.append((path, at, self.message[at : self.position]))
         elif field.kind == "wstring":
             raise LogError(f"{path} is a wide string, whose size ROS 2 leaves open", fix="Choose a field before it")
         else:
@@ -189,27 +184,16 @@ class Walk:
                 yield from self._message(field.kind, path if count is None else f"{path}[{k}]")
 
     def _bounded(self, count: int) -> int:
-        if count > len(self.payload) - self.position:
-            raise LogError(f"a count of {count} with {len(self.payload) - self.position} bytes left in the message")
+        if count > len(self.message) - self.position:
+            raise LogError(f"a count of {count} with {len(self.message) - self.position} bytes left in the message")
         return count
 
-    def _align(self, size: int) -> None:
-        self.position += -(self.position - 4) % size if self._is_cdr else 0
-
-    def _skip(self, size: int) -> int:
-        at, self.position = self.position, self.position + size
-        if self.position > len(self.payload):
-            raise LogError(f"payload of {len(self.payload)} bytes ends before byte {self.position}")
-        return at
-
-    def _word(self) -> int:
-        self._align(4)
-        at = self._skip(4)
-        raw = self.payload[at : at + 4]
-        self.constants.append((at, raw))
+    def word(self, value: int = 0) -> int:
+        """A count or a length; LogError where there are too many."""
+        found = super().word(value)
         if len(self.constants) > MOST_COUNTED:
             raise LogError(f"more than {MOST_COUNTED} texts and counts in one message", fix="Choose a field before them")
-        return int(struct.unpack(self.order + "I", raw)[0])
+        return found
 
 
 class DescribedCdr:

@@ -9,10 +9,11 @@ are read, little endian is written) and `ros1` (no encapsulation, no alignment, 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ PRESSURE = "sensor_msgs/msg/FluidPressure"
 MESSAGE_TWISTS = {"geometry_msgs/msg/TwistStamped": "twist", TWIST: "twist.twist", ODOMETRY: "twist.twist"}  # the twist's field
 
 NS_PER_S = 1_000_000_000
+Found = TypeVar("Found")  # what is known of a stretch of messages
 
 _FIELDS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
@@ -135,14 +137,19 @@ class Layout:
     data: tuple[int, int] | None = None  # (first byte, bytes) of an image
 
 
-class _Walk:
-    """A position in a message, moving by one field; texts and counts are read, or given."""
+class ByteWalk:
+    """Position in a message that is read (or, without one, written), moving by one field.
 
-    def __init__(self, encoding: str, message: bytes | None, texts: Sequence[str] = ()) -> None:
-        self.message, self.given, self.ros1 = message, list(texts), encoding == "ros1"
+    `constants` are the bytes that another message must share to have the same layout.
+
+    Raises:
+        LogError: not plain CDR, an unknown encoding, or a message that ends before its fields do.
+    """
+
+    def __init__(self, encoding: str, message: bytes | None) -> None:
+        self.message, self.ros1 = message, encoding == "ros1"
         self.order, self.start = "<", 0
         self.constants: list[tuple[int, bytes]] = []
-        self.texts: list[str] = []
         if encoding == "cdr":
             self.start = 4
             head = b"\0\1\0\0" if message is None else message[:4]
@@ -155,22 +162,32 @@ class _Walk:
         self.position = self.start
 
     def align(self, size: int) -> None:
+        """Move to the next place of a field of this size."""
         if not self.ros1:
             self.position += -(self.position - self.start) % size
 
     def skip(self, size: int) -> int:
+        """Move behind a field; return its place."""
         at, self.position = self.position, self.position + size
         if self.message is not None and self.position > len(self.message):
             raise LogError(f"payload of {len(self.message)} bytes ends before byte {self.position}")
         return at
 
-    def word(self, value: int) -> int:
+    def word(self, value: int = 0) -> int:
         """A uint32 that every message of the layout shares."""
         self.align(4)
         at = self.skip(4)
         raw = struct.pack("<I", value) if self.message is None else self.message[at : at + 4]
         self.constants.append((at, raw))
         return int(struct.unpack(self.order + "I", raw)[0])
+
+
+class _Walk(ByteWalk):
+    """Walk whose texts are read, or given."""
+
+    def __init__(self, encoding: str, message: bytes | None, texts: Sequence[str]) -> None:
+        super().__init__(encoding, message)
+        self.given, self.texts = list(texts), list[str]()
 
     def text(self) -> None:
         nul = b"" if self.ros1 else b"\0"
@@ -222,15 +239,27 @@ def runs(rows: UInt8[np.ndarray, "n L"], schema_name: str, encoding: str = "cdr"
     Raises:
         LogError: a message is shorter than its fields, or the encoding is not known.
     """
+
+    def look(message: bytes) -> tuple[Sequence[tuple[int, bytes]], Layout]:
+        layout = layout_of(schema_name, encoding, message=message)
+        return layout.constants, layout
+
+    return stretches(rows, look)
+
+
+def stretches(
+    rows: UInt8[np.ndarray, "n L"], look: Callable[[bytes], tuple[Sequence[tuple[int, bytes]], Found]]
+) -> Iterator[tuple[slice, Found]]:
+    """Stretches of messages that share what `look` finds in the first: constants, and more."""
     pending = [(0, len(rows))] if len(rows) else []
     while pending:
         first, last = pending.pop()
-        layout = layout_of(schema_name, encoding, message=rows[first].tobytes())
+        constants, found = look(rows[first].tobytes())
         differ = np.zeros(last - first - 1, bool)
-        for at, value in layout.constants:
+        for at, value in constants:
             column = rows[first:last, at : at + len(value)]
             if (column != column[0]).any():
                 differ |= (column[1:] != column[:-1]).any(axis=1)
         edges = [first, *(np.flatnonzero(differ) + first + 1).tolist(), last]
-        yield slice(first, edges[1]), layout
+        yield slice(first, edges[1]), found
         pending += reversed(list(pairwise(edges[1:])))

@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -140,25 +139,20 @@ class Described:
 
     def columns(self, payload: UInt8[np.ndarray, "n L"], paths: Sequence[str]) -> Iterator[Columns]:
         """Stretches of messages with the same field offsets, found by one walk each."""
-        pending = [(0, len(payload))] if len(payload) else []
-        while pending:
-            first, last = pending.pop()
-            walk = self._walk(payload[first].tobytes())
+
+        def look(raw: bytes) -> tuple[Sequence[tuple[int, bytes]], tuple[dict[str, Leaf], str]]:
+            walk = self._walk(raw)
             places = _places(walk, paths)
-            differ = np.zeros(last - first - 1, bool)
-            for at, raw in walk.constants:
-                column = payload[first:last, at : at + len(raw)]
-                if (column != column[0]).any():
-                    differ |= (column[1:] != column[:-1]).any(axis=1)
-            edges = [first, *(np.flatnonzero(differ) + first + 1).tolist(), last]
-            cut = payload[first : edges[1]]
+            return walk.constants, (places, walk.order)
+
+        for rows, (places, order) in schemas.stretches(payload, look):
+            cut = payload[rows]
             values = np.full((len(cut), len(paths)), np.nan)
             for k, path in enumerate(paths):
                 if path in places:
-                    values[:, k] = _column(cut, places[path], walk.order)
-            lacks = next(((path, first) for path in paths if path not in places), None)
-            yield Columns(slice(first, edges[1]), _stamps(cut, places, walk.order), values, lacks)
-            pending += reversed(list(pairwise(edges[1:])))
+                    values[:, k] = _column(cut, places[path], order)
+            lacks = next(((path, rows.start) for path in paths if path not in places), None)
+            yield Columns(rows, _stamps(cut, places, order), values, lacks)
 
     def texts(self, payload: UInt8[np.ndarray, "n L"], path: str) -> Iterator[tuple[str, ...]]:
         """Every different list of texts."""

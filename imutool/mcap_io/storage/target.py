@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 
 from imutool.errors import ConfigError
-from imutool.file_location import Location, io_errors, reason
+from imutool.file_location import Location, first_bytes, io_errors, reason
 from imutool.mcap_io.codec.records import crc32
 from imutool.mcap_io.storage.local import LocalFile, Stream, is_stream, remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
@@ -216,11 +216,7 @@ class FolderTarget:
             raise ConfigError(what, where=self.path, fix="Choose another folder, or remove this one yourself")
 
     def _was_made_here(self) -> bool:
-        try:
-            with (self.path / self.signed).open("rb") as file:
-                return SIGNATURE.encode() in file.read(len(SIGNATURE) + 80)
-        except OSError:
-            return False
+        return SIGNATURE.encode() in first_bytes(self.path / self.signed, len(SIGNATURE) + 80)
 
     def __enter__(self) -> Path:
         return self.temporary

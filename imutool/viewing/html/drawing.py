@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.errors import not_installed
+from imutool.errors import required
 from imutool.viewing.html.page import GRID, INK, LIGHT, printable, text
 
 WIDTH_INCH = 11.5  # on a page of 1150 pixels, letters of 9 points are 12 pixels high
@@ -194,11 +194,7 @@ def require_matplotlib() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise not_installed("matplotlib", "report", where="report", error=error) from error
-    return matplotlib
+    return required("matplotlib", "report", where="report")
 
 
 @contextmanager

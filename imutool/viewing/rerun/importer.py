@@ -12,10 +12,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
+from imutool.file_location import Location, first_bytes
+
 if TYPE_CHECKING:
     import rerun as rr
 
-    from imutool.file_location import Location
     from imutool.mcap_io.log import Log
     from imutool.viewing.model.run_data import RunData
 
@@ -84,11 +85,7 @@ def rrd(path: Path, target: Target | None = None) -> bytes | None:
 
 def _is_mcap(path: Path) -> bool:
     """Whether a file begins like an MCAP log."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
+    return first_bytes(path, len(MAGIC)) == MAGIC
 
 
 def load_first_imu(path: Location, findings: Path | None = None) -> RunData | None:

@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal
 
-from imutool.errors import ConfigError, not_installed
+from imutool.errors import ConfigError, required
 from imutool.recording import Times
 from imutool.viewing.model.run_data import RunData, Trace
 
@@ -33,10 +33,7 @@ def require_rerun() -> None:
         ConfigError: Rerun is not installed.
     """
     os.environ.setdefault(LOGGING, LOG_LEVELS)  # read when Rerun is first imported
-    try:
-        import rerun  # noqa: F401
-    except ImportError as error:
-        raise not_installed("the viewer", "view", where="view", error=error) from error
+    required("rerun", "view", package="the viewer", where="view")
 
 
 def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:

@@ -16,6 +16,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 from support import diagnoses
 from support.diagnoses import replace
+from support.loaded import loaded
 
 from imutool.diagnosis.wording.conclusion import headline
 from imutool.errors import ConfigError
@@ -224,10 +225,5 @@ def test_a_missing_rerun_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_importing_what_shows_a_diagnosis_costs_no_viewer_no_plotting_and_no_torch() -> None:
-    code = (
-        "import sys, imutool.diagnosis.wording.conclusion\n"
-        "import imutool.viewing.html.diagnosis_page, imutool.viewing.rerun.diagnosis\n"
-        "print(sorted({'torch', 'rerun', 'matplotlib'} & set(sys.modules)))"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "[]"
+    shows = ("diagnosis.wording.conclusion", "viewing.html.diagnosis_page", "viewing.rerun.diagnosis")
+    assert loaded(f"import {', '.join(f'imutool.{name}' for name in shows)}", {"torch", "rerun", "matplotlib"}) == []

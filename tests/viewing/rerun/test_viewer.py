@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from rerun.chunk import RrdReader
+from support.saved_rrd import entities
 
 from imutool.errors import ConfigError
 from imutool.viewing.model.run_data import RunData
@@ -22,13 +23,6 @@ from imutool.viewing.rerun import connect, scene, viewer
 
 NO_WAIT_S = 2.0
 SETTLED_S = 0.5
-
-
-def entities(path: Path) -> set[str]:
-    """What a file has data on."""
-    reader = RrdReader(path)
-    (store,) = reader.recordings()
-    return {chunk.entity_path for chunk in reader.stream(store=store)}
 
 
 @pytest.fixture
