@@ -230,7 +230,7 @@ def _samples(columns: Columns) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndar
 
 
 def _all_poses(topics: dict[str, Columns], remarks: Remarks) -> dict[str, Poses]:
-    found = {}
+    found: dict[str, Poses] = {}
     for topic, ending in (("/ground_truth/pose", "_groundtruth"), ("/ekf/pose", "")):
         try:
             poses = _poses(topics, ending, remarks)

@@ -147,11 +147,7 @@ class Topic:
 
 
 def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, schemas.Layout]]:
-    """Stretches of messages that share one layout.
-
-    Raises:
-        LogError: a payload that is no such message, or an encoding that is not known.
-    """
+    """Stretches of messages that share one layout; a message that is none is refused by its number."""
     done = 0
     try:
         for part, layout in schemas.runs(rows.payload, schema_name, encoding):

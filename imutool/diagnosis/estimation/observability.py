@@ -172,7 +172,7 @@ def with_common_arm(
     settings: SearchSettings,
     is_significant: Callable[[Effect, float], bool],
 ) -> Fit:
-    """Fit with a lever arm instead of a size effect of three equal arms; with both if the rest is significant and smaller."""
+    """Fit with a lever arm for a size effect of equal arms; with both if the rest is smaller."""
     arms = [k for k, (effect, _) in enumerate(now.chosen) if effect.name == "size_effect" and len(effect.parameters) == 9]
     lever = [effect for effect in named if effect.name == "lever_arm" and effect.key not in now.keys]
     if not arms or not lever:
