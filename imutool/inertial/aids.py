@@ -48,7 +48,6 @@ NO_HEIGHT = re.compile(
 COMMAND = re.compile(r"cmd|command|setpoint|target|desired")
 
 logger = logging.getLogger(__name__)
-Vectors = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -181,11 +180,6 @@ def index_of_best(values: Sequence[float | None], name: str) -> int | None:
     if name in NOT_ERRORS or len(known) < 2 or min(known)[0] == max(known)[0]:
         return None
     return min(known)[1]
-
-
-def unit_of(name: str) -> str:
-    """Unit at the end of a figure's name."""
-    return "°" if re.search(r"_deg\b", name) else "m" if re.search(r"_m\b", name) else ""
 
 
 def _window(trace: Trace, length_s: float) -> float | None:
