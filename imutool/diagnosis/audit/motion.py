@@ -155,12 +155,19 @@ def _force_faults(fit: KinematicFit) -> list[FaultFound]:
 
 
 def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[FaultFound]:
-    """Delays of the gyro, of the acceleration and of its attitude, in sample periods."""
+    """Delays of the gyro, of the acceleration and of its attitude, in sample periods.
+
+    A semi-implicit integrator makes all velocities late alike, by half of its step. So the acceleration counts from the gyro
+    where the gyro is late by a part of a step, unless both are differences of explicit states.
+    """
     gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
-    late = {"gyro": gyro, "accel": accel}
-    least = {"gyro": LEAST_GYRO_DELAY, "accel": LEAST_DELAY}
-    steps = {signal: _delay(tau, period_s, least[signal]) for signal, tau in late.items()}
+    steps = {"gyro": _delay(gyro, period_s, LEAST_GYRO_DELAY), "accel": _delay(accel, period_s, LEAST_DELAY)}
     together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
+    whole = together and steps["accel"] in ("step_delay", "early_stamps")
+    if abs(gyro.value) < PART * period_s and steps["gyro"] != steps["accel"] and not whole:
+        accel = Estimate(accel.value - gyro.value, float(np.hypot(accel.std, gyro.std)), "-")
+        steps["accel"] = _delay(accel, period_s, LEAST_DELAY)
+    late = {"gyro": gyro, "accel": accel}
     out = []
     for name in ("step_delay", "early_stamps"):
         signals = [signal for signal, kind in steps.items() if kind == name and (signal == "gyro" or together)]

@@ -53,6 +53,23 @@ def test_a_right_simulator_has_no_fault(seed: int) -> None:
     assert simulator_faults(*bench.made("null", seed, DURATION_S)) == []
 
 
+@pytest.mark.parametrize(("step", "differences"), [(0.25, False), (1.0, True)])
+def test_a_semi_implicit_integrator_makes_all_velocities_late_alike(step: float, differences: bool) -> None:
+    """Only what the acceleration is late after the gyro is its own fault; `step` is in sample periods."""
+    rng, period_s = np.random.default_rng(3), 1.0 / 240.0
+    motion, t = bench.Motion.drawn(rng), np.arange(round(DURATION_S / period_s)) * period_s
+    late_s = 0.5 * step * period_s  # of the velocities after the poses
+    a_w = motion.position(t - late_s, 2)
+    if differences:
+        a_w = (motion.position(t - late_s, 1) - motion.position(t - late_s - period_s, 1)) / period_s
+    samples = np.concatenate([motion.rate(t - late_s), motion.attitude(t).inv().apply(a_w - bench.G_W)], axis=1)
+    samples += np.repeat([2e-3, 2e-2], 3) * rng.normal(size=samples.shape)
+    faults = simulator_faults(bench._log(motion, t, samples), None, Noise())
+    accused = {fault.signal: fault.parameters["delay"].value for fault in faults if fault.fault == "backward_difference"}
+    assert len(accused) == len(faults)
+    assert accused.get("accel", 0.0) == pytest.approx(0.5 * period_s * differences, rel=0.03)
+
+
 def test_a_diagnosis_says_what_the_simulation_does_wrong() -> None:
     sim, _, _ = bench.made("coordinate_acceleration", 2, DURATION_S)
     (remark,) = simulator_remarks(sim)
