@@ -275,7 +275,9 @@ def _table(name: str, columns: Columns, start_ns: int) -> Table:
         groups.setdefault(re.sub(r"\[\d+\]$", "", column), []).append(column)
     fields, values = [], {}
     for group, members in groups.items():
-        field = re.sub(r"[^a-z0-9]+", "_", group.lower()).strip("_")
+        field = re.sub(r"[^a-z0-9]+", "_", group.lower()).strip("_") or "unnamed"
+        while field in values:  # damage makes names alike
+            field += "_"
         kind = np.result_type(*(columns[member].dtype for member in members))
         shape = (len(members),) if members != [group] else ()
         fields.append((field, kind, shape))

@@ -117,6 +117,7 @@ def test_a_log_that_pyulog_would_read_for_ever_is_refused(convert, tmp_path):
 def test_fields_and_times_that_cannot_be_are_told_and_the_rest_is_converted(convert, tmp_path):
     log = ulog_flight()
     log.log("from the end of time", 2**31 * 1_000_000)
+    log.topic("damaged", "uint64_t timestamp;float **;float Load;float load", [(7_000_000, 1.0, 2.0, 3.0)])
     (tmp_path / "a.ulg").write_bytes(
         log.write(tmp_path / "b.ulg").read_bytes().replace(b"float[3] gyro_rad", b"float[3] gyro_bad")
     )
