@@ -88,7 +88,9 @@ def kinematics(log: Recording) -> Kinematics:
     rows = (since_s > stretch.start_s + JERK_S) & (since_s < stretch.end_s - JERK_S)
     t_ns = imu.t_ns[rows]
     if stretch.duration_s < LEAST_S or rows.sum() < LEAST_S / imu.period_s:
-        raise DataError("its poses cover too little", where=log.name, expected=f"{LEAST_S:g} s of poses without a hole")
+        raise DataError(
+            "its poses cover too little", where=log.name, expected=f"{LEAST_S:g} s of poses without a hole or an impact"
+        )
     step_ns = round(JERK_S * 1e9)
     at, before, after = (stretch.trajectory.at(t_ns + shift) for shift in (0, -step_ns, step_ns))
     R_wb = Rotation.from_quat(at.q_wb_wxyz, scalar_first=True).as_matrix()
