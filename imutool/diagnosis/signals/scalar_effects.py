@@ -103,6 +103,15 @@ def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
     return replace(ideal, fine=np.asarray(lfilter(b, [1.0, -e], ideal.fine - first, axis=0) + first))
 
 
+def without_phase(ideal: IdealSignal, theta: Theta) -> IdealSignal:
+    """Signal filtered with the gain of a low-pass and without its lag."""
+    n, mean = len(ideal.fine), ideal.fine.mean(axis=0)
+    ends = 2.0 * ideal.fine[[0, -1]]
+    y = np.concatenate([ends[0] - ideal.fine[::-1], ideal.fine, ends[1] - ideal.fine[::-1]]) - mean
+    gain = 1.0 / np.hypot(1.0, np.fft.rfftfreq(len(y), 1.0 / ideal.rate_hz) / float(theta[0]))
+    return replace(ideal, fine=np.fft.irfft(np.fft.rfft(y, axis=0) * gain[:, None], len(y), axis=0)[n : 2 * n] + mean)
+
+
 def _dead_bands(size: float, unit: str) -> Iterator[Effect]:
     width = Parameter("width", unit, size, positive=True, step=LOG_MOVED)
     numbers = (width, Parameter("center", unit, 0.3 * size, step=MOVED * size))

@@ -226,6 +226,16 @@ def test_nothing_is_found_where_only_noise_and_a_constant_differ(seed: int) -> N
     assert d.unexplained[NAME].rms == pytest.approx(NOISE, rel=0.25)
 
 
+@pytest.mark.parametrize("seed", [4, 32, 36])
+def test_what_is_left_of_a_slow_simulations_noise_is_no_lag_of_the_recording(seed: int) -> None:
+    """A thermometer at 10 Hz, as noisy in both: a low-pass would smooth the noise that the Wiener filter leaves."""
+    rng = np.random.default_rng(seed)
+    t, t_sim, fine = 3.0 + np.arange(600) / 10.0, np.arange(650) / 10.0, np.arange(7000) / 100.0
+    warm = 25.0 + np.cumsum(0.003 * rng.normal(size=len(fine)))
+    real, sim = (fields(at, np.interp(at, fine, warm) + 0.02 * rng.normal(size=len(at))) for at in (t, t_sim))
+    assert diagnose_signal(SignalPair.of_fields(real, sim, NAME), {}).findings == ()
+
+
 def test_what_interpolation_leaves_between_two_logs_without_noise_is_nothing() -> None:
     """Two simulators interpolate one motion on straight lines."""
     fine = np.arange(0.0, 70.0, 2e-3)
