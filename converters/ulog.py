@@ -119,7 +119,7 @@ def _open(path: Path) -> Any:
 
 
 class _FiniteFile(BufferedReader):
-    """File that ends the reading of a damaged log that pyulog 1.3 begins again and again."""
+    """File that can be read a limited number of times: pyulog 1.3 reads one kind of damage for ever."""
 
     def __init__(self, raw: FileIO) -> None:
         super().__init__(raw)

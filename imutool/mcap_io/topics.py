@@ -155,7 +155,7 @@ def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, s
             yield rows.where(part), layout
     except LogError as error:
         what = f"message {rows.sequence[done]} is no {schema_name}: {error.what}"
-        raise LogError(what, expected=error.expected, fix=error.fix or CUT) from error
+        raise LogError(what, expected=error.expected, fix=error.fix or ("" if error.expected else CUT)) from error
 
 
 def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:

@@ -57,7 +57,8 @@ CONVERTED = 2  # times that currents are made torques: a limit or dead band in a
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signals ({:+.3f} s), so that a delay between them cannot be seen"
-LOW_PASS, LAG_SHARE = "low_pass", 0.5  # of what it removes, that its lag has to
+LOW_PASS = "low_pass"
+LAG_SHARE = 0.5  # of what a low-pass removes: its lag has to explain as much
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
     "efforts": (

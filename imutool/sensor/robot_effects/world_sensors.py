@@ -5,7 +5,8 @@ Magnetometer: soft iron, misalignment and declination; a constant is hard iron. 
 the declination turns the field about the vertical of the world.
 
 Barometer: dynamic pressure and temperature. p = p_static + C rho v² / 2 (Bolanakis, MEMS barometers toward vertical position
-detection, 2017, section 4), and a share of the temperature. Its lag is the `low_pass` of any signal, of both pressures.
+detection, 2017, section 4), and a share of the temperature. The `low_pass` of any signal is its lag,
+and acts on both pressures.
 
 GNSS antenna: lever arm and latency. A position is p = p_body + R_wb r (Groves, Principles of GNSS, Inertial, and Multisensor
 Integrated Navigation Systems, section 14.3), sampled `delay` before its stamp.
