@@ -17,7 +17,7 @@ error of a bias model is derived from it (`imutool.sensor.linear_form`). Effects
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, Literal
 
@@ -103,6 +103,7 @@ class Effect:
     diagnosed: a diagnosis may find it.
     basis: the terms of a trained effect, where `forward` for one parameter at a time would be slow; the same numbers.
     fast: a trained effect for given parameters, where `forward` would be slow; the same numbers.
+    lagless: `forward` with its gain and without its lag.
     """
 
     name: str
@@ -125,6 +126,7 @@ class Effect:
     diagnosed: bool = True
     basis: Callable[[Signals], Float64[np.ndarray, "n q"]] | None = None
     fast: Callable[[Theta], CompiledEffect] | None = None
+    lagless: Callable[[Any, Theta], Any] | None = None
 
     @property
     def key(self) -> str:
@@ -140,6 +142,10 @@ class Effect:
     def null_value(self) -> Theta:
         """The parameters at which the effect does nothing."""
         return np.array([parameter.null_value for parameter in self.parameters])
+
+    def without_lag(self) -> Effect:
+        """The same gain without its lag, where that is known."""
+        return self if self.lagless is None else replace(self, forward=self.lagless)
 
 
 def each_axis(unit: str, plausible: float, before: str = "") -> tuple[Parameter, ...]:

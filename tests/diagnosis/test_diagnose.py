@@ -210,6 +210,21 @@ def test_an_offset_of_clocks_that_share_no_epoch_is_no_finding(made: Made, tmp_p
     assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
 
 
+@pytest.mark.parametrize(("seed", "cutoff_hz"), [(9, None), (1, 15.0)])
+def test_a_low_pass_is_more_than_what_smooths_a_simulations_noise(seed: int, cutoff_hz: float | None, tmp_path: Path) -> None:
+    """Clocks without a common epoch hide its lag; the noise of a simulation of 240 Hz looked like one of 76 Hz."""
+    rng, t_s = np.random.default_rng(seed), planted.clock(40.0, 240.0)
+    path, own_s, noise = planted.moving(seed, 40.0), t_s[10:-10], np.repeat([2e-3, 2e-2], 3)
+    imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
+    slow = planted.acting({} if cutoff_hz is None else {"low_pass": [cutoff_hz]})
+    real, sim = planted.ideal(planted.rich(seed, 40.0), slow, own_s), np.concatenate([imu.gyro, imu.accel], axis=1)
+    real, sim = (samples + noise * rng.normal(size=samples.shape) for samples in (real, sim))
+    write(planted.recording("real", own_s, real), tmp_path / "real.mcap")
+    write(planted.recording("sim", t_s, sim, 0), tmp_path / "sim.mcap")
+    found = diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap")
+    assert effects(found) == ([] if cutoff_hz is None else ["low_pass"])
+
+
 def test_a_pair_is_named_whole_strongest_first(made: Made) -> None:
     real, sim = made({"clock_offset": [0.004], "lever_arm": ARM})
     found = diagnose([real], sim)

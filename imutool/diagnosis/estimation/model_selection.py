@@ -1,8 +1,7 @@
 """Model selection of effects: forward selection, exchange and elimination.
 
-Forward: each candidate is scored beside the effects so far; those of the best score are fitted in full, and the best comes in.
-Then back: an effect that the others have made superfluous goes, one for which another serves better is exchanged. What stays
-must cost more than noise on all rows, for all that was tried, and help on unseen blocks. Candidates compare by log p-values.
+Forward: the candidates of the best scores are fitted in full, and the best comes in. Back: a superfluous effect goes, one for
+which another serves better is exchanged. What stays must beat noise on all rows, for all that was tried, and on unseen time.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from imutool.diagnosis.estimation.significance import (
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import SplineCurve, shrinks_motion, with_finer_curve
+from imutool.diagnosis.estimation.unnamed_effects import SplineCurve, shrinks_motion, smoothing, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
@@ -85,11 +84,13 @@ def select_effects(
         answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
         other.end()
-    several = [(search, found.chosen[: len(always) + 1]) for search, found in answers if len(found.chosen) > len(always) + 1]
-    alone = ((search, fit(logs, chosen)) for search, chosen in several)  # what came in later may have spoilt the first
+    least = len(always) + 1  # what came in later may have spoilt the first
+    alone = ((search, fit(logs, found.chosen[:least])) for search, found in answers if len(found.chosen) > least)
     selections = (search.tested(search.simplified(found)) for search, found in chain(answers, alone))
     best = next(selections)
-    return best if best.selected else next((one for one in selections if one.selected), best)  # unseen time refuted the best
+    best = best if best.selected else next((one for one in selections if one.selected), best)  # unseen time refuted the best
+    noise = smoothing(best.whole, len(always))
+    return select_effects(logs, candidates, later, report, always=(*always, *noise)) if noise else best
 
 
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
@@ -144,7 +145,7 @@ class _Search:
         """The best fit with one more effect; none if chance explains its gain."""
         share, count, settings = self.settings.rival_share, self.settings.fitted_each_round, self.settings
         self.trials_of, self.trials = now, self.trials if self.trials_of is now else {}
-        allowed = self.named + (self.unnamed if unnamed_count(now) < self.settings.most_unnamed else ())
+        allowed = self.named + (self.unnamed if unnamed_count(now) < settings.most_unnamed else ())
         best: tuple[float, Fit] | None = None
         for promised, effect, start, gain in self.candidates.ranked(now, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
@@ -169,8 +170,7 @@ class _Search:
     def tried_with(self, others: Chosen, effect: Effect, start: Theta, near: Fit, limit: float) -> Fit:
         """Fit with one more effect, without its implausibly large parameters."""
         trial = fit(self.logs, (*others, (effect, start)), near=near, give_up_above=limit)
-        theta = trial.chosen[-1][1]
-        reduced = without_implausible(effect, theta, self.settings.implausible_factor)
+        reduced = without_implausible(effect, theta := trial.chosen[-1][1], self.settings.implausible_factor)
         start = values_of(effect, reduced, theta)
         return trial if reduced is effect else fit(self.logs, (*others, (reduced, start)), near=near, give_up_above=limit)
 

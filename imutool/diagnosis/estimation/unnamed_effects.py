@@ -14,16 +14,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import BSpline, PPoly
+from scipy.interpolate import BSpline, PPoly, make_interp_spline
 
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import AddedColumns, expected
+from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, expected
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.effects.low_pass import smoothed
 from imutool.sensor.physics_file_terms import VARIABLES, Variable, product_of
 from imutool.sensor.physics_file_terms import driven as channel_effect
 from imutool.sensor.samples import Recent, SensorSamples
@@ -35,6 +36,8 @@ PLAUSIBLE, PLAUSIBLE_LAG_S = {"gyro": 0.1, "accel": 1.0}, 0.2
 INSIDE = 0.005  # of the values of a variable lie beyond its first knot, and as many beyond its last
 QUANTILES, BY_RANGE = 1001, 0.35  # places between which knots are found, and how many of them by the range alone
 REPEATED = 0.01  # of a channel's variance, left by the IMU's samples: below it the channel is these samples
+LAG_SHARE = 0.8  # of what a low-pass removes, that its lag has to explain
+SMOOTHED_SHARE = 0.15  # of the noise that a filter left: it errs by up to 0.13 of it
 SPREAD = 1e-9  # relative: knots that lie closer are one
 
 
@@ -267,3 +270,31 @@ def shrinks_motion(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) ->
         return np.asarray(-(motion * added).sum(axis=0) / np.maximum((motion**2).sum(axis=0), 1e-300))
 
     return any(bool((taken(log) > log.pair.settings.search.most_taken).any()) for log in logs if log.pair.band_hz is not None)
+
+
+def smoothing(found: Fit, first: int) -> Chosen:
+    """Low-passes, without their lag, that only smooth what a filter left of a simulation's noise."""
+    filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]
+    return tuple((effect.without_lag(), theta) for effect, theta in filters if _only_smooths(effect, theta, found))
+
+
+def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
+    """Whether no lag is explained, nor more than a filter errs by (clocks without a common epoch hide a lag)."""
+    others = tuple(one for one in found.chosen if one[0] is not effect)
+    without, alike = (fit(found.logs, (*others, *more), part=found.part) for more in ((), ((effect.without_lag(), theta),)))
+    gain, of_lag = without.objective - found.objective, alike.objective - found.objective
+    left = sum(_smoothed_squares(log, float(theta[0]), found.part) for log in found.logs)
+    return of_lag < LAG_SHARE * gain and gain < SMOOTHED_SHARE * left
+
+
+def _smoothed_squares(log: WhitenedLog, cutoff_hz: float, part: str) -> float:
+    """White squares that a low-pass takes from the noise that is left of a simulation; infinite if that is unknown."""
+    left = log.pair.noise_left if isinstance(log.pair, Pair) else None
+    if left is None:
+        return np.inf
+    n, rate_hz = len(log.pair.real), 1.0 / log.pair.period_s
+    density = make_interp_spline(left.f_hz, left.density, k=1)(np.fft.rfftfreq(n, 1.0 / rate_hz).clip(max=left.f_hz[-1]))
+    white = np.fft.rfft(np.random.default_rng(0).normal(scale=np.sqrt(rate_hz / 2.0), size=(n, 6)), axis=0)
+    noise = np.fft.irfft(np.sqrt(density) * white, n, axis=0)
+    before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, cutoff_hz)))
+    return float((before**2).sum() - (after**2).sum())

@@ -51,7 +51,12 @@ class AlignedSignal(AlignedLog):
     shares_epoch: bool
     constants: tuple[float, ...] = ()
 
-    exact, denoised = True, False
+    exact = True
+
+    @property
+    def denoised(self) -> bool:
+        """Whether the simulation's samples were filtered."""
+        return bool(self.sim_density.any())
 
     @property
     def bias_std(self) -> Float64[np.ndarray, " k"]:

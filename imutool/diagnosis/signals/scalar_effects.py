@@ -18,6 +18,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
+from imutool.sensor.effects.low_pass import smoothed
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 
 CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
@@ -80,6 +81,7 @@ def named(signal: AlignedSignal) -> Iterator[Effect]:
         (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf, step=LOG_MOVED),),
         _low_pass,
         [np.array([times * slope / size / (2.0 * np.pi)]) for times in CUTOFFS],
+        lagless=_lagless,
     )
     gain = (Parameter("gain", "-", 0.5, null_value=1.0),)
     yield _effect("gain", Stage.SENSOR, "y = gain x", gain, lambda s, theta: s.but(theta[0] * s.y), [np.ones(1)])
@@ -103,13 +105,8 @@ def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
     return replace(ideal, fine=np.asarray(lfilter(b, [1.0, -e], ideal.fine - first, axis=0) + first))
 
 
-def without_phase(ideal: IdealSignal, theta: Theta) -> IdealSignal:
-    """Signal filtered with the gain of a low-pass and without its lag."""
-    n, mean = len(ideal.fine), ideal.fine.mean(axis=0)
-    ends = 2.0 * ideal.fine[[0, -1]]
-    y = np.concatenate([ends[0] - ideal.fine[::-1], ideal.fine, ends[1] - ideal.fine[::-1]]) - mean
-    gain = 1.0 / np.hypot(1.0, np.fft.rfftfreq(len(y), 1.0 / ideal.rate_hz) / float(theta[0]))
-    return replace(ideal, fine=np.fft.irfft(np.fft.rfft(y, axis=0) * gain[:, None], len(y), axis=0)[n : 2 * n] + mean)
+def _lagless(ideal: IdealSignal, theta: Theta) -> IdealSignal:
+    return replace(ideal, fine=smoothed(ideal.fine, ideal.rate_hz, float(theta[0])))
 
 
 def _dead_bands(size: float, unit: str) -> Iterator[Effect]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.candidate_score import Selection
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import noise_std
@@ -57,8 +57,6 @@ CONVERTED = 2  # times that currents are made torques: a limit or dead band in a
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
 CURVE_SHARE = 0.03  # of the misfit that a curve has to explain beyond an equation
 NO_EPOCH = "{}: the two clocks share no epoch; aligned by the signals ({:+.3f} s), so that a delay between them cannot be seen"
-LOW_PASS = "low_pass"
-LAG_SHARE = 0.5  # of what a low-pass removes: its lag has to explain as much
 DELAYS = frozenset({"delay", "latency"})
 CATALOGUE = {
     "efforts": (
@@ -117,21 +115,7 @@ def diagnose_signal(
     if (noise_std(rewhitened.whiten) < signal.settings.signal.better_noise * noise_std(now.log.whiten)).any():
         now = now._replace(log=rewhitened)  # the effects' own high frequencies were taken for noise
         selection = _selected(now)
-    if signal.sim_density.any() and _smooths_noise(now.log, selection.whole):
-        now = now._replace(candidates=[effect for effect in now.candidates if effect.name != LOW_PASS])
-        selection = _selected(now)
     return _summarized(now.log, now.candidates, selection, now.lsb, signal.settings)
-
-
-def _smooths_noise(log: WhitenedLog, found: Fit) -> bool:
-    """Whether a low-pass does little but smooth what is left of the simulation's own noise: it explains no lag."""
-    for effect, theta in found.chosen:
-        if effect.name == LOW_PASS:
-            others = tuple(one for one in found.chosen if one[0].key != effect.key)
-            lagless = replace(effect, forward=common.without_phase)
-            without, smoothed = (fit([log], chosen, part="all") for chosen in (others, (*others, (lagless, theta))))
-            return smoothed.objective - found.objective < LAG_SHARE * (without.objective - found.objective)
-    return False
 
 
 class _Prepared(NamedTuple):

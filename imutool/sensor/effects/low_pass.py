@@ -40,6 +40,20 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
+def _lagless(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
+    columns = (smoothed(x, motion.rate_hz, float(cutoff_hz[0])) for x in (motion.gyro, motion.accel, motion.alpha))
+    gyro, accel, alpha = columns
+    return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
+
+
+def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, cutoff_hz: float) -> Float64[np.ndarray, "n k"]:
+    """Columns with the gain of a first-order low-pass and without its lag."""
+    n, mean = len(x), x.mean(axis=0)
+    y = np.concatenate([2.0 * x[0] - x[::-1], x, 2.0 * x[-1] - x[::-1]]) - mean
+    gain = 1.0 / np.hypot(1.0, np.fft.rfftfreq(len(y), 1.0 / rate_hz) / cutoff_hz)
+    return np.asarray(np.fft.irfft(np.fft.rfft(y, axis=0) * gain[:, None], len(y), axis=0)[n : 2 * n] + mean)
+
+
 class Filter(NamedTuple):
     """Filter of samples N / D in powers of 1/z.
 
@@ -96,4 +110,5 @@ EFFECT = Effect(
     _forward,
     linear=False,
     starts=starts_at(*([hz] for hz in START_HZ)),
+    lagless=_lagless,
 )
