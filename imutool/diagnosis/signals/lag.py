@@ -1,10 +1,11 @@
-"""Lag of a recording behind its simulation at first sight, by correlation."""
+"""Lag of a recording behind its simulation at first sight; copies of one log in the other."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import correlate, correlation_lags
 
 from imutool.array_types import Float64
@@ -13,6 +14,12 @@ from imutool.errors import DataError
 from imutool.inertial.correlation import dependent_samples
 
 Column = Float64[np.ndarray, "_"]
+LEAST_COPIED = 0.9  # of the longer log's time, that two copies share
+SAME, DIGITS = 1e-6, 1e-7  # of a column's deviation, and of its largest value, as float32 has it
+INTERPOLATED, MOST_INTERPOLATED = 0.1, 1e-4  # of the error over twice the step; of a column's deviation
+UNLIKE_SIZE = 0.2  # of the logarithm: copies that share most of their time are no farther apart
+LEAST_INTERPOLATED = 8  # samples
+SHIFTS = 4  # Newton steps from a lag at first sight
 
 
 def lag_at_first_sight(
@@ -68,3 +75,59 @@ def _smooth(t_s: Column, values: Column, rate_hz: float) -> Float64[np.ndarray, 
     at = np.arange(t_s[0], t_s[-1], 1.0 / rate_hz)
     even = np.interp(at, t_s, values)
     return np.asarray(even - even.mean())
+
+
+# ── copies ──
+
+
+def is_copy(
+    t_real: Column,
+    real: Float64[np.ndarray, "_ k"],
+    t_sim: Column,
+    sim: Float64[np.ndarray, "_ k"],
+    names: Sequence[str],
+    settings: DiagnoseSettings,
+) -> bool:
+    """Whether one log copies the other, but for epoch, digits and interpolation.
+
+    No sensor reads what a simulation computes to a millionth of its motion.
+    """
+    sides = [(t_real, real), (t_sim, sim)]
+    if any(len(t) < LEAST_INTERPOLATED or (np.diff(t) <= 0.0).any() for t, _ in sides):
+        return False
+    if (np.abs(np.log(real.std(axis=0) / np.maximum(sim.std(axis=0), 1e-300))) > UNLIKE_SIZE).any():  # saves the correlation
+        return False
+    try:
+        shift_s = lag_at_first_sight(t_real, real, t_sim, sim, names, settings)[1]
+    except DataError:  # too short or too unlike for a lag: copies have none on one clock
+        shift_s = None
+    if shift_s is not None:
+        sides[1] = (t_sim - shift_s, sim)
+    coarse, dense = sorted(sides, key=lambda side: -float(np.median(np.diff(side[0]))))
+    return any(_is_within(*one, *other, 1 if shift_s is None else SHIFTS) for one, other in ((coarse, dense), (dense, coarse)))
+
+
+def _is_within(
+    t_s: Column, values: Float64[np.ndarray, "_ k"], t_other: Column, others: Float64[np.ndarray, "_ k"], shifts: int
+) -> bool:
+    """Whether values are interpolated from others, along a spline or straight lines, at some shift near zero."""
+    size, spline, missed = values.std(axis=0), CubicSpline(t_other, others), _interpolation_error(t_other, others)
+    allowed = np.maximum(SAME * size, np.minimum(missed, MOST_INTERPOLATED * size)) + DIGITS * np.abs(values).max(axis=0)
+    lines, moved = make_interp_spline(t_other, others, k=1), 0.0
+    for _ in range(shifts):
+        at = t_s + moved
+        inside = (at >= t_other[0]) & (at <= t_other[-1])
+        if inside.sum() * np.ptp(t_s) / len(t_s) < LEAST_COPIED * max(np.ptp(t_s), np.ptp(t_other)):
+            return False
+        each = [values[inside] - curve(at[inside]) for curve in (spline, lines)]
+        if any((np.sqrt((left**2).mean(axis=0)) <= allowed).all() for left in each):
+            return True
+        slope = spline(at[inside], 1) / size
+        moved += float((each[0] / size * slope).sum() / max(float((slope**2).sum()), 1e-300))
+    return False
+
+
+def _interpolation_error(t_s: Column, values: Float64[np.ndarray, "_ k"]) -> Float64[np.ndarray, " k"]:
+    """Error of a cubic spline between samples: a 16th of that between every second one."""
+    left = CubicSpline(t_s[::2], values[::2])(t_s[1:-1:2]) - values[1:-1:2]
+    return np.asarray(INTERPOLATED * np.sqrt((left**2).mean(axis=0)))

@@ -12,19 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
+from imutool.diagnosis.signals.lag import is_copy
 from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
 from imutool.diagnosis.signals.quantities import in_one_unit, in_radians, metres, unwrapped
 from imutool.file_location import Location
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import ODOMETRY, PRESSURE
 from imutool.mcap_io.fields import Fields
+from imutool.recording import seconds
 from imutool.sensor.channels import is_quantity
 
 MOST_COMPARED, MOST_DRIVERS = 24, 6
-SAME = 1e-12  # relative difference of two copies
-LEAST_COPIED = 0.9  # of the longer log, that two copies share
 LISTED = 12
 VALUES: Mapping[str, tuple[str, str, str]] = {
     PRESSURE: ("fluid_pressure", "pressure", "Pa"),
@@ -74,10 +75,10 @@ def paired(real: Location, sim: Location) -> Pairing:
 
 
 def _is_copy(pair: SignalPair) -> bool:
-    """Whether one log's numbers are those of the other, which may have left out some at its ends."""
-    _, mine, theirs = np.intersect1d(pair.real_ns, pair.sim_ns, return_indices=True)
-    whole = len(mine) == min(len(pair.real), len(pair.sim)) > LEAST_COPIED * max(len(pair.real), len(pair.sim))
-    return whole and np.allclose(pair.real[mine], pair.sim[theirs], rtol=SAME, atol=0.0)
+    """Whether one log's numbers are those of the other."""
+    start_ns = int(pair.real_ns[0])
+    t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
+    return is_copy(t_real, pair.real, t_sim, pair.sim, pair.names, DiagnoseSettings())
 
 
 def _listed(what: str, names: list[str]) -> list[str]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 from imutool.sensor.robot_effects.signal_samples import Columns, Samples, SignalSamples, State
@@ -28,6 +29,7 @@ UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
 LIMITS = (0.5, 1.0, 1.5, 2.0)  # to start from, likewise
+ASKED = (0.05, 0.3)  # of the commands, the largest, while what acts is such a limit
 BEYOND = (0.003, 0.01, 0.03, 0.1)  # of the commands, that another limit to start from cuts
 EXTENT = "; inertia: about its own centre, alike about all axes"
 OFFSETS = "; offsets: lengths before it, which the simulated arm's own weight does not show"
@@ -96,7 +98,8 @@ def load_effects(scale: Scale) -> Iterator[Effect]:
 class _Kept:
     """What the actuator keeps back of a command: all within `width`, or what is above `limit`.
 
-    What acts has to be like the effort that the motion needs: a command alone would explain itself, and hide a large friction.
+    What acts has to be like the effort that the motion needs, but for the noise with which it is read: a command alone would
+    explain itself, and hide a large friction.
     """
 
     joint: int
@@ -107,8 +110,9 @@ class _Kept:
         u: Samples = s.channel(self.name)
         inside = np.clip(u, -theta[0], theta[0])
         kept, needed = (u - inside if self.limits else inside), s.y[:, self.joint]
-        like = np.std(u - kept - needed) < UNLIKE * np.std(needed)
-        return s.with_added(self.joint, kept) if like else s
+        passed = np.mean((np.abs(u) < theta[0]) == self.limits)
+        unlike = np.var(u - kept - needed) - passed * white_noise(u[:, None])[0] ** 2
+        return s.with_added(self.joint, kept) if unlike < UNLIKE**2 * np.var(needed) else s
 
 
 def _delayed(taken_s: Samples, theta: Theta) -> Samples:
@@ -164,10 +168,15 @@ def _of_joint(scale: Scale, k: int) -> Iterator[Effect]:
         _Kept(k, scale.names[k], limits=True),
         "the effort goes beyond the limit",
     )
-    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k], size)))
+    yield from (dead_band, replace(limit, linear=False, starts=lambda ideal, real: _limits(real.y[:, k], real.x[:, k], size)))
 
 
-def _limits(commands: Samples, size: float) -> list[Theta]:
-    """Limits to start from: a controller asks now for much more than acts, and now goes beyond a limit for a moment only."""
-    moments = np.quantile(np.abs(commands), 1.0 - np.array(BEYOND))
-    return [np.array([limit]) for limit in (*(share * size for share in LIMITS), *moments)]
+def _limits(commands: Samples, needed: Samples, size: float) -> list[Theta]:
+    """Limits to start from: a controller asks now for much more than acts, and now goes beyond a limit for a moment only.
+
+    What acts while most is asked for is the limit, however far a controller winds up.
+    """
+    u, acts = np.abs(commands), np.abs(needed)
+    moments = np.quantile(u, 1.0 - np.array(BEYOND))
+    plateaus = [np.median(acts[u >= least]) for least in np.quantile(u, 1.0 - np.array(ASKED))]
+    return [np.array([limit]) for limit in (*(share * size for share in LIMITS), *moments, *plateaus) if limit > 0.0]

@@ -14,7 +14,7 @@ from support.robot_cases.log import write
 
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
-from imutool.diagnosis.signals.lag import lag_at_first_sight
+from imutool.diagnosis.signals.lag import is_copy, lag_at_first_sight
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.quantities import in_one_unit
 from imutool.diagnosis.signals.signal_constants import current_remark
@@ -186,6 +186,28 @@ def test_two_motions_are_not_taken_for_one(seed: int) -> None:
     real, sim = (np.sin(2.0 * np.pi * np.outer(T * 3.0, f[k]) + p[k]).sum(axis=1)[:, None] for k in (0, 1))
     with pytest.raises(DataError, match="not alike"):
         lag_at_first_sight(T * 3.0, real, T * 3.0, sim, ("/x.y",), DiagnoseSettings())
+
+
+EPOCH_S = 1.7e9
+COPIES = {
+    "another epoch": (T + EPOCH_S, wave(1), True),
+    "float32": (T, wave(1).astype(np.float32).astype(float), True),
+    "every third sample of another epoch": (T[::3] + EPOCH_S, wave(1)[::3], True),
+    "interpolated to another rate": (T[5:-5] + 0.004, np.interp(T[5:-5] + 0.004, T, wave(1)), True),
+    "noise of a thousandth": (T + EPOCH_S, wave(1) + 1e-3 * np.random.default_rng(0).normal(size=len(T)), False),
+    "a small gain": (T + EPOCH_S, 1.001 * wave(1), False),
+    "an offset": (T, wave(1) + 0.001, False),
+    "half of the time": (T[:1000], wave(1)[:1000], False),
+    "another motion": (T, wave(2), False),
+}
+
+
+@pytest.mark.parametrize("case", COPIES)
+def test_copies_are_known_whatever_their_clock_and_what_differs_is_none(case: str) -> None:
+    t_s, values, copied = COPIES[case]
+    both = t_s, values[:, None], T, wave(1)[:, None]
+    assert is_copy(*both, ("/x.y",), DiagnoseSettings()) == copied
+    assert is_copy(*both[2:], *both[:2], ("/x.y",), DiagnoseSettings()) == copied
 
 
 def test_efforts_that_are_motor_currents_are_told() -> None:

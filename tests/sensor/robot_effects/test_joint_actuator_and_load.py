@@ -41,5 +41,23 @@ def test_a_limit_that_a_motion_passes_for_a_moment_is_searched_for_near_it() -> 
     scale = Scale((NAME,), ("N m",), (0.5,), (1.0,), 0.0, 20.0, {})
     (effect,) = (e for e in actuator_effects(scale) if e.name == "torque_saturation")
     assert effect.starts is not None
-    starts = effect.starts(None, SimpleNamespace(y=command[:, None]))
+    starts = effect.starts(None, SimpleNamespace(y=command[:, None], x=command[:, None]))
     assert min(abs(np.log(float(start[0]) / 3.0)) for start in starts) < 0.3
+
+
+def test_a_limit_is_searched_for_where_it_acts_when_the_controller_winds_up() -> None:
+    """Commands a hundred times the limit, as of an integrator, so that no size of them is near."""
+    command = 100.0 * np.sin(T) + np.random.default_rng(0).normal(0.0, 0.5, len(T))
+    needed = np.clip(100.0 * np.sin(T), -0.8, 0.8)
+    scale = Scale((NAME,), ("N m",), (float(command.std()),), (1.0,), 0.0, 20.0, {})
+    (effect,) = (e for e in actuator_effects(scale) if e.name == "torque_saturation")
+    assert effect.starts is not None
+    starts = effect.starts(None, SimpleNamespace(y=command[:, None], x=needed[:, None]))
+    assert min(abs(np.log(float(start[0]) / 0.8)) for start in starts) < 0.05
+
+
+def test_a_limit_explains_commands_that_are_read_with_noise() -> None:
+    """What acts is unlike what is needed by the noise of the command alone."""
+    needed = np.sin(T)
+    command = needed + np.random.default_rng(0).normal(0.0, 0.45, len(T))
+    assert not np.array_equal(behind("torque_saturation", 0.9, command, needed), needed)
