@@ -16,10 +16,9 @@ from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
-from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.timestamps import late_stamps
-from imutool.diagnosis.estimation.unnamed_effects import SplineCurve
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, level
 from imutool.diagnosis.held_out import (
     gains,

@@ -13,7 +13,7 @@ from scipy.stats import beta
 
 from imutool.array_types import Bool, Complex128, Float64
 from imutool.config import Settings
-from imutool.inertial.stationary import nothing_but_noise
+from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.recording import Imu, seconds
 
 MOSTLY = 2.0  # times the noise: less is noise for the most part
@@ -21,6 +21,8 @@ OVERLAP = 4  # windows begin a quarter of a window apart
 INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequencies (noise alone: 0.5 and 0.67)
 CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
+CALM = 1.2  # times `white_noise`, that pure white noise is
+LEAST_NOISE = 1e-12  # of what the top holds
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
 Parts = Complex128[np.ndarray, "f t k"]
 
@@ -69,7 +71,8 @@ def denoised(
     y = x - line
     mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
     parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
-    std = _noise_std(parts, None if recorded is None else _shared(x, recorded, stft, settings), settings)[:, None]
+    calm = white_noise(x) * CALM * np.sqrt((stft.win**2).sum())
+    std = _noise_std(parts, calm, None if recorded is None else _shared(x, recorded, stft, settings), settings)[:, None]
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
     power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")
@@ -102,8 +105,13 @@ def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Floa
     return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
 
 
-def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:
-    """Noise of the parts by frequency: by those that are not shared, and as white as the top where none are."""
+def _noise_std(
+    parts: Parts, calm: Float64[np.ndarray, " k"], shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings
+) -> Float64[np.ndarray, "f k"]:
+    """Noise of the parts by frequency: by those that are not shared, and as white as the top where none are.
+
+    Where all are shared, as impacts are, the top is motion: then the noise is no more than between impacts, `calm`.
+    """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
     out = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1))
@@ -114,6 +122,8 @@ def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: W
         if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
+        elif column.all():
+            out[:, k] = np.minimum(out[:, k], np.maximum(calm[k] ** 2, LEAST_NOISE * out[:, k]))
     return np.asarray(np.sqrt(np.maximum(out, 1e-300)))
 
 

@@ -22,6 +22,7 @@ from imutool import diagnosis_output
 from imutool.cli import load
 from imutool.diagnosis.closed_loop import CLOSED_LOG
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
+from imutool.diagnosis.estimation.jacobians import SplineBasis
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.diagnosis.wording.conclusion import conclusion
@@ -369,7 +370,7 @@ def test_a_term_without_a_name_acts_as_it_was_found() -> None:
 
 def test_a_curve_and_the_bias_add_up_to_what_was_fitted() -> None:
     """The curve is told about its mean, which goes to the bias: the coefficients' own curve is what both make together."""
-    shape = unnamed.SplineBasis(np.array([-1.0, -0.3, 0.0, 0.2, 1.0]))
+    shape = SplineBasis(np.array([-1.0, -0.3, 0.0, 0.2, 1.0]))
     c, x = np.array([0.5, 0.1, 0.0, 0.2, 0.4, 0.9, 1.0]), np.linspace(-1.0, 1.0, 41)
     y = np.zeros((41, 3))
     mean = float((shape.basis(x) @ c).mean())

@@ -14,6 +14,7 @@ from imutool.diagnosis.compare_findings import ANOTHER_MOTION, is_of_digits, rem
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, HeldOut
 from imutool.errors import DataError
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 
 ARM, SCALE = [0.2, -0.05, 0.1], [0.02, 0.0, -0.015]
@@ -111,6 +112,16 @@ def test_what_only_the_recording_has_is_found_beside_a_simulation_of_another_mot
         found.closer["gyro"].rms_after, rel=0.02
     )  # nothing is left out there
     assert found.closer["accel"].rms_after < 0.1 * found.closer["accel"].rms_before
+
+
+def test_a_simulations_poses_of_another_motion_are_true_on_an_odometry_topic_too(tmp_path: Path) -> None:
+    real, sim = log(tmp_path, "real", 3, {"lever_arm": ARM}), log(tmp_path, "sim", 7, {})
+    known = read(sim)
+    poses = {"/odom": known.truth}
+    write(replace(known, truths=poses, other_poses={"/odom": "odometry"}), tmp_path / "odometry.mcap")
+    with pytest.raises(DataError, match="odometry"):
+        diagnose([tmp_path / "odometry.mcap"])
+    assert [one.effect for one in diagnose([real], tmp_path / "odometry.mcap").findings] == ["lever_arm"]
 
 
 def test_another_motion_without_poses_on_both_sides_is_refused(tmp_path: Path) -> None:

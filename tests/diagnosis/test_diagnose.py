@@ -210,6 +210,22 @@ def test_an_offset_of_clocks_that_share_no_epoch_is_no_finding(made: Made, tmp_p
     assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
 
 
+def test_impacts_and_noise_of_both_are_no_mismatch(tmp_path: Path) -> None:
+    """A body that is thrown: its forces last for a sample, and its rates jump."""
+    rng, t_s = np.random.default_rng(3), planted.clock(30.0, 240.0)
+    path = planted.moving(3, 30.0)
+    imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
+    felt, hits = np.concatenate([0.1 * imu.gyro, 0.01 * imu.accel], axis=1), np.arange(60, len(t_s), 120)
+    felt[hits, 3:] += rng.normal(scale=200.0, size=(len(hits), 3))
+    for hit in hits:
+        felt[hit:, :3] += rng.normal(size=3) - 0.5 * felt[hit, :3]
+    logs = [tmp_path / "real.mcap", tmp_path / "sim.mcap"]
+    for log, start_ns, bias in zip(logs, (planted.START_NS, 0), (planted.BIAS, 0.0), strict=True):
+        noisy = felt + np.repeat([2e-3, 2e-2], 3) * rng.normal(size=felt.shape) + bias
+        write(planted.recording(log.stem, t_s, noisy, start_ns), log)
+    assert effects(diagnose(logs[:1], logs[1])) == []
+
+
 @pytest.mark.parametrize(("seed", "cutoff_hz"), [(9, None), (1, 15.0)])
 def test_a_low_pass_is_more_than_what_smooths_a_simulations_noise(seed: int, cutoff_hz: float | None, tmp_path: Path) -> None:
     """Clocks without a common epoch hide its lag; the noise of a simulation of 240 Hz looked like one of 76 Hz."""

@@ -72,3 +72,12 @@ def test_the_noise_that_is_left_under_a_motion_is_told_with_its_density(seed: in
 def test_white_noise_gets_no_colour_from_what_it_shares_by_chance(seed: int) -> None:
     x, recorded = np.random.default_rng(seed).normal(size=(2, 2_400, 6))
     assert np.array_equal(denoised(x, 100.0, recorded=recorded)[0], wiener_filter(x, 100.0))
+
+
+def test_impacts_that_a_recording_shares_are_no_noise() -> None:
+    """A sample of 40 in every second: the top of the spectrum is full of them, and they are motion."""
+    x, rng = motion(0), np.random.default_rng(5)
+    x[200::400] += 40.0 * rng.normal(size=x[200::400].shape)
+    simulated, recorded = (x + 0.02 * rng.normal(size=x.shape) for _ in range(2))
+    clean, alone = (denoised(simulated, RATE_HZ, recorded=known)[0] for known in (recorded, None))
+    assert np.abs(clean - x).max() < 0.2 < np.abs(alone - x).max()

@@ -10,9 +10,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from bisect import bisect
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog
@@ -45,6 +46,44 @@ class AddedColumns(ABC):
         out = (samples.gyro if self.sensor == 0 else samples.accel).copy(order="K")
         out[:, self.axis] += self.added_at(samples, theta)
         return samples.with_readings(gyro=out) if self.sensor == 0 else samples.with_readings(accel=out)
+
+
+class SplineBasis:
+    """Cubic B-splines, or sums of them, of one variable, constant beyond their ends.
+
+    Where samples are many, knots are close: at even distances, what the motion rarely does would bend all the rest.
+    """
+
+    def __init__(self, inner: Float64[np.ndarray, " p"]) -> None:
+        self.inner, self.knots = inner, np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+
+    def points(self, count: int) -> Float64[np.ndarray, " k"]:
+        """Values to show the curve at: more where it can bend more."""
+        return np.asarray(np.interp(np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, len(self.inner)), self.inner))
+
+    def basis(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n q"]:
+        """The curve's basis functions at some values."""
+        if self._last is None or not np.array_equal(self._last[0], x):  # derivatives ask for the same again and again
+            inside = np.clip(x, self.inner[0], self.inner[-1])
+            splines = BSpline.design_matrix(inside, self.knots, 3).toarray()[:, : len(self.inner) + 2]
+            self._last = x.copy(), self._combined(np.asarray(splines))
+        return self._last[1]
+
+    def _combined(self, splines: Float64[np.ndarray, "n q"]) -> Float64[np.ndarray, "n q"]:
+        return splines
+
+
+class SplineCurve(SplineBasis, ABC):
+    """Forward model of a spline curve of one variable, on one of the columns of a signal."""
+
+    def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"], columns: int = 1, axis: int = 0) -> None:
+        super().__init__(inner)
+        self.variable, self.unit, self.columns, self.axis = variable, unit, columns, axis
+
+    @abstractmethod
+    def __call__(self, samples: Any, theta: Theta) -> Any:
+        """The samples with the curve on them."""
 
 
 class ForwardPass:

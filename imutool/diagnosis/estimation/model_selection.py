@@ -15,7 +15,7 @@ import numpy as np
 
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
 from imutool.diagnosis.estimation.noise_estimate import is_coloured_noise, with_bias_walk
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
@@ -43,7 +43,7 @@ from imutool.diagnosis.estimation.significance import (
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import SplineCurve, shrinks_motion, smoothing, with_finer_curve
+from imutool.diagnosis.estimation.unnamed_effects import shrinks_motion, smoothing, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each

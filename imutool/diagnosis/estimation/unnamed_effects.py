@@ -8,18 +8,17 @@ to it.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from scipy.interpolate import BSpline, PPoly, make_interp_spline
+from scipy.integrate import trapezoid
+from scipy.interpolate import PPoly, make_interp_spline
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, expected
+from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, SplineBasis, SplineCurve, expected
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
@@ -132,44 +131,6 @@ def _curve(variable: str, sensor: int, axis: int, splines: SplineBasis) -> Effec
     )
 
 
-class SplineBasis:
-    """Cubic B-splines, or sums of them, of one variable, constant beyond their ends.
-
-    Where samples are many, knots are close: at even distances, what the motion rarely does would bend all the rest.
-    """
-
-    def __init__(self, inner: Float64[np.ndarray, " p"]) -> None:
-        self.inner, self.knots = inner, np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
-
-    def points(self, count: int) -> Float64[np.ndarray, " k"]:
-        """Values to show the curve at: more where it can bend more."""
-        return np.asarray(np.interp(np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, len(self.inner)), self.inner))
-
-    def basis(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n q"]:
-        """The curve's basis functions at some values."""
-        if self._last is None or not np.array_equal(self._last[0], x):  # derivatives ask for the same again and again
-            inside = np.clip(x, self.inner[0], self.inner[-1])
-            splines = BSpline.design_matrix(inside, self.knots, 3).toarray()[:, : len(self.inner) + 2]
-            self._last = x.copy(), self._combined(np.asarray(splines))
-        return self._last[1]
-
-    def _combined(self, splines: Float64[np.ndarray, "n q"]) -> Float64[np.ndarray, "n q"]:
-        return splines
-
-
-class SplineCurve(SplineBasis, ABC):
-    """Forward model of a spline curve of one variable, on one of the columns of a signal."""
-
-    def __init__(self, variable: str, unit: str, inner: Float64[np.ndarray, " p"], columns: int = 1, axis: int = 0) -> None:
-        super().__init__(inner)
-        self.variable, self.unit, self.columns, self.axis = variable, unit, columns, axis
-
-    @abstractmethod
-    def __call__(self, samples: Any, theta: Theta) -> Any:
-        """The samples with the curve on them."""
-
-
 class Curve(AddedColumns, SplineCurve):
     """+ a spline of one variable on one axis of an IMU.
 
@@ -256,8 +217,11 @@ def shrinks_motion(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) ->
     """Whether a term, a curve or a limit takes most of an axis' motion by poses.
 
     On an axis that hardly moves, what poses say is their own noise, and whatever shrinks it removes a misfit (regression
-    dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7). No sensor loses so much.
+    dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7). No sensor loses so much. A term or a curve takes the noise of
+    a simulation as well, if it is no larger.
     """
+    if effect.kind == "unknown" and any(_within_noise(effect, theta, log.pair) for log in logs):
+        return True
     if effect.kind == "catalogue" and effect.name != "saturation":
         return False
 
@@ -270,6 +234,14 @@ def shrinks_motion(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) ->
         return np.asarray(-(motion * added).sum(axis=0) / np.maximum((motion**2).sum(axis=0), 1e-300))
 
     return any(bool((taken(log) > log.pair.settings.search.most_taken).any()) for log in logs if log.pair.band_hz is not None)
+
+
+def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
+    """Whether an effect adds no more to any axis than a simulation's own noise does."""
+    if not isinstance(pair, Pair) or pair.noise_left is None:
+        return False
+    added = (expected(pair, ((effect, theta),)) - expected(pair, ()))[pair.fitted | pair.held_out]
+    return bool((added.var(axis=0) < trapezoid(pair.noise_left.density, pair.noise_left.f_hz, axis=0)).all())
 
 
 def smoothing(found: Fit, first: int) -> Chosen:

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.unnamed_effects import LAGS_S, SplineCurve
+from imutool.diagnosis.estimation.jacobians import SplineCurve
+from imutool.diagnosis.estimation.unnamed_effects import LAGS_S
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
 from imutool.sensor.effects.low_pass import smoothed
