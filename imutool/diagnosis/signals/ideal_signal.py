@@ -8,6 +8,7 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import make_interp_spline
 from scipy.signal import firwin, welch
 
@@ -25,6 +26,7 @@ from imutool.sensor.robot_effects.wheel import WheelRelation
 MOST_FINE = 20_000_000  # samples
 WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
 STEP_ROUNDS = 3
+WAY_S, CONTRADICTS = 1.0, 0.5  # of a way by velocity and by position, and the share of it by which the two may differ
 ENDS_S = 0.5  # of a motion, where its derivatives are not known
 Column = Float64[np.ndarray, "_"]
 
@@ -88,6 +90,8 @@ def at_recorded_motion(
     Raises:
         DataError: the columns of the simulation do not follow from its state.
     """
+    for state, log in ((pair.state, "recording"), (pair.sim_state, "simulation")):
+        _refuse_contradictory(state, pair, log)
     sim_s, _, sim_state = motion(pair.sim_state, settings)
     own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
     inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
@@ -142,6 +146,37 @@ def _ahead_s(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], t_s: 
     """Time (s) by which columns come before what follows from a motion."""
     slope = np.gradient(x, t_s, axis=0) / y.std(axis=0)
     return float(((y - x) / y.std(axis=0) * slope).sum() / max(float((slope**2).sum()), 1e-300))
+
+
+def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: str) -> None:
+    """Refuses velocities that are no rates of the positions beside them.
+
+    They are compared by the way of each second: a velocity that is filtered, or late, goes the same way.
+
+    Raises:
+        DataError: a joint goes another way by its velocity than by its position.
+    """
+    contradictions = list[tuple[float, float, float, str]]()
+    for label in (label for label in state if label.startswith("q") and f"d{label}" in state):
+        position, velocity = state[label], state[f"d{label}"]
+        start_ns = int(position.t_ns[0])
+        t_s, own_s = seconds(position.t_ns, start_ns), seconds(velocity.t_ns, start_ns)
+        at_s = np.arange(max(0.0, own_s[0]), min(t_s[-1], own_s[-1]), WAY_S)
+        gone = np.interp(at_s, own_s, cumulative_trapezoid(velocity.values, own_s, initial=0.0))
+        ways = np.diff([np.interp(at_s, t_s, position.values), gone], axis=1)
+        if ways.size:
+            by_position, by_velocity, apart = np.sqrt((np.stack([*ways, ways[1] - ways[0]]) ** 2).mean(axis=1))
+            share = float(apart / max(by_position, by_velocity, 1e-300))
+            contradictions.append((share, by_velocity, by_position, pair.names[int(label.removeprefix("q"))]))
+    share, by_velocity, by_position, name = max(contradictions, default=(0.0, 0.0, 0.0, ""))
+    if share > CONTRADICTS:
+        raise DataError(
+            f"the velocity beside {name} is not the rate of the position in the {log}:"
+            f" {by_velocity:.3g} rad a second by the one, {by_position:.3g} by the other",
+            where=name,
+            expected="velocities that are the rates of the positions",
+            fix="Record both of the same joint and in one unit, or the positions alone",
+        )
 
 
 def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Column, float, dict[str, Column]]:

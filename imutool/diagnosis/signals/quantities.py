@@ -27,19 +27,17 @@ USUAL = {"magnetic": 5e-5, "pressure": 1e5}
 
 def unwrapped(pair: SignalPair) -> SignalPair:
     """Angles that wrap, as continuous ones."""
+    return replace(pair, real=continuous(pair.real), sim=continuous(pair.sim))
 
-    def whole(values: Float64[np.ndarray, "_ 1"]) -> Float64[np.ndarray, "_ 1"]:
-        steps = np.abs(np.diff(values[:, 0]))
-        for turn in TURNS:
-            if (
-                np.ptp(values) <= 1.001 * turn
-                and (np.abs(steps[steps > 0.5 * turn] - turn) < 0.2 * turn).all()
-                and (steps > 0.5 * turn).any()
-            ):
-                return np.asarray(np.unwrap(values, period=turn, axis=0))
-        return values
 
-    return replace(pair, real=whole(pair.real), sim=whole(pair.sim))
+def continuous(values: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """Angles of one column without the jumps of a turn; other numbers as they are."""
+    steps = np.abs(np.diff(values.ravel()))
+    for turn in TURNS:
+        jumps = steps[steps > 0.5 * turn]
+        if np.ptp(values) <= 1.001 * turn and len(jumps) and (np.abs(jumps - turn) < 0.2 * turn).all():
+            return np.asarray(np.unwrap(values, period=turn, axis=0))
+    return values
 
 
 def in_radians(pair: SignalPair) -> tuple[SignalPair, str]:

@@ -111,8 +111,9 @@ class _Kept:
         inside = np.clip(u, -theta[0], theta[0])
         kept, needed = (u - inside if self.limits else inside), s.y[:, self.joint]
         passed = np.mean((np.abs(u) < theta[0]) == self.limits)
-        unlike = np.var(u - kept - needed) - passed * white_noise(u[:, None])[0] ** 2
-        return s.with_added(self.joint, kept) if unlike < UNLIKE**2 * np.var(needed) else s
+        size, noise = np.var(needed), white_noise(u[:, None])[0] ** 2
+        unlike = np.var(u - kept - needed) - passed * min(noise, size)
+        return s.with_added(self.joint, kept) if unlike < UNLIKE**2 * size else s
 
 
 def _delayed(taken_s: Samples, theta: Theta) -> Samples:

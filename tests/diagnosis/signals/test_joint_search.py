@@ -15,9 +15,10 @@ from imutool.diagnosis.signals import signal_diagnosis
 from imutool.diagnosis.signals.aligned_signal import aligned
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.noise import LEARNT_ERROR, SMALL_GAIN, learnt_errors, whitened
-from imutool.diagnosis.signals.quantities import in_radians
+from imutool.diagnosis.signals.quantities import continuous, in_radians
 from imutool.diagnosis.signals.signal_constants import as_torques
 from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
+from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 
 JOINTS, RATE_HZ, DURATION_S = 2, 100.0, 30.0
@@ -192,3 +193,30 @@ def test_angles_of_motors_before_their_gears_are_no_degrees() -> None:
     changed, remark = in_radians(given)
     assert changed is given
     assert not remark
+
+
+@pytest.mark.parametrize("log", ["recording", "simulation"])
+def test_an_arm_whose_velocity_is_no_rate_of_its_position_is_refused(log: str) -> None:
+    """A motor turns on at a velocity of its own, as that of a slipping joint does: no dynamics join the two."""
+    given, part = pair(), "state" if log == "recording" else "sim_state"
+    state = dict(getattr(given, part))
+    state["dq1"] = replace(state["dq1"], values=state["dq1"].values - 80.0)
+    with pytest.raises(DataError, match=rf"effort\[1\] is not the rate of the position in the {log}"):
+        aligned(replace(given, **{part: state}), {}, DiagnoseSettings())
+
+
+def test_a_velocity_that_is_late_and_filtered_is_the_rate_of_its_position() -> None:
+    given = pair()
+    late = {
+        name: replace(own, values=np.interp(np.arange(len(own)) - 5.0, np.arange(len(own)), own.values))
+        if name.startswith("dq")
+        else own
+        for name, own in given.state.items()
+    }
+    assert aligned(replace(given, state=late), {}, DiagnoseSettings()).columns == JOINTS
+
+
+def test_angles_that_wrap_are_continuous_and_others_stay() -> None:
+    turning = 0.05 * np.arange(400)
+    assert np.allclose(continuous(np.mod(turning, 2.0 * np.pi)), turning)
+    assert continuous(turning) is turning
