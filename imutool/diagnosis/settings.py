@@ -137,6 +137,7 @@ class SignalSettings(Settings, frozen=True):
     same_grid: Share = 0.01  # relative difference of two LSBs that are one
     motion_band_hz: Positive = 15.0  # of the motion of joints: above, accelerations are noise
     motion_band_share: Share = 0.15  # of the sample rate, for slower logs
+    motion_beyond_band: Share = 0.3  # of the squared velocities above it, from which on a motion is faster than its band
     copy_correlation: Share = 0.98  # of another channel, above which it is a copy of the signal
 
 

@@ -13,7 +13,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.diagnosis.signals import signal_diagnosis
 from imutool.diagnosis.signals.aligned_signal import aligned
-from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.ideal_signal import SignalPair, band_hz
 from imutool.diagnosis.signals.noise import LEARNT_ERROR, SMALL_GAIN, learnt_errors, whitened
 from imutool.diagnosis.signals.quantities import continuous, in_radians
 from imutool.diagnosis.signals.signal_constants import as_torques
@@ -220,3 +220,41 @@ def test_angles_that_wrap_are_continuous_and_others_stay() -> None:
     turning = 0.05 * np.arange(400)
     assert np.allclose(continuous(np.mod(turning, 2.0 * np.pi)), turning)
     assert continuous(turning) is turning
+
+
+def oscillating(f_hz: float, size: float) -> SignalPair:
+    """The arm whose recorded motion oscillates, at efforts that fit it."""
+    given, state = pair(), dict[str, Fields]()
+    w, t = 2.0 * np.pi * f_hz, np.arange(len(given.real_ns)) / RATE_HZ
+    for name, own in given.state.items():
+        wave = np.sin(w * t) if name.startswith("q") else w * np.cos(w * t)
+        state[name] = replace(own, values=own.values + size * wave)
+    return replace(given, state=state)
+
+
+def test_a_motion_is_compared_as_far_as_it_goes_where_samples_can_be_differentiated() -> None:
+    settings, fast = DiagnoseSettings().signal, oscillating(19.0, 0.1).state
+    assert band_hz(pair().state, 200.0, settings) == settings.motion_band_hz
+    assert band_hz(fast, 2.0 * RATE_HZ, settings) == settings.motion_band_share * 2.0 * RATE_HZ
+
+
+def test_an_arm_that_oscillates_too_fast_for_its_samples_is_refused() -> None:
+    with pytest.raises(DataError, match="faster than 15 Hz, as where a controller oscillates"):
+        aligned(oscillating(30.0, 0.1), {}, DiagnoseSettings())
+    assert aligned(oscillating(30.0, 1e-4), {}, DiagnoseSettings()).columns == JOINTS
+
+
+def test_efforts_that_oscillate_and_act_late_are_no_currents() -> None:
+    """A delay of a quarter of a period: commands are unlike what the motion needs, and no gain of theirs is."""
+    given, late_s = pair(), 0.028
+    t, w = np.arange(len(given.real_ns)) / RATE_HZ, 2.0 * np.pi * 9.0
+    q, dq, ddq = (0.3 * w**n * np.sin(w * t + 0.5 * np.pi * n) for n in range(3))
+    both = np.stack([q, -0.7 * q]), np.stack([dq, -0.7 * dq]), np.stack([ddq, -0.7 * ddq])
+    state = {
+        f"{kind}{k}": Fields(given.real_ns, values[k]) for kind, values in zip(("q", "dq"), both, strict=False) for k in (0, 1)
+    }
+    tau = efforts(*both)
+    ahead = np.stack([np.interp(t + late_s, t, column) for column in tau.T], axis=1)
+    found_effects = found(replace(given, state=state, real=ahead))
+    assert list(found_effects) == [("actuator_delay", "/joints")]
+    assert abs(found_effects["actuator_delay", "/joints"]["delay"].value - late_s) < 0.003
