@@ -154,8 +154,7 @@ def _ahead_s(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], t_s: 
 def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: str) -> None:
     """Refuses velocities that are no rates of the positions beside them.
 
-    They are compared by the way of each second: a velocity that is filtered, or late, goes the same way, but for a small part of
-    the joint's range.
+    They are compared by the way of each second: a velocity that is filtered, or late, goes the same way but for a small part.
 
     Raises:
         DataError: a joint goes another way by its velocity than by its position.

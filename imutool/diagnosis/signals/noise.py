@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
+import msgspec
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.signal import welch
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
-from imutool.diagnosis.estimation.gauss_newton import Fit
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.noise_estimate import ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.unnamed_effects import SplineBasis
 from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
 from imutool.diagnosis.held_out import held_out_rms, with_effects
+from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, Column
 from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.scalar_effects import without_phase
+from imutool.sensor.effect import Effect
 
 RICH_KNOTS = 12
 INTERPOLATION_ERROR = 1e-5  # of a signal's size, between the stamps of two logs; the digits of a sensor are coarser
 LEARNT_ERROR = 0.003  # of the efforts themselves
+LOW_PASS = "low_pass"
+LAG_SHARE = 0.5  # of what a low-pass removes: its lag has to explain as much
 SMALL_GAIN = 3e-3  # of the largest effect's squares, which such an error may take (5 % of its size)
 
 
@@ -169,3 +175,24 @@ def learnt_errors(log: WhitenedLog, found: Fit) -> dict[str, Float64[np.ndarray,
         positive = np.array([parameter.positive for parameter in effect.parameters])  # fitted by their logarithm
         out[effect.key] = np.sqrt(squares[found.place(effect.key)]) * np.where(positive, theta, 1.0)
     return out
+
+
+def with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Float64[np.ndarray, " _"]]) -> Finding:
+    """Finding with no parameter surer than the dynamics against which it was measured; a curve has none."""
+    by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
+    parameters = {
+        name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
+        for name, one in finding.parameters.items()
+    }
+    return msgspec.structs.replace(finding, parameters=parameters)
+
+
+def smooths_noise(log: WhitenedLog, found: Fit) -> bool:
+    """Whether a low-pass does little but smooth what is left of the simulation's own noise: it explains no lag."""
+    for effect, theta in found.chosen:
+        if effect.name == LOW_PASS:
+            others = tuple(one for one in found.chosen if one[0].key != effect.key)
+            lagless = replace(effect, forward=without_phase)
+            without, smoothed = (fit([log], chosen, part="all") for chosen in (others, (*others, (lagless, theta))))
+            return smoothed.objective - found.objective < LAG_SHARE * (without.objective - found.objective)
+    return False

@@ -258,3 +258,34 @@ def test_efforts_that_oscillate_and_act_late_are_no_currents() -> None:
     found_effects = found(replace(given, state=state, real=ahead))
     assert list(found_effects) == [("actuator_delay", "/joints")]
     assert abs(found_effects["actuator_delay", "/joints"]["delay"].value - late_s) < 0.003
+
+
+def stuck(seed: int, coulomb: float, stribeck: float, slow: float) -> tuple[np.ndarray, dict[str, Fields], np.ndarray]:
+    """A pendulum that sticks where it turns round: dry friction takes a part of its impulse, or all of it."""
+    rng, h, each = np.random.default_rng(seed), 0.001, round(1000.0 / RATE_HZ)
+    w, phase = 2.0 * np.pi * rng.uniform(0.05, 0.5, 5), rng.uniform(0.0, 6.0, 5)
+    inertia, weight = MASSES[1] * LENGTH**2, MASSES[1] * LENGTH * G
+    t = h * np.arange(round(DURATION_S / h))
+    wanted, speed, rate = ((w**n * np.sin(np.outer(t, w) + phase + 0.5 * np.pi * n)).sum(axis=1) / 3.0 for n in range(3))
+    q, v, rows = float(wanted[0]), float(speed[0]), []
+    for k in range(len(t)):
+        tau = inertia * (rate[k] + 300.0 * (wanted[k] - q) + 30.0 * (speed[k] - v)) + weight * np.cos(q)
+        if k % each == 0:
+            rows.append((q, v, tau))
+        free = v + h * (tau - weight * np.cos(q)) / inertia
+        level = h * (coulomb + stribeck * np.exp(-((v / slow) ** 2))) / inertia
+        v = float(np.sign(free) * max(abs(free) - level, 0.0))
+        q += h * v
+    (q_, v_, tau_), t_ns = np.array(rows).T, np.round(1e18 + t[::each] * 1e9).astype(np.int64)
+    noisy = [values + size * rng.normal(size=len(values)) for values, size in ((v_, 5e-4), (tau_, 0.004))]
+    return t_ns, {"q0": Fields(t_ns, q_), "dq0": Fields(t_ns, noisy[0])}, noisy[1][:, None]
+
+
+def test_what_a_joint_that_sticks_leaves_is_no_delay() -> None:
+    """The effort runs from one level to the other while the joint rests, as if it acted late."""
+    (real_ns, state, real), (sim_ns, sim_state, sim) = stuck(1, 1.0, 0.8, 0.1), stuck(2, 0.0, 0.0, 0.1)
+    names, units = ("/joints.effort[0]",), ("N m",)
+    effects = found(SignalPair("/joints", names, units, real_ns, real, sim_ns, sim, "efforts", state, sim_state))
+    assert {name for name, _ in effects} == {"coulomb_friction", "stribeck_friction"}
+    levels = {name: parameters["level"].value for (name, _), parameters in effects.items()}
+    assert levels == {"coulomb_friction": pytest.approx(1.0, abs=0.02), "stribeck_friction": pytest.approx(0.8, abs=0.05)}
