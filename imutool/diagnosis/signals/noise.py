@@ -126,15 +126,14 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if not selection.selected:
         return selection, []
-    size, least, of = np.array(pair.scale().size), 0.0, _changes if pair.band_hz is None else _sizes
+    size, of = np.array(pair.scale().size), _changes if pair.band_hz is None else _sizes
     sizes = np.stack([of(log, selection, selected) for selected in selection.selected])
     enough = INTERPOLATION_ERROR * size
     if pair.band_hz is not None:
-        least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
         enough = np.maximum(LEARNT_ERROR * size, np.sqrt(SMALL_GAIN) * sizes.max(axis=0))
     kept, small = list[SelectedEffect](), list[SelectedEffect]()
     for selected, own in zip(selection.selected, sizes, strict=True):
-        (kept if selected.gain >= least and (own >= enough).any() else small).append(selected)
+        (kept if (own >= enough).any() else small).append(selected)
     names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors or pair.names)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names
 
@@ -178,7 +177,7 @@ def learnt_errors(log: WhitenedLog, found: Fit) -> dict[str, Float64[np.ndarray,
 
 
 def with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Float64[np.ndarray, " _"]]) -> Finding:
-    """Finding with no parameter surer than the dynamics against which it was measured; a curve has none."""
+    """Finding with no parameter surer than the dynamics that were learnt; a curve has none."""
     by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
     parameters = {
         name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
@@ -188,7 +187,7 @@ def with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Flo
 
 
 def smooths_noise(log: WhitenedLog, found: Fit) -> bool:
-    """Whether a low-pass does little but smooth what is left of the simulation's own noise: it explains no lag."""
+    """Whether a low-pass smooths what is left of the simulation's own noise: it explains no lag."""
     for effect, theta in found.chosen:
         if effect.name == LOW_PASS:
             others = tuple(one for one in found.chosen if one[0].key != effect.key)
