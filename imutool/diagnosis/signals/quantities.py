@@ -10,8 +10,10 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion
+from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
+from imutool.recording import seconds
 from imutool.sensor.robot_effects.joint_dynamics import identified
 
 FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
@@ -80,13 +82,13 @@ def _is_chain(pair: SignalPair, settings: DiagnoseSettings) -> bool:
 def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
     """Both logs in one unit, where they differ by a known factor.
 
-    It is the message's unit where the size of the values shows it, else the simulation's.
+    It is the message's unit where the size of the values shows it, else the simulation's. Two noises differ by any factor.
     """
     sizes = [float(np.linalg.norm(np.std(values, axis=0))) for values in (pair.real, pair.sim)]
     ratio = np.log(max(sizes[0], 1e-300) / max(sizes[1], 1e-300))
     factors, error = ({1e3: "thousands"}, OTHER_MOTION_ERROR) if pair.sim_state else (FACTORS, FACTOR_ERROR)
     for factor, word in factors.items():
-        if abs(abs(ratio) - np.log(factor)) < error:
+        if abs(abs(ratio) - np.log(factor)) < error and (pair.sim_state or _is_one_motion(pair)):
             larger, changed = bool(ratio > 0.0), "sim" if _is_usual(pair) else "real"
             by = factor if larger != (changed == "real") else 1.0 / factor
             text = (
@@ -96,6 +98,16 @@ def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
             )
             return replace(pair, **{changed: getattr(pair, changed) * by}), text
     return pair, ""
+
+
+def _is_one_motion(pair: SignalPair) -> bool:
+    """Whether both logs move alike."""
+    t_real, t_sim = (seconds(t_ns, int(pair.real_ns[0])) for t_ns in (pair.real_ns, pair.sim_ns))
+    try:
+        lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, DiagnoseSettings())
+    except DataError:
+        return False
+    return True
 
 
 def _is_usual(pair: SignalPair) -> bool:
