@@ -21,6 +21,7 @@ OVERLAP = 4  # windows begin a quarter of a window apart
 INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequencies (noise alone: 0.5 and 0.67)
 CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
+ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the power, no noise
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
 Parts = Complex128[np.ndarray, "f t k"]
 
@@ -103,7 +104,10 @@ def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Floa
 
 
 def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:
-    """Noise of the parts by frequency: by those that are not shared, and as white as the top where none are."""
+    """Noise of the parts by frequency: by those that are not shared, and as white as the top where nothing is compared.
+
+    Where a recording shares almost all, there is none: shocks of contacts are as white as a noise.
+    """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
     out = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1))
@@ -114,6 +118,8 @@ def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: W
         if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
+        elif column.mean() > ALMOST_ALL:
+            out[:, k] = NO_NOISE * power[:, k].max()
     return np.asarray(np.sqrt(np.maximum(out, 1e-300)))
 
 

@@ -72,3 +72,12 @@ def test_the_noise_that_is_left_under_a_motion_is_told_with_its_density(seed: in
 def test_white_noise_gets_no_colour_from_what_it_shares_by_chance(seed: int) -> None:
     x, recorded = np.random.default_rng(seed).normal(size=(2, 2_400, 6))
     assert np.array_equal(denoised(x, 100.0, recorded=recorded)[0], wiener_filter(x, 100.0))
+
+
+def test_nothing_is_taken_from_shocks_that_a_recording_shares() -> None:
+    """Contacts of a legged robot, differentiated at every step: as white as a noise, and in both logs."""
+    rng = np.random.default_rng(4)
+    x = motion(0) + rng.normal(size=(24_000, 3)) * (rng.random((24_000, 1)) < 0.2)
+    recorded = x + 0.01 * rng.normal(size=x.shape)
+    off = denoised(x, RATE_HZ, recorded=recorded)[0] - x
+    assert np.sqrt((off**2).mean()) < 1e-6
