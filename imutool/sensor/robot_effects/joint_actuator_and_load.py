@@ -25,7 +25,7 @@ USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
 SPREAD_M = 0.1  # of a payload about its centre
 OFFSET_M = 0.1  # of two axes of a wrist
-UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
+UNLIKE, NOISIEST = 0.5, 2.0  # of the needed effort: what acts may differ from it so much, and beyond that by such a noise
 PLAUSIBLE_S, MOVED = 0.05, 0.005
 LONGEST_S, LEAST_DELAYS, MOST_DELAYS = 0.08, 5, 40  # of a delay to start from, and how many are looked at
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
@@ -113,7 +113,7 @@ class _Kept:
         kept, needed = (u - inside if self.limits else inside), s.y[:, self.joint]
         passed = np.mean((np.abs(u) < theta[0]) == self.limits)
         size, noise = np.var(needed), white_noise(u[:, None])[0] ** 2
-        unlike = np.var(u - kept - needed) - passed * min(noise, size)
+        unlike = np.var(u - kept - needed) - passed * min(noise, NOISIEST**2 * size)
         return s.with_added(self.joint, kept) if unlike < UNLIKE**2 * size else s
 
 
