@@ -21,8 +21,8 @@ OVERLAP = 4  # windows begin a quarter of a window apart
 INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequencies (noise alone: 0.5 and 0.67)
 CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
+ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the top, no noise
 CALM = 1.2  # times `white_noise`, that pure white noise is
-LEAST_NOISE = 1e-12  # of what the top holds
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
 Parts = Complex128[np.ndarray, "f t k"]
 
@@ -71,8 +71,8 @@ def denoised(
     y = x - line
     mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
     parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
-    calm = white_noise(x) * CALM * np.sqrt((stft.win**2).sum())
-    std = _noise_std(parts, calm, None if recorded is None else _shared(x, recorded, stft, settings), settings)[:, None]
+    shared = None if recorded is None else _shared(x, recorded, stft, settings)
+    std = _noise_std(parts, shared, settings)[:, None]
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
     power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")
@@ -86,6 +86,8 @@ def denoised(
     gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
     left = 2.0 * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0] / (rate_hz * float((stft.win**2).sum()))
+    if shared is not None:  # as much as calm samples show, of which the filter took nothing
+        left = np.where(shared.mean(axis=0) > ALMOST_ALL, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
     return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
 
 
@@ -105,12 +107,10 @@ def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Floa
     return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
 
 
-def _noise_std(
-    parts: Parts, calm: Float64[np.ndarray, " k"], shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings
-) -> Float64[np.ndarray, "f k"]:
-    """Noise of the parts by frequency: by those that are not shared, and as white as the top where none are.
+def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:
+    """Noise of the parts by frequency: by those that are not shared, and as white as the top where nothing is compared.
 
-    Where all are shared, as impacts are, the top is motion: then the noise is no more than between impacts, `calm`.
+    Where almost all are shared it cannot be told from the motion, and none is taken.
     """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
@@ -122,8 +122,8 @@ def _noise_std(
         if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
-        elif column.all():
-            out[:, k] = np.minimum(out[:, k], np.maximum(calm[k] ** 2, LEAST_NOISE * out[:, k]))
+        elif column.mean() > ALMOST_ALL:
+            out[:, k] = NO_NOISE * power[:, k].max()
     return np.asarray(np.sqrt(np.maximum(out, 1e-300)))
 
 

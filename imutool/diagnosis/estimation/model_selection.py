@@ -16,7 +16,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
-from imutool.diagnosis.estimation.noise_estimate import is_coloured_noise, with_bias_walk
+from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise, with_bias_walk
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
     WANDER,
@@ -96,15 +96,16 @@ def select_effects(
 def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[Sequence[Effect]]) -> tuple[_Search, Fit]:
     """Fit after effects came in one by one, until no candidate explains more than chance."""
     search, settings, waiting = replace(first, unnamed=tuple(unnamed)), first.settings, list(later)
-    before, largest = first.before, 0.0  # squares left, and those of the largest effect
+    before, largest = first.before, np.zeros(first.logs[0].pair.columns)  # squares left, and by column the largest effect's
     for _ in range(settings.rounds):
         count = len(now.chosen) - len(first.always)
         search.progress(" with ".join([f"{len(search.named) + len(search.unnamed)} effects", *now.keys[len(first.always) :]]))
         hopeless = count > settings.suspicious_effects and now.objective > settings.hopeless_chi_square * now.numbers
         hopeless &= before - now.objective < settings.hopeless_share * (before - now.numbers)
         better = search.added(now) if count < settings.most_effects and not hopeless else None
-        if better is not None and now.objective - better.objective >= settings.negligible_share * largest:
-            largest = max(largest, now.objective - better.objective)
+        gained = axis_squares(now) - axis_squares(better or now)
+        if better is not None and gained.max() >= settings.negligible_share * largest[gained.argmax()]:
+            largest = np.maximum(largest, gained)
             before, now = now.objective, search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
@@ -155,8 +156,7 @@ class _Search:
             if effect.key not in self.trials:
                 limit = now.objective - (0.0 if best is None else share * (now.objective - best[1].objective))
                 self.trials[effect.key] = self.tried_with(now.chosen, effect, start, now, limit)
-            trial = self.trials[effect.key]
-            added_effect, theta = trial.chosen[-1]
+            added_effect, theta = (trial := self.trials[effect.key]).chosen[-1]
             if not added_effect.parameters or beyond_the_band(added_effect, theta, self.logs, self.settings):
                 continue
             log_p = self.candidates.log_p(added_effect, now.objective - trial.objective)

@@ -158,6 +158,12 @@ def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
     return all(vibration.line_p_value(residual, rate_hz, theta[0]) > chance for residual, rate_hz in without)
 
 
+def axis_squares(found: Fit) -> Axes:
+    """Squares of white residuals by axis."""
+    each = zip(found.logs, found.residuals, found.bias, strict=True)
+    return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
+
+
 def squares_of_walk(found: Fit, like: Fit) -> float:
     """Squares that random walks of the biases explain of a fit's residual.
 

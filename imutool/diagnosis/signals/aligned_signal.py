@@ -142,7 +142,7 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
         end_s = ideal.start_s + len(ideal.fine) / ideal.rate_hz
         t_real = seconds(pair.real_ns, start_ns)
         rows = np.flatnonzero((t_real > ideal.start_s + ENDS_S) & (t_real < end_s - ENDS_S))
-        band = band_hz(ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
+        band = band_hz(pair.state, ideal.rate_hz, settings.signal) if isinstance(ideal.relation, Dynamics) else None
         return _aligned(pair, ideal, rows, t_real, density, settings, band_hz=band)
     t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
     lag_s, aligned_s = 0.0, pair.clock_s or None

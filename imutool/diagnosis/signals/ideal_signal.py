@@ -8,6 +8,7 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import make_interp_spline
 from scipy.signal import firwin, welch
 
@@ -25,6 +26,8 @@ from imutool.sensor.robot_effects.wheel import WheelRelation
 MOST_FINE = 20_000_000  # samples
 WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
 STEP_ROUNDS = 3
+SEGMENT = 512  # samples of a velocity's spectrum
+WAY_S, CONTRADICTS = 1.0, 0.5  # of a way by velocity and by position, and the share of it by which the two may differ
 ENDS_S = 0.5  # of a motion, where its derivatives are not known
 Column = Float64[np.ndarray, "_"]
 
@@ -88,6 +91,10 @@ def at_recorded_motion(
     Raises:
         DataError: the columns of the simulation do not follow from its state.
     """
+    for side, log in ((pair.state, "recording"), (pair.sim_state, "simulation")):
+        _refuse_contradictory(side, pair, log)
+    if pair.kind == "efforts":
+        _refuse_fast(pair, settings.signal)
     sim_s, _, sim_state = motion(pair.sim_state, settings)
     own_s = seconds(pair.sim_ns, int(next(iter(pair.sim_state.values())).t_ns[0]))
     inside = (own_s > sim_s[0] + ENDS_S) & (own_s < sim_s[-1] - ENDS_S)
@@ -144,6 +151,37 @@ def _ahead_s(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], t_s: 
     return float(((y - x) / y.std(axis=0) * slope).sum() / max(float((slope**2).sum()), 1e-300))
 
 
+def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: str) -> None:
+    """Refuses velocities that are no rates of the positions beside them.
+
+    They are compared by the way of each second: a velocity that is filtered, or late, goes the same way but for a small part.
+
+    Raises:
+        DataError: a joint goes another way by its velocity than by its position.
+    """
+    contradictions = list[tuple[float, float, float, str]]()
+    for label in (label for label in state if label.startswith("q") and f"d{label}" in state):
+        position, velocity = state[label], state[f"d{label}"]
+        start_ns = int(position.t_ns[0])
+        t_s, own_s = seconds(position.t_ns, start_ns), seconds(velocity.t_ns, start_ns)
+        at_s = np.arange(max(0.0, own_s[0]), min(t_s[-1], own_s[-1]), WAY_S)
+        gone = np.interp(at_s, own_s, cumulative_trapezoid(velocity.values, own_s, initial=0))
+        ways = np.diff([np.interp(at_s, t_s, position.values), gone], axis=1)
+        if ways.size:
+            by_position, by_velocity, apart = np.sqrt((np.stack([*ways, ways[1] - ways[0]]) ** 2).mean(axis=1))
+            share = float(apart / max(by_position, by_velocity, position.values.std(), 1e-300))
+            contradictions.append((share, by_velocity, by_position, pair.names[int(label.removeprefix("q"))]))
+    share, by_velocity, by_position, name = max(contradictions, default=(0.0, 0.0, 0.0, ""))
+    if share > CONTRADICTS:
+        raise DataError(
+            f"the velocity beside {name} is not the rate of the position in the {log}:"
+            f" {by_velocity:.3g} rad a second by the one, {by_position:.3g} by the other",
+            where=name,
+            expected="velocities that are the rates of the positions",
+            fix="Record both of the same joint and in one unit, or the positions alone",
+        )
+
+
 def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Column, float, dict[str, Column]]:
     """State on an even clock (s from its first sample), slow enough to be differentiated.
 
@@ -155,7 +193,7 @@ def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Co
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
     at_s = np.arange(int((t_s[-1] - t_s[0]) * rate_hz) + 1) / rate_hz
     even = np.stack([np.interp(at_s, t_s, own.values) for own in fields.values()], axis=1)
-    cutoff_hz = WIDER * band_hz(rate_hz, settings.signal)
+    cutoff_hz = WIDER * band_hz(fields, rate_hz, settings.signal)
     slow = Band(firwin(2 * round(FILTER_PERIODS * rate_hz / cutoff_hz) + 1, cutoff_hz, fs=rate_hz), 1)
     line = even[0] + np.outer(at_s / at_s[-1], even[-1] - even[0])  # beyond its ends a filter sees zeros
     out = dict(zip(fields, (line + slow(even - line)).T, strict=True))
@@ -169,9 +207,44 @@ def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Co
     return at_s, rate_hz, out
 
 
-def band_hz(rate_hz: float, settings: SignalSettings) -> float:
-    """Frequency up to which a motion is compared: above, its accelerations are noise."""
-    return min(settings.motion_band_hz, settings.motion_band_share * rate_hz)
+def band_hz(fields: Mapping[str, Fields], rate_hz: float, settings: SignalSettings) -> float:
+    """Frequency up to which a motion is compared: above, its accelerations are noise.
+
+    A motion that is faster, as where a controller oscillates, is compared as far as its samples can be differentiated.
+    """
+    most_hz = settings.motion_band_share * rate_hz
+    slow_hz = min(settings.motion_band_hz, most_hz)
+    return most_hz if _faster(fields, rate_hz, slow_hz) > settings.motion_beyond_band else slow_hz
+
+
+def _faster(fields: Mapping[str, Fields], rate_hz: float, above_hz: float) -> float:
+    """Share of the squared velocities of all joints above a frequency."""
+    total, fast = 0.0, 0.0
+    for name, own in fields.items():
+        rates = own.values if name.startswith("dq") else np.gradient(own.values) * rate_hz
+        if name.startswith("dq") or (name.startswith("q") and f"d{name}" not in fields):
+            f_hz, power = welch(rates, rate_hz, nperseg=min(SEGMENT, len(rates)))
+            total, fast = total + float(power.sum()), fast + float(power[f_hz > above_hz].sum())
+    return fast / max(total, 1e-300)
+
+
+def _refuse_fast(pair: SignalPair, settings: SignalSettings) -> None:
+    """Refuses an arm whose motion is too fast for its samples to be differentiated.
+
+    Raises:
+        DataError: a good part of the velocities is above the highest frequency that is compared.
+    """
+    for state, log in ((pair.state, "recording"), (pair.sim_state, "simulation")):
+        rate_hz = 1e9 / float(np.median(np.diff(next(iter(state.values())).t_ns)))
+        most_hz = settings.motion_band_share * rate_hz
+        if (share := _faster(state, rate_hz, most_hz)) > settings.motion_beyond_band:
+            raise DataError(
+                f"{share:.0%} of the squared velocities of {pair.name} in the {log} are faster than {most_hz:.3g} Hz,"
+                " as where a controller oscillates",
+                where=pair.name,
+                expected=f"a motion that {rate_hz:.4g} samples a second can be differentiated for",
+                fix="Record faster, or with a calmer controller",
+            )
 
 
 def _slope(t_s: Column, values: Column) -> Column:

@@ -9,7 +9,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
-from imutool.diagnosis.signals.quantities import unwrapped
+from imutool.diagnosis.signals.quantities import continuous, unwrapped
 from imutool.errors import LogError
 from imutool.mcap_io.fields import Fields, decoder_of
 from imutool.mcap_io.log import Log
@@ -91,7 +91,10 @@ def _efforts(topic: str, moving: Sequence[str], mine: Mapping[str, Fields], othe
     for side in (mine, other):
         paths = [f"{word}{k}" for k in moving for word in JOINT_UNITS if f"{word}{k}" in side]
         t_ns, values = stacked([side[path] for path in paths])
-        known = {path: Fields(t_ns, column) for path, column in zip(paths, values.T, strict=True)}
+        columns = (
+            continuous(column) if path.startswith("position") else column for path, column in zip(paths, values.T, strict=True)
+        )
+        known = {path: Fields(t_ns, column) for path, column in zip(paths, columns, strict=True)}
         sides.append(known)
         words = (("q", "position"), ("dq", "velocity"))
         named = {f"{short}{n}": f"{word}{k}" for n, k in enumerate(moving) for short, word in words}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
+import msgspec
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.signal import welch
@@ -18,9 +19,11 @@ from imutool.diagnosis.estimation.noise_estimate import ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
 from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
 from imutool.diagnosis.held_out import held_out_rms, with_effects
+from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings, NoiseSettings
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, Column
 from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.sensor.effect import Effect
 
 RICH_KNOTS = 12
 INTERPOLATION_ERROR = 1e-5  # of a signal's size, between the stamps of two logs; the digits of a sensor are coarser
@@ -120,15 +123,14 @@ def above_model_error(log: WhitenedLog, selection: Selection) -> tuple[Selection
     pair: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     if not selection.selected:
         return selection, []
-    size, least, of = np.array(pair.scale().size), 0.0, _changes if pair.band_hz is None else _sizes
+    size, of = np.array(pair.scale().size), _changes if pair.band_hz is None else _sizes
     sizes = np.stack([of(log, selection, selected) for selected in selection.selected])
     enough = INTERPOLATION_ERROR * size
     if pair.band_hz is not None:
-        least = SMALL_GAIN * max(selected.gain for selected in selection.selected)
         enough = np.maximum(LEARNT_ERROR * size, np.sqrt(SMALL_GAIN) * sizes.max(axis=0))
     kept, small = list[SelectedEffect](), list[SelectedEffect]()
     for selected, own in zip(selection.selected, sizes, strict=True):
-        (kept if selected.gain >= least and (own >= enough).any() else small).append(selected)
+        (kept if (own >= enough).any() else small).append(selected)
     names = [f"{selected.effect.name} of {', '.join(selected.effect.sensors or pair.names)}" for selected in small]
     return replace(selection, selected=tuple(kept)), names
 
@@ -169,3 +171,13 @@ def learnt_errors(log: WhitenedLog, found: Fit) -> dict[str, Float64[np.ndarray,
         positive = np.array([parameter.positive for parameter in effect.parameters])  # fitted by their logarithm
         out[effect.key] = np.sqrt(squares[found.place(effect.key)]) * np.where(positive, theta, 1.0)
     return out
+
+
+def with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Float64[np.ndarray, " _"]]) -> Finding:
+    """Finding with no parameter surer than the dynamics that were learnt; a curve has none."""
+    by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
+    parameters = {
+        name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
+        for name, one in finding.parameters.items()
+    }
+    return msgspec.structs.replace(finding, parameters=parameters)

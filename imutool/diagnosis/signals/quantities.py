@@ -10,8 +10,10 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion
+from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
+from imutool.recording import seconds
 from imutool.sensor.robot_effects.joint_dynamics import identified
 
 FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
@@ -27,19 +29,17 @@ USUAL = {"magnetic": 5e-5, "pressure": 1e5}
 
 def unwrapped(pair: SignalPair) -> SignalPair:
     """Angles that wrap, as continuous ones."""
+    return replace(pair, real=continuous(pair.real), sim=continuous(pair.sim))
 
-    def whole(values: Float64[np.ndarray, "_ 1"]) -> Float64[np.ndarray, "_ 1"]:
-        steps = np.abs(np.diff(values[:, 0]))
-        for turn in TURNS:
-            if (
-                np.ptp(values) <= 1.001 * turn
-                and (np.abs(steps[steps > 0.5 * turn] - turn) < 0.2 * turn).all()
-                and (steps > 0.5 * turn).any()
-            ):
-                return np.asarray(np.unwrap(values, period=turn, axis=0))
-        return values
 
-    return replace(pair, real=whole(pair.real), sim=whole(pair.sim))
+def continuous(values: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """Angles of one column without the jumps of a turn; other numbers as they are."""
+    steps = np.abs(np.diff(values.ravel()))
+    for turn in TURNS:
+        jumps = steps[steps > 0.5 * turn]
+        if np.ptp(values) <= 1.001 * turn and len(jumps) and (np.abs(jumps - turn) < 0.2 * turn).all():
+            return np.asarray(np.unwrap(values, period=turn, axis=0))
+    return values
 
 
 def in_radians(pair: SignalPair) -> tuple[SignalPair, str]:
@@ -82,13 +82,13 @@ def _is_chain(pair: SignalPair, settings: DiagnoseSettings) -> bool:
 def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
     """Both logs in one unit, where they differ by a known factor.
 
-    It is the message's unit where the size of the values shows it, else the simulation's.
+    It is the message's unit where the size of the values shows it, else the simulation's. Two noises differ by any factor.
     """
     sizes = [float(np.linalg.norm(np.std(values, axis=0))) for values in (pair.real, pair.sim)]
     ratio = np.log(max(sizes[0], 1e-300) / max(sizes[1], 1e-300))
     factors, error = ({1e3: "thousands"}, OTHER_MOTION_ERROR) if pair.sim_state else (FACTORS, FACTOR_ERROR)
     for factor, word in factors.items():
-        if abs(abs(ratio) - np.log(factor)) < error:
+        if abs(abs(ratio) - np.log(factor)) < error and (pair.sim_state or _is_one_motion(pair)):
             larger, changed = bool(ratio > 0.0), "sim" if _is_usual(pair) else "real"
             by = factor if larger != (changed == "real") else 1.0 / factor
             text = (
@@ -98,6 +98,16 @@ def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
             )
             return replace(pair, **{changed: getattr(pair, changed) * by}), text
     return pair, ""
+
+
+def _is_one_motion(pair: SignalPair) -> bool:
+    """Whether both logs move alike."""
+    t_real, t_sim = (seconds(t_ns, int(pair.real_ns[0])) for t_ns in (pair.real_ns, pair.sim_ns))
+    try:
+        lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, DiagnoseSettings())
+    except DataError:
+        return False
+    return True
 
 
 def _is_usual(pair: SignalPair) -> bool:

@@ -2,7 +2,8 @@
 
 Where efforts are motor currents, each joint has a gain. Currents differ from torques by a large factor of their own at each
 joint. Beside such a misfit all else is small, so that the factors have to be known before effects are searched for. A heavy
-load makes efforts larger as well, and so does a controller that asks for what a limit keeps back: all three are compared.
+load makes efforts larger as well, and so does a controller that asks for what a limit keeps back; efforts that oscillate and
+act late are unlike what a motion needs. All are compared.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ FAR_GAIN = 2.0  # of an actuator: no motor loses or gains as much, so that its e
 CERTAIN = 6.0  # deviations from which a constant is a finding
 REWEIGHTED, SMALL_LEFT = 20, 0.01  # times that a regression is, and the least residual that it weighs by, over their mean
 EXACT = 1e-3  # of an LSB, that its estimate may be off
-GAIN, LOAD, LIMIT = "actuator_gain", "payload", "torque_saturation"
+GAIN, LOAD, LIMIT, DELAY = "actuator_gain", "payload", "torque_saturation", "actuator_delay"
 Constants = Float64[np.ndarray, " k"]
 CONSTANTS = {
     "magnetic": ("hard_iron", "field += hard iron"),
@@ -56,7 +57,9 @@ def torque_constants(log: WhitenedLog, candidates: Sequence[Effect], always: Cho
     loads = [(load, start) for load in candidates if load.name == LOAD for start in signal.starts(load)]
     one = signal.columns == 1  # whose load is a gain and a rotor
     beside = (limited.chosen,) if one else (currents, torques, limited.chosen)
+    late = [(delay, start) for delay in candidates if delay.name == DELAY for start in signal.starts(delay)]
     trials = [fit([log], currents), limited, *(fit([log], (*base, load)) for base in beside for load in loads)]
+    trials += [fit([log], (*base, one)) for base in (currents, torques) for one in late]
     best = {effect.key: float(theta[0]) for effect, theta in min(trials, key=bic).chosen}
     constants = {name: best.get(effect.key, 1.0) for name, effect in zip(first, gains, strict=True)}
     return np.array(list(constants.values())) if _far(constants) else None

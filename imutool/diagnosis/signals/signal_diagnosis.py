@@ -10,14 +10,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64
 from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import noise_std
 from imutool.diagnosis.estimation.observability import unobservable
-from imutool.diagnosis.estimation.significance import scatter
+from imutool.diagnosis.estimation.significance import bic, scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import held_out_rms, noise_floor, unexplained_residuals, with_effects
 from imutool.diagnosis.localization import locate_findings
@@ -27,13 +26,13 @@ from imutool.diagnosis.signals import scalar_effects as common
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal, aligned
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.noise import (
-    LEARNT_ERROR,
     SMALL_GAIN,
     above_model_error,
     learnt_errors,
     lsb_of,
     rich_residual,
     whitened,
+    with_learnt_error,
 )
 from imutool.diagnosis.signals.signal_constants import (
     GAIN,
@@ -52,6 +51,7 @@ from imutool.mcap_io.fields import Fields
 from imutool.sensor.effect import Effect
 from imutool.sensor.robot_effects import joint_actuator_and_load, joint_friction, joint_transmission, wheel, world_sensors
 from imutool.sensor.robot_effects.joint_actuator_and_load import with_extent
+from imutool.sensor.robot_effects.joint_friction import holds, with_stiction
 
 CONVERTED = 2  # times that currents are made torques: a limit or dead band in amperes shows once all else is known
 MODEL_ERROR = 0.01  # of a misfit, that the error of learnt dynamics may be
@@ -152,7 +152,7 @@ def _with_own_search(signal: AlignedSignal) -> AlignedSignal:
 
 def _refined(log: WhitenedLog, selection: Selection, settings: DiagnoseSettings) -> Selection:
     """Selection with friction fitted where its joint slides, and a payload with its own inertia, if there are some."""
-    finer = {effect.key: with_extent(joint_friction.with_stiction(effect)) for effect, _ in selection.whole.chosen}
+    finer = {effect.key: with_extent(with_stiction(effect)) for effect, _ in selection.whole.chosen}
     if all(finer[effect.key] is effect for effect, _ in selection.whole.chosen):
         return selection
     chosen = [
@@ -176,6 +176,8 @@ def _selected(now: _Prepared) -> Selection:
     columns = range(signal.columns)
     driven = [effect for k in columns for effect in common.driven(signal, k)]
     named = _refined(log, select_effects([log], candidates, [driven], always=always), signal.settings)
+    if (resting := _beside_stiction(now, named, driven)) is not None:
+        named, candidates = resting
     left, largest = named.whole.objective - named.whole.numbers, max((one.gain for one in named.selected), default=0.0)
     settings = signal.settings.search
     if named.whole.reduced_chi_square < settings.explained_chi_square or left < settings.negligible_share * largest:
@@ -189,6 +191,22 @@ def _selected(now: _Prepared) -> Selection:
     before = fit([log], always, part="all").objective
     gain = selection.whole.objective - curved.whole.objective
     return curved if gain > CURVE_SHARE * (before - selection.whole.objective) else selection
+
+
+def _beside_stiction(now: _Prepared, found: Selection, driven: Sequence[Effect]) -> tuple[Selection, list[Effect]] | None:
+    """Selection beside joints that friction holds at rest, and its candidates; None where it is no better.
+
+    What a joint's rest leaves looks like a delay, for the joint turns when its effort does not.
+    """
+    settings = now.log.pair.settings
+    begin = tuple(entry for entry in found.whole.chosen if holds(entry[0]))
+    if not begin or found.whole.reduced_chi_square < settings.search.explained_chi_square:
+        return None
+    joints = {effect.sensors for effect, _ in begin}
+    candidates = [with_stiction(effect) if effect.sensors in joints else effect for effect in now.candidates]
+    trial = select_effects([now.log], candidates, [driven], always=now.always, begin=begin)
+    trial = _refined(now.log, trial, settings)
+    return (trial, candidates) if bic(trial.whole) < bic(found.whole) - settings.search.clearly_better else None
 
 
 def catalogue(signal: AlignedSignal) -> list[Effect]:
@@ -213,7 +231,7 @@ def _summarized(
     if pair.band_hz is not None:  # dynamics that were learnt are known to a share
         errors = learnt_errors(log, selection.whole)
         each = zip(findings, selection.selected, strict=True)
-        findings = [_with_learnt_error(finding, selected.effect, errors) for finding, selected in each]
+        findings = [with_learnt_error(finding, selected.effect, errors) for finding, selected in each]
     p_values = {name: min((f.p_value for f in findings if f.signal in (name, pair.name)), default=1.0) for name in names}
     place = partial(locate_findings, [pair], [before], [after], level, (), p_values, settings.localization)
     floor = level.copy()
@@ -258,16 +276,6 @@ def _with_python(finding: Finding) -> Finding:
     if finding.kind != "unknown" or finding.curve is not None:
         return finding
     return msgspec.structs.replace(finding, python=python(finding.variable, finding.signal.rpartition(".")[2]))
-
-
-def _with_learnt_error(finding: Finding, effect: Effect, errors: Mapping[str, Float64[np.ndarray, " _"]]) -> Finding:
-    """Finding with no parameter surer than the dynamics against which it was measured; a curve has none."""
-    by_name = {parameter.name: error for parameter, error in zip(effect.parameters, errors[effect.key].tolist(), strict=True)}
-    parameters = {
-        name: msgspec.structs.replace(one, std=float(np.linalg.norm([one.std, by_name[name], LEARNT_ERROR * one.value])))
-        for name, one in finding.parameters.items()
-    }
-    return msgspec.structs.replace(finding, parameters=parameters)
 
 
 def _unseen(log: WhitenedLog, candidates: Sequence[Effect], selection: Selection, settings: DiagnoseSettings) -> Iterator[str]:

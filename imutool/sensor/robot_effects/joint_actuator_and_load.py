@@ -18,15 +18,16 @@ import numpy as np
 from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics
-from imutool.sensor.robot_effects.signal_samples import Columns, Samples, SignalSamples, State
+from imutool.sensor.robot_effects.signal_samples import Columns, IdealSignal, Samples, SignalSamples, State
 from imutool.sensor.robot_effects.signal_sizes import Scale
 
 USUAL_ARM_M = 0.3  # of a payload, where gravity shows no length
 PLAUSIBLE_KG = 2.0
 SPREAD_M = 0.1  # of a payload about its centre
 OFFSET_M = 0.1  # of two axes of a wrist
-UNLIKE = 0.5  # of the needed effort, that what acts may differ from it
+UNLIKE, NOISIEST = 0.5, 2.0  # of the needed effort: what acts may differ from it so much, and beyond that by such a noise
 PLAUSIBLE_S, MOVED = 0.05, 0.005
+LONGEST_S, LEAST_DELAYS, MOST_DELAYS = 0.08, 5, 40  # of a delay to start from, and how many are looked at
 WIDTHS = (0.05, 0.15, 0.4)  # of a dead band, over the effort's standard deviation
 LIMITS = (0.5, 1.0, 1.5, 2.0)  # to start from, likewise
 ASKED = (0.05, 0.3)  # of the commands, the largest, while what acts is such a limit
@@ -111,27 +112,41 @@ class _Kept:
         inside = np.clip(u, -theta[0], theta[0])
         kept, needed = (u - inside if self.limits else inside), s.y[:, self.joint]
         passed = np.mean((np.abs(u) < theta[0]) == self.limits)
-        unlike = np.var(u - kept - needed) - passed * white_noise(u[:, None])[0] ** 2
-        return s.with_added(self.joint, kept) if unlike < UNLIKE**2 * np.var(needed) else s
+        size, noise = np.var(needed), white_noise(u[:, None])[0] ** 2
+        unlike = np.var(u - kept - needed) - passed * min(noise, NOISIEST**2 * size)
+        return s.with_added(self.joint, kept) if unlike < UNLIKE**2 * size else s
 
 
 def _delayed(taken_s: Samples, theta: Theta) -> Samples:
     return np.asarray(taken_s + theta[0])
 
 
+def _delays(ideal: IdealSignal, real: SignalSamples, turn_s: float) -> list[Theta]:
+    """None, and the delay that commands are most like: from others an effort that oscillates leads a period away."""
+    tried = np.linspace(0.0, LONGEST_S, int(np.clip(2.0 * LONGEST_S / turn_s, LEAST_DELAYS, MOST_DELAYS)))
+
+    def unlike(delay_s: float) -> float:
+        needed = ideal.sample(real.stamp_s + delay_s, real.stamp_s).x
+        return float((np.var(real.y - needed, axis=0) / np.maximum(np.var(real.y, axis=0), 1e-300)).sum())
+
+    return [np.zeros(1), np.array([min(tried[1:], key=unlike)])]
+
+
 def actuator_effects(scale: Scale) -> Iterator[Effect]:
     """Delay of all joints; gain, dead band and limit of each."""
-    step = MOVED * min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))
-    yield scale.effect(
+    turn_s = min(
+        size / slope for size, slope in zip(scale.size, scale.slope, strict=True)
+    )  # in which an effort turns by a radian
+    delay = scale.effect(
         "actuator_delay",
         scale.columns,
         "the effort acts `delay` after it is commanded",
-        (Parameter("delay", "s", PLAUSIBLE_S, step=step),),
+        (Parameter("delay", "s", PLAUSIBLE_S, step=MOVED * turn_s),),
         _delayed,
         "the effort varies",
         stage=Stage.CLOCK,
-        starts=[np.zeros(1), np.array([0.02]), np.array([0.06])],
     )
+    yield replace(delay, linear=False, starts=lambda ideal, real: _delays(ideal, real, turn_s))
     for k in scale.columns:
         yield from _of_joint(scale, k)
 

@@ -50,12 +50,18 @@ def with_stiction(effect: Effect) -> Effect:
     """Dry friction that holds a joint at rest; any other effect as it is.
 
     At rest the force is what the command leaves over, up to Coulomb's and Stribeck's level together (eq. 3 of the survey):
-    sliding alone shows the levels. It follows the recording there, and can therefore not be searched for.
+    sliding alone shows the levels. It follows the recording there, so that only sliding may bring it in; what else acts is then
+    searched for beside it.
     """
     forward = effect.forward
-    if not isinstance(forward, _Friction) or forward.kind == "viscous":
+    if not isinstance(forward, _Friction) or forward.kind == "viscous" or forward.holds:
         return effect
     return replace(effect, forward=replace(forward, holds=True), linear=False)
+
+
+def holds(effect: Effect) -> bool:
+    """Whether an effect is dry friction that holds a joint at rest."""
+    return isinstance(effect.forward, _Friction) and effect.forward.holds
 
 
 def friction_effects(scale: Scale) -> Iterator[Effect]:

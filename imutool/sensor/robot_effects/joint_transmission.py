@@ -23,6 +23,7 @@ STARTS = 2
 BINS_A_RADIAN = 4.0 * MOST_TEETH / np.pi  # eight to the shortest ripple
 MOST_BINS, FINER = 2**19, 7  # some 500 turns; so much closer than they are told apart are ripples tried
 PLAUSIBLE_RAD = 0.05
+MOST_ECCENTRIC = 0.3  # of its radius, that a disc is off its centre: beyond, a reading has several angles before long
 ROUNDS = 4  # to an angle from its reading: each leaves as much of the error as the disc is off its centre, of 0.1 rad 1e-5
 GAPS = (0.3, 1.0, 1.5)  # of a joint's play to start from, over twice the deviation of the misfit
 
@@ -72,6 +73,8 @@ class _Angle:
         q, dq, ddq = (ideal.state[f"{kind}{self.joint}"] for kind in ("q", "dq", "ddq"))
         if not self.eccentric:
             return ideal.with_state(**{f"q{self.joint}": q - theta[0]})
+        if np.hypot(*theta) > MOST_ECCENTRIC:
+            return ideal
         angle = q  # that of the joint: where its disc reads q
         for _ in range(ROUNDS):
             angle = q - theta[0] * np.sin(angle) - theta[1] * np.cos(angle)

@@ -13,11 +13,12 @@ from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.diagnosis.signals import signal_diagnosis
 from imutool.diagnosis.signals.aligned_signal import aligned
-from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.ideal_signal import SignalPair, band_hz
 from imutool.diagnosis.signals.noise import LEARNT_ERROR, SMALL_GAIN, learnt_errors, whitened
-from imutool.diagnosis.signals.quantities import in_radians
+from imutool.diagnosis.signals.quantities import continuous, in_radians
 from imutool.diagnosis.signals.signal_constants import as_torques
 from imutool.diagnosis.signals.signal_diagnosis import diagnose_signal
+from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
 
 JOINTS, RATE_HZ, DURATION_S = 2, 100.0, 30.0
@@ -192,3 +193,99 @@ def test_angles_of_motors_before_their_gears_are_no_degrees() -> None:
     changed, remark = in_radians(given)
     assert changed is given
     assert not remark
+
+
+@pytest.mark.parametrize("log", ["recording", "simulation"])
+def test_an_arm_whose_velocity_is_no_rate_of_its_position_is_refused(log: str) -> None:
+    """A motor turns on at a velocity of its own, as that of a slipping joint does: no dynamics join the two."""
+    given, part = pair(), "state" if log == "recording" else "sim_state"
+    state = dict(getattr(given, part))
+    state["dq1"] = replace(state["dq1"], values=state["dq1"].values - 80.0)
+    with pytest.raises(DataError, match=rf"effort\[1\] is not the rate of the position in the {log}"):
+        aligned(replace(given, **{part: state}), {}, DiagnoseSettings())
+
+
+def test_a_velocity_that_is_late_and_filtered_is_the_rate_of_its_position() -> None:
+    given = pair()
+    late = {
+        name: replace(own, values=np.interp(np.arange(len(own)) - 5.0, np.arange(len(own)), own.values))
+        if name.startswith("dq")
+        else own
+        for name, own in given.state.items()
+    }
+    assert aligned(replace(given, state=late), {}, DiagnoseSettings()).columns == JOINTS
+
+
+def test_angles_that_wrap_are_continuous_and_others_stay() -> None:
+    turning = 0.05 * np.arange(400)
+    assert np.allclose(continuous(np.mod(turning, 2.0 * np.pi)), turning)
+    assert continuous(turning) is turning
+
+
+def oscillating(f_hz: float, size: float) -> SignalPair:
+    """The arm whose recorded motion oscillates, at efforts that fit it."""
+    given, state = pair(), dict[str, Fields]()
+    w, t = 2.0 * np.pi * f_hz, np.arange(len(given.real_ns)) / RATE_HZ
+    for name, own in given.state.items():
+        wave = np.sin(w * t) if name.startswith("q") else w * np.cos(w * t)
+        state[name] = replace(own, values=own.values + size * wave)
+    return replace(given, state=state)
+
+
+def test_a_motion_is_compared_as_far_as_it_goes_where_samples_can_be_differentiated() -> None:
+    settings, fast = DiagnoseSettings().signal, oscillating(19.0, 0.1).state
+    assert band_hz(pair().state, 200.0, settings) == settings.motion_band_hz
+    assert band_hz(fast, 2.0 * RATE_HZ, settings) == settings.motion_band_share * 2.0 * RATE_HZ
+
+
+def test_an_arm_that_oscillates_too_fast_for_its_samples_is_refused() -> None:
+    with pytest.raises(DataError, match="faster than 15 Hz, as where a controller oscillates"):
+        aligned(oscillating(30.0, 0.1), {}, DiagnoseSettings())
+    assert aligned(oscillating(30.0, 1e-4), {}, DiagnoseSettings()).columns == JOINTS
+
+
+def test_efforts_that_oscillate_and_act_late_are_no_currents() -> None:
+    """A delay of a quarter of a period: commands are unlike what the motion needs, and no gain of theirs is."""
+    given, late_s = pair(), 0.028
+    t, w = np.arange(len(given.real_ns)) / RATE_HZ, 2.0 * np.pi * 9.0
+    q, dq, ddq = (0.3 * w**n * np.sin(w * t + 0.5 * np.pi * n) for n in range(3))
+    both = np.stack([q, -0.7 * q]), np.stack([dq, -0.7 * dq]), np.stack([ddq, -0.7 * ddq])
+    state = {
+        f"{kind}{k}": Fields(given.real_ns, values[k]) for kind, values in zip(("q", "dq"), both, strict=False) for k in (0, 1)
+    }
+    tau = efforts(*both)
+    ahead = np.stack([np.interp(t + late_s, t, column) for column in tau.T], axis=1)
+    found_effects = found(replace(given, state=state, real=ahead))
+    assert list(found_effects) == [("actuator_delay", "/joints")]
+    assert abs(found_effects["actuator_delay", "/joints"]["delay"].value - late_s) < 0.003
+
+
+def stuck(seed: int, coulomb: float, stribeck: float, slow: float) -> tuple[np.ndarray, dict[str, Fields], np.ndarray]:
+    """A pendulum that sticks where it turns round: dry friction takes a part of its impulse, or all of it."""
+    rng, h, each = np.random.default_rng(seed), 0.001, round(1000.0 / RATE_HZ)
+    w, phase = 2.0 * np.pi * rng.uniform(0.05, 0.5, 5), rng.uniform(0.0, 6.0, 5)
+    inertia, weight = MASSES[1] * LENGTH**2, MASSES[1] * LENGTH * G
+    t = h * np.arange(round(DURATION_S / h))
+    wanted, speed, rate = ((w**n * np.sin(np.outer(t, w) + phase + 0.5 * np.pi * n)).sum(axis=1) / 3.0 for n in range(3))
+    q, v, rows = float(wanted[0]), float(speed[0]), []
+    for k in range(len(t)):
+        tau = inertia * (rate[k] + 300.0 * (wanted[k] - q) + 30.0 * (speed[k] - v)) + weight * np.cos(q)
+        if k % each == 0:
+            rows.append((q, v, tau))
+        free = v + h * (tau - weight * np.cos(q)) / inertia
+        level = h * (coulomb + stribeck * np.exp(-((v / slow) ** 2))) / inertia
+        v = float(np.sign(free) * max(abs(free) - level, 0.0))
+        q += h * v
+    (q_, v_, tau_), t_ns = np.array(rows).T, np.round(1e18 + t[::each] * 1e9).astype(np.int64)
+    noisy = [values + size * rng.normal(size=len(values)) for values, size in ((v_, 5e-4), (tau_, 0.004))]
+    return t_ns, {"q0": Fields(t_ns, q_), "dq0": Fields(t_ns, noisy[0])}, noisy[1][:, None]
+
+
+def test_what_a_joint_that_sticks_leaves_is_no_delay() -> None:
+    """The effort runs from one level to the other while the joint rests, as if it acted late."""
+    (real_ns, state, real), (sim_ns, sim_state, sim) = stuck(1, 1.0, 0.8, 0.1), stuck(2, 0.0, 0.0, 0.1)
+    names, units = ("/joints.effort[0]",), ("N m",)
+    effects = found(SignalPair("/joints", names, units, real_ns, real, sim_ns, sim, "efforts", state, sim_state))
+    assert {name for name, _ in effects} == {"coulomb_friction", "stribeck_friction"}
+    levels = {name: parameters["level"].value for (name, _), parameters in effects.items()}
+    assert levels == {"coulomb_friction": pytest.approx(1.0, abs=0.02), "stribeck_friction": pytest.approx(0.8, abs=0.05)}

@@ -178,6 +178,14 @@ def test_a_gain_is_no_unit() -> None:
     assert in_one_unit(given) == (given, "")
 
 
+def test_two_noises_differ_by_no_unit() -> None:
+    """The vertical speed of a rover on a plane: a hundred times the simulation's."""
+    rng, t_ns = np.random.default_rng(0), (T * 1e9).astype(np.int64)
+    real, sim = (Fields(t_ns, size * rng.normal(size=len(T))) for size in (100.0, 1.0))
+    given = SignalPair.of_fields(real, sim, "/x.y")
+    assert in_one_unit(given) == (given, "")
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_two_motions_are_not_taken_for_one(seed: int) -> None:
     """Slow signals correlate by chance, the more so at any lag."""

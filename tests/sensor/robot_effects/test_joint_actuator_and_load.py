@@ -61,3 +61,10 @@ def test_a_limit_explains_commands_that_are_read_with_noise() -> None:
     needed = np.sin(T)
     command = needed + np.random.default_rng(0).normal(0.0, 0.45, len(T))
     assert not np.array_equal(behind("torque_saturation", 0.9, command, needed), needed)
+
+
+def test_a_limit_does_not_explain_a_command_that_is_noise() -> None:
+    """The last joint of a wrist needs nothing that can be read."""
+    needed = 1e-5 * np.sin(T)
+    command = needed + np.random.default_rng(0).normal(0.0, 2e-3, len(T))
+    assert np.array_equal(behind("torque_saturation", 2e-5, command, needed), needed)

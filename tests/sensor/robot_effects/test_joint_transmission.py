@@ -79,3 +79,5 @@ def test_an_eccentric_disc_is_taken_out_of_angle_speed_and_acceleration_exactly(
     found = effect.forward(ideal, np.array([a, b]))
     for name, values in true.items():
         assert np.abs(found.state[name] - values).max() < 3e-5 * np.abs(values).max()
+    far = effect.forward(ideal, np.array([0.03, -1.5]))  # no disc is so far off its centre
+    assert far is ideal
