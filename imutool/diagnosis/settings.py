@@ -154,9 +154,7 @@ class SearchSettings(Settings, frozen=True):
     fitted_each_round: Count = 3  # candidates of the best score that are fitted in full; the best is among them
     most_effects: Count = 8  # more never came out of an IMU's log
     effects_each_column: Count = 2  # of the efforts of an arm of many joints, if that is more
-    negligible_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = (
-        0.0  # of the largest effect's, in each column: less ends a search
-    )
+    negligible_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0  # of the largest squares in a column: less ends a search
     rounds: Count = 20  # times that an effect may come in
     suspicious_effects: Count = 3  # from which on one unnamed effect may be the better answer
     clearly_better: Positive = 10.0  # squares by which an answer has to be better, as in BIC (Kass and Raftery 1995)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
@@ -103,6 +104,15 @@ def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:
         not_identifiable=(*diagnosis.not_identifiable, *added.not_identifiable),
         unexplained={**diagnosis.unexplained, **added.unexplained},
         closer={**diagnosis.closer, **closer},
-        remarks=(*diagnosis.remarks, *added.remarks),
+        remarks=reduce(_with_remark, added.remarks, diagnosis.remarks),
         signals={**diagnosis.signals, **added.traces},
     )
+
+
+def _with_remark(remarks: tuple[str, ...], remark: str) -> tuple[str, ...]:
+    """Adds a remark on a signal; what is said of another signal is said of both at once."""
+    name, _, said = remark.partition(": ")
+    for k, one in enumerate(remarks):
+        if (names := one.removesuffix(f": {said}")) != one:
+            return (*remarks[:k], f"{names}, {name}: {said}", *remarks[k + 1 :])
+    return (*remarks, remark)

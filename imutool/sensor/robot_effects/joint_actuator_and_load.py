@@ -134,9 +134,7 @@ def _delays(ideal: IdealSignal, real: SignalSamples, turn_s: float) -> list[Thet
 
 def actuator_effects(scale: Scale) -> Iterator[Effect]:
     """Delay of all joints; gain, dead band and limit of each."""
-    turn_s = min(
-        size / slope for size, slope in zip(scale.size, scale.slope, strict=True)
-    )  # in which an effort turns by a radian
+    turn_s = min(size / slope for size, slope in zip(scale.size, scale.slope, strict=True))  # an effort turns by a radian
     delay = scale.effect(
         "actuator_delay",
         scale.columns,

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from support.robot_cases.log import write
 
+from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.diagnosis.signals.lag import is_copy, lag_at_first_sight
@@ -156,6 +157,18 @@ UNITS = (
     ("number", 2.0, 1000.0, 1.0, 1e-3),
     ("number", 2.0, 1.0, 1000.0, 1000.0),
 )
+
+
+def test_what_is_said_of_several_signals_is_said_once(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    sides = {
+        name: {f"/{k}": (NUMBER, first_s + T, wave(k)[:, None] + 0.01 * rng.normal(size=(len(T), 1))) for k in (1, 2)}
+        for name, first_s in (("real", 0.0), ("sim", 1e6))
+    }
+    logged(tmp_path, *sides.values(), (), ())  # type: ignore[arg-type]  # topics as `write` takes them
+    found = diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap")
+    (remark,) = [remark for remark in found.remarks if "share no epoch" in remark]
+    assert remark.startswith("/1.data, /2.data: the two clocks")
 
 
 @pytest.mark.parametrize(("kind", "size", "real", "sim", "by"), UNITS)
