@@ -6,6 +6,7 @@ temperature: an effect that is weighed against white noise alone explains the wa
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -50,10 +51,9 @@ def walk_likelihood(
     they took up is no evidence against a walk. None where they leave too few blocks.
     """
     names, inverse, count = np.unique(block, return_inverse=True, return_counts=True)
-    root = np.sqrt(count)
-    means = np.array([np.bincount(inverse, weights=row) for row in (residual, *derivatives)]) / root  # as noisy as a sample
-    since = (names - names[0]).astype(float)
-    power, vector = np.linalg.eigh(np.minimum.outer(since, since) * np.outer(root, root))
+    means = np.array([np.bincount(inverse, weights=row) for row in (residual, *derivatives)])
+    means /= np.sqrt(count)  # as noisy as a sample
+    power, vector = _modes(tuple((names - names[0]).tolist()), tuple(count.tolist()))
     y, fitted = means[0] @ vector, means[1:] @ vector
     _, singular, X = np.linalg.svd(fitted / np.maximum(np.linalg.norm(fitted, axis=1), 1e-300)[:, None], full_matrices=False)
     X = X[singular > INDEPENDENT * singular[0]]
@@ -66,6 +66,14 @@ def walk_likelihood(
         squares[k] = y / variance @ y - g @ np.linalg.solve(N, g)
         log_determinant[k] = np.log(variance).sum() + np.linalg.slogdet(N)[1]
     return WalkLikelihood(squares, log_determinant, free)
+
+
+@lru_cache(maxsize=8)
+def _modes(since: tuple[int, ...], count: tuple[int, ...]) -> tuple[Float64[np.ndarray, " b"], Float64[np.ndarray, "b b"]]:
+    """Eigenvalues and vectors of a walk's covariance in blocks of some samples; all axes and fits of a log share them."""
+    root = np.sqrt(count)
+    power, vector = np.linalg.eigh(np.minimum.outer(since, since) * np.outer(root, root))
+    return power, vector
 
 
 def without_walk(x: Float64[np.ndarray, " n"], steps: float) -> Float64[np.ndarray, " n"]:

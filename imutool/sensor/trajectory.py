@@ -9,6 +9,7 @@ levelled and let back in over seconds; glitches lose their weight; the samples t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import ClassVar
 
@@ -18,6 +19,7 @@ from scipy.ndimage import median_filter, percentile_filter
 from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.kinematics import Trajectory, continuous
+from imutool.processes.forked import Forked
 from imutool.recording import GRAVITY_M_S2, Poses, seconds
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.smoothing import Penalised, Samples
@@ -33,9 +35,7 @@ FIRST_CUTOFF_HZ = 12.0  # of the first pass: higher, it would follow the glitche
 HUMP = 3.0  # residuals of this many sigmas count half; of GLITCH they are dropped
 GLITCH = 8.0
 ANGLE = 2.0 * np.sqrt(4.0 / 3.0)  # a unit quaternion errs by half the angle, in three of its four coordinates
-WEIGHED = (
-    0.8196  # square root of the mean of r² / 3 / (1 + r² / 9) for three unit normal numbers: weights make noise look smaller
-)
+WEIGHED = 0.8196  # root of the mean of r² / 3 / (1 + r² / 9) for three unit normal numbers: weights make noise look smaller
 USUAL_S = 2.0  # time that says what residual is usual: poses err more in motion (their stamps) than at rest
 USUAL_PERCENTILE = 75.0  # of it: a motion that begins is no glitch, and a quarter of a second in two may be one
 USUAL_NORM = 2.0269  # that percentile of the length of three unit normal numbers; a unit quaternion, too, errs in three
@@ -172,8 +172,9 @@ def _smoothed(poses: Poses) -> SmoothMotion:
         rows = waiting.pop()
         if not _long_enough(t_s[rows]):
             continue
+        rotation = Forked(partial(_robust, t_s[rows], columns[1][rows]))
         position, count = _levelled(t_s[rows], columns[0][rows])
-        fits = [_robust(t_s[rows], y) for y in (position, columns[1][rows])]
+        fits = [_robust(t_s[rows], position), rotation.result()]
         sound = np.all([weights > 0.0 for _, weights in fits], axis=0)
         if len(parts := _unbroken(t_s[rows][sound])) > 1:  # a glitch so long that it is a hole
             kept = rows[sound]
@@ -286,8 +287,7 @@ def _steps(t_s: Times, y: Values) -> Int64[np.ndarray, " s"]:
     size = np.linalg.norm(_unexplained_difference(t_s, y), axis=1)
     usual = np.maximum(np.maximum(median_filter(size, LOCAL, mode="nearest"), np.median(size)), LEAST_NOISE)
     around = np.max([np.roll(size, shift) for shift in (-2, -1, 1, 2)], axis=0)
-    rows: Int64[np.ndarray, " s"] = np.flatnonzero((size > STEP * usual) & (size >= 0.9 * around))
-    return rows
+    return np.asarray(np.flatnonzero((size > STEP * usual) & (size >= 0.9 * around)))
 
 
 def _step_size(t_s: Times, y: Values, at: Int64[np.ndarray, " s"], k: int) -> Float64[np.ndarray, " d"]:

@@ -217,8 +217,8 @@ def _frame(k: Kinematics, y: Vectors, body: Float64[np.ndarray, "n 3 p"], *, fre
     """Whether a signal is in the world frame, and its axes P: the simplest that explains as much as any."""
     squares: list[tuple[float, int, bool, Matrix]] = []
     for world, x in ((False, body), (True, np.einsum("nij,njp->nip", k.R_wb, body))):
-        for rank, P in enumerate(PERMUTATIONS):
-            squares.append((_squares(y @ P, x, free_bias=free_bias), rank + len(PERMUTATIONS) * world, world, P))
+        each = zip(PERMUTATIONS, _squares(y, x, free_bias=free_bias), strict=True)
+        squares += [(left, rank + len(PERMUTATIONS) * world, world, P) for rank, (P, left) in enumerate(each)]
     least = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
     if least > CLEARLY * squares[0][0]:
         return False, np.eye(3)
@@ -226,21 +226,24 @@ def _frame(k: Kinematics, y: Vectors, body: Float64[np.ndarray, "n 3 p"], *, fre
     return chosen[2], chosen[3]
 
 
-def _squares(y: Vectors, x: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> float:
-    """Least squares of a signal by its parts: the rate; or acceleration, gravity (0, 1, 2, -1) and transport term."""
+def _squares(y: Vectors, x: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> list[float]:
+    """Least squares of y P by its parts, for each P: the rate; or acceleration, gravity (0, 1, 2, -1) and transport term."""
     weights = (
         [(1.0,)] if x.shape[2] == 1 else [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
     )
-    flat, target, n = x.reshape(-1, x.shape[2]), y.ravel(), len(y)
-    G, g, s = flat.T @ flat, flat.T @ target, float(target @ target)
+    flat, n, s = x.reshape(-1, x.shape[2]), len(y), float((y**2).sum())
+    G, both = flat.T @ flat, y.T @ x.reshape(n, -1)  # of y and x, whatever P
     mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
-    best = np.inf
-    for weight in weights:
-        w = np.array(weight)
-        mean = mean_y - mean_x @ w
-        left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
-        best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))
-    return best
+    out = []
+    for P in PERMUTATIONS:
+        g, best = np.einsum("ji,jip->p", P, both.reshape(3, *x.shape[1:])), np.inf
+        for weight in weights:
+            w = np.array(weight)
+            mean = mean_y @ P - mean_x @ w
+            left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
+            best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))
+        out.append(best)
+    return out
 
 
 def _solved(

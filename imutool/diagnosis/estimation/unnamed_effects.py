@@ -245,7 +245,7 @@ def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
 
 
 def smoothing(found: Fit, first: int) -> Chosen:
-    """Low-passes, without their lag, that only smooth what a filter left of a simulation's noise."""
+    """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
     filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]
     return tuple((effect.without_lag(), theta) for effect, theta in filters if _only_smooths(effect, theta, found))
 

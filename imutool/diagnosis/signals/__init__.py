@@ -110,7 +110,7 @@ def _with_signal(diagnosis: Diagnosis, added: SignalDiagnosis) -> Diagnosis:
 
 
 def _with_remark(remarks: tuple[str, ...], remark: str) -> tuple[str, ...]:
-    """Adds a remark on a signal; what is said of another signal is said of both at once."""
+    """Adds a remark on a signal; signals with the same remark share it."""
     name, _, said = remark.partition(": ")
     for k, one in enumerate(remarks):
         if (names := one.removesuffix(f": {said}")) != one:

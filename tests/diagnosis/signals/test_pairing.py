@@ -159,7 +159,7 @@ UNITS = (
 )
 
 
-def test_what_is_said_of_several_signals_is_said_once(tmp_path: Path) -> None:
+def test_signals_with_the_same_remark_share_it(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     sides = {
         name: {f"/{k}": (NUMBER, first_s + T, wave(k)[:, None] + 0.01 * rng.normal(size=(len(T), 1))) for k in (1, 2)}
