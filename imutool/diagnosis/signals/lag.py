@@ -19,6 +19,7 @@ SAME, DIGITS = 1e-6, 1e-7  # of a column's deviation, and of its largest value, 
 INTERPOLATED, MOST_INTERPOLATED = 0.1, 1e-4  # of the error over twice the step; of a column's deviation
 UNLIKE_SIZE = 0.2  # of the logarithm: copies that share most of their time are no farther apart
 LEAST_INTERPOLATED = 8  # samples
+LEAST_SIZE = 1e-100  # of a constant
 SHIFTS = 4  # Newton steps from a lag at first sight
 
 
@@ -95,7 +96,8 @@ def is_copy(
     sides = [(t_real, real), (t_sim, sim)]
     if any(len(t) < LEAST_INTERPOLATED or (np.diff(t) <= 0.0).any() for t, _ in sides):
         return False
-    if (np.abs(np.log(real.std(axis=0) / np.maximum(sim.std(axis=0), 1e-300))) > UNLIKE_SIZE).any():  # saves the correlation
+    sizes = [np.maximum(values.std(axis=0), LEAST_SIZE) for values in (real, sim)]
+    if (np.abs(np.log(sizes[0] / sizes[1])) > UNLIKE_SIZE).any():  # saves the correlation
         return False
     try:
         shift_s = lag_at_first_sight(t_real, real, t_sim, sim, names, settings)[1]
@@ -111,9 +113,13 @@ def _is_within(
     t_s: Column, values: Float64[np.ndarray, "_ k"], t_other: Column, others: Float64[np.ndarray, "_ k"], shifts: int
 ) -> bool:
     """Whether values are interpolated from others, along a spline or straight lines, at some shift near zero."""
-    size, spline, missed = values.std(axis=0), CubicSpline(t_other, others), _interpolation_error(t_other, others)
+    size, spline, missed = (
+        np.maximum(values.std(axis=0), LEAST_SIZE),
+        CubicSpline(t_other, others),
+        _interpolation_error(t_other, others),
+    )
     allowed = np.maximum(SAME * size, np.minimum(missed, MOST_INTERPOLATED * size)) + DIGITS * np.abs(values).max(axis=0)
-    lines, moved = make_interp_spline(t_other, others, k=1), 0.0
+    spline, lines, moved = CubicSpline(t_other, others), make_interp_spline(t_other, others, k=1), 0.0
     for _ in range(shifts):
         at = t_s + moved
         inside = (at >= t_other[0]) & (at <= t_other[-1])

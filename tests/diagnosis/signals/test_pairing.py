@@ -231,6 +231,14 @@ def test_copies_are_known_whatever_their_clock_and_what_differs_is_none(case: st
     assert is_copy(*both[2:], *both[:2], ("/x.y",), DiagnoseSettings()) == copied
 
 
+@pytest.mark.parametrize(("real", "sim", "copied"), [(0.0, 0.0, True), (0.0, 1.0, False), (5.0, 5.0, True)])
+def test_what_stands_still_in_both_is_compared_too(real: float, sim: float, copied: bool) -> None:
+    """The speed of a planar robot to its side."""
+    columns = [np.stack([wave(1), np.full(len(T), value)], axis=1) for value in (real, sim)]
+    assert is_copy(T, columns[0], T + EPOCH_S, columns[1], ("/x.y", "/x.z"), DiagnoseSettings()) == copied
+    assert is_copy(T, columns[0][:, 1:], T, columns[1][:, 1:], ("/x.z",), DiagnoseSettings()) == copied
+
+
 def test_efforts_that_are_motor_currents_are_told() -> None:
     (remark,) = current_remark({"/j.effort[0]": 9.0, "/j.effort[1]": 0.95})
     assert "motor currents" in remark
