@@ -113,11 +113,7 @@ def _is_within(
     t_s: Column, values: Float64[np.ndarray, "_ k"], t_other: Column, others: Float64[np.ndarray, "_ k"], shifts: int
 ) -> bool:
     """Whether values are interpolated from others, along a spline or straight lines, at some shift near zero."""
-    size, spline, missed = (
-        np.maximum(values.std(axis=0), LEAST_SIZE),
-        CubicSpline(t_other, others),
-        _interpolation_error(t_other, others),
-    )
+    size, missed = np.maximum(values.std(axis=0), LEAST_SIZE), _interpolation_error(t_other, others)
     allowed = np.maximum(SAME * size, np.minimum(missed, MOST_INTERPOLATED * size)) + DIGITS * np.abs(values).max(axis=0)
     spline, lines, moved = CubicSpline(t_other, others), make_interp_spline(t_other, others, k=1), 0.0
     for _ in range(shifts):
