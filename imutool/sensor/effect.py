@@ -143,9 +143,10 @@ class Effect:
         """The parameters at which the effect does nothing."""
         return np.array([parameter.null_value for parameter in self.parameters])
 
-    def without_lag(self) -> Effect:
-        """The same gain without its lag, where that is known."""
-        return self if self.lagless is None else replace(self, forward=self.lagless)
+    def without_lag(self, theta: Theta) -> Effect:
+        """Its gain at some parameters, whatever a fit makes of them, and without its lag."""
+        lagless = self.lagless or self.forward
+        return replace(self, forward=lambda ideal, _: lagless(ideal, theta))
 
 
 def each_axis(unit: str, plausible: float, before: str = "") -> tuple[Parameter, ...]:

@@ -247,13 +247,13 @@ def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
 def smoothing(found: Fit, first: int) -> Chosen:
     """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
     filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]
-    return tuple((effect.without_lag(), theta) for effect, theta in filters if _only_smooths(effect, theta, found))
+    return tuple((effect.without_lag(theta), theta) for effect, theta in filters if _only_smooths(effect, theta, found))
 
 
 def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
     """Whether no lag is explained, nor more than a filter errs by (clocks without a common epoch hide a lag)."""
-    others = tuple(one for one in found.chosen if one[0] is not effect)
-    without, alike = (fit(found.logs, (*others, *more), part=found.part) for more in ((), ((effect.without_lag(), theta),)))
+    others, lagless = tuple(one for one in found.chosen if one[0] is not effect), (effect.without_lag(theta), theta)
+    without, alike = (fit(found.logs, chosen, part=found.part) for chosen in (others, (*others, lagless)))
     gain, of_lag = without.objective - found.objective, alike.objective - found.objective
     left = sum(_smoothed_squares(log, float(theta[0]), found.part) for log in found.logs)
     return of_lag < LAG_SHARE * gain and gain < SMOOTHED_SHARE * left

@@ -27,7 +27,7 @@ MOST_FINE = 20_000_000  # samples
 WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
 STEP_ROUNDS = 3
 SEGMENT = 512  # samples of a velocity's spectrum
-WAY_S, CONTRADICTS = 1.0, 0.5  # of a way by velocity and by position, and the share of it by which the two may differ
+WAY_S, CONTRADICTS, WHOLE = 1.0, 0.5, 0.8  # of a way; the share of it by which two may differ; of its most samples
 ENDS_S = 0.5  # of a motion, where its derivatives are not known
 Column = Float64[np.ndarray, "_"]
 
@@ -162,11 +162,12 @@ def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: st
     contradictions = list[tuple[float, float, float, str]]()
     for label in (label for label in state if label.startswith("q") and f"d{label}" in state):
         position, velocity = state[label], state[f"d{label}"]
-        start_ns = int(position.t_ns[0])
-        t_s, own_s = seconds(position.t_ns, start_ns), seconds(velocity.t_ns, start_ns)
+        t_s, own_s = (seconds(side.t_ns, int(position.t_ns[0])) for side in (position, velocity))
         at_s = np.arange(max(0.0, own_s[0]), min(t_s[-1], own_s[-1]), WAY_S)
         gone = np.interp(at_s, own_s, cumulative_trapezoid(velocity.values, own_s, initial=0))
-        ways = np.diff([np.interp(at_s, t_s, position.values), gone], axis=1)
+        counts = np.array([np.diff(np.searchsorted(stamps, at_s)) for stamps in (t_s, own_s)])
+        whole = (counts > WHOLE * counts.max(axis=1, initial=0, keepdims=True)).all(axis=0)
+        ways = np.diff([np.interp(at_s, t_s, position.values), gone], axis=1)[:, whole]
         if ways.size:
             by_position, by_velocity, apart = np.sqrt((np.stack([*ways, ways[1] - ways[0]]) ** 2).mean(axis=1))
             share = float(apart / max(by_position, by_velocity, position.values.std(), 1e-300))
@@ -239,8 +240,8 @@ def _refuse_fast(pair: SignalPair, settings: SignalSettings) -> None:
         most_hz = settings.motion_band_share * rate_hz
         if (share := _faster(state, rate_hz, most_hz)) > settings.motion_beyond_band:
             raise DataError(
-                f"{share:.0%} of the squared velocities of {pair.name} in the {log} are faster than {most_hz:.3g} Hz,"
-                " as where a controller oscillates",
+                f"{share:.0%} of the squared velocities of {pair.name} in the {log} are faster than {most_hz:.3g} Hz, as where"
+                " a controller oscillates",
                 where=pair.name,
                 expected=f"a motion that {rate_hz:.4g} samples a second can be differentiated for",
                 fix="Record faster, or with a calmer controller",

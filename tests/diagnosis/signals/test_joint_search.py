@@ -205,6 +205,15 @@ def test_an_arm_whose_velocity_is_no_rate_of_its_position_is_refused(log: str) -
         aligned(replace(given, **{part: state}), {}, DiagnoseSettings())
 
 
+def test_a_hole_in_a_log_is_no_contradiction_of_position_and_velocity() -> None:
+    given = pair()
+    kept = np.ones(len(given.real_ns), bool)
+    kept[len(kept) // 3 : len(kept) // 2] = False
+    state = {name: Fields(own.t_ns[kept], own.values[kept]) for name, own in given.state.items()}
+    with_hole = replace(given, state=state, real_ns=given.real_ns[kept], real=given.real[kept])
+    assert aligned(with_hole, {}, DiagnoseSettings()).columns == aligned(given, {}, DiagnoseSettings()).columns
+
+
 def test_a_velocity_that_is_late_and_filtered_is_the_rate_of_its_position() -> None:
     given = pair()
     late = {

@@ -159,6 +159,20 @@ UNITS = (
 )
 
 
+def test_noise_of_simulated_joints_adds_no_effect_to_a_friction(tmp_path: Path) -> None:
+    """Noise of velocities is that of accelerations: a low-pass would smooth it, and a gain make up for that."""
+    rng, t_s = np.random.default_rng(0), np.arange(4000) / 100.0
+    wide, fast, phase = (rng.uniform(*ends, 5) for ends in ((0.2, 0.5), (0.5, 5.0), (0.0, 6.0)))
+    q = np.sin(np.outer(t_s, fast) + phase) @ wide
+    dq = np.gradient(q, t_s)
+    effort = 0.5 * np.gradient(dq, t_s) + 2.0 * np.sin(q)
+    for name, friction in (("sim", 0.0), ("real", 0.2)):
+        rows = np.stack([q, dq, effort + friction * np.sign(dq)], axis=1) + 1e-3 * rng.normal(size=(4000, 3))
+        write(tmp_path / f"{name}.mcap", {"/joint_states": (JOINTS, t_s, rows)}, ("hip",))
+    found = diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap")
+    assert [finding.effect for finding in found.findings] == ["coulomb_friction"]
+
+
 def test_signals_with_the_same_remark_share_it(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     sides = {
