@@ -161,8 +161,8 @@ UNITS = (
 
 def test_noise_of_simulated_joints_adds_no_effect_to_a_friction(tmp_path: Path) -> None:
     """Noise of velocities is that of accelerations: a low-pass would smooth it, and a gain make up for that."""
-    rng, t_s = np.random.default_rng(0), np.arange(4000) / 100.0
-    wide, fast, phase = (rng.uniform(*ends, 5) for ends in ((0.2, 0.5), (0.5, 5.0), (0.0, 6.0)))
+    motion, rng, t_s = np.random.default_rng(1), np.random.default_rng(0), np.arange(4000) / 100.0
+    wide, fast, phase = (motion.uniform(*ends, 5) for ends in ((0.2, 0.5), (0.5, 5.0), (0.0, 6.0)))
     q = np.sin(np.outer(t_s, fast) + phase) @ wide
     dq = np.gradient(q, t_s)
     effort = 0.5 * np.gradient(dq, t_s) + 2.0 * np.sin(q)
