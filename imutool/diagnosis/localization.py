@@ -198,7 +198,7 @@ def _words(name: str, word: str, threshold: float, unit: str) -> str:
     """A regime in words; of the time it is a part of the log."""
     if name == "time":
         return f"{TIMES[word == 'below']} {threshold:.0f} {unit}"
-    return f"{name} {word} {threshold:.2g} {unit}".strip()
+    return f"{name} {word} {float(f'{threshold:.2g}'):g} {unit}".strip()
 
 
 def _youden(level: Float64[np.ndarray, " w"], high: Sequence[bool] | Bool[np.ndarray, " w"]) -> tuple[float, float]:

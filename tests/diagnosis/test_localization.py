@@ -101,6 +101,12 @@ def test_the_regime_is_the_variable_with_its_threshold(word: str, seed: int) -> 
     assert 2.0 * both / (inside.sum() + rows.sum()) > 0.8  # F1 of its seconds
 
 
+def test_a_large_threshold_is_a_plain_number() -> None:
+    rate = wandering(1)
+    (one,) = locate(T, acting(4, rate > np.quantile(rate, 0.5)), NOISE, {"effort": ("N m", 500.0 * rate)}, {})
+    assert re.fullmatch(r"effort above -?\d+ N m", one.regime), one.regime
+
+
 def test_a_misfit_that_grows_with_a_variable_is_always_there_most_where_that_is_large() -> None:
     rate = wandering(3) + 0.3
     misfit = NOTHING.copy()

@@ -145,7 +145,7 @@ def location_text(place: Located) -> str:
     """Location as text: `accel x, y, angular rate above 0.4 rad/s, 12.0 to 48.5 s`."""
     spans = [f"{first:.1f} to {last:.1f} s" for first, last in place.intervals_s]
     shown = spans if len(spans) <= SHOWN else [*spans[: SHOWN - 1], f"{len(spans) - SHOWN + 1} more stretches"]
-    parts = (Path(place.log).stem, f"{place.signal} {', '.join(place.axes)}", place.regime, *shown)
+    parts = (Path(place.log).stem, f"{place.signal} {', '.join(place.axes)}".rstrip(), place.regime, *shown)
     return ", ".join(part for part in parts if part)
 
 

@@ -228,7 +228,8 @@ def _left(d: Diagnosis) -> Iterator[str]:
     if d.unexplained:
         yield "<h2>Remaining misfit</h2>"
         head = "".join(f"<th>{title}</th>" for title in ("Signal", "Remains (rms)", "Noise (rms)", "Ratio", ""))
-        units = {finding.signal: finding.held_out.unit for finding in d.findings} | ASCII_UNITS
+        units = {signal: traces.unit for signal, traces in d.signals.items()}
+        units |= {finding.signal: finding.held_out.unit for finding in d.findings} | ASCII_UNITS
         rows = []
         for signal, residual in d.unexplained.items():
             unit = symbol(units.get(signal, ""))
