@@ -127,8 +127,8 @@ def _beside_reference(
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
-        own = next(iter(simulated.truths), None)  # true, whatever their topic is called
-        sim_findings, simulated = diagnose([sim], imu=imu, truth=own, settings=settings).findings, None
+        by_itself = diagnose([sim], imu=imu, truth=next(iter(simulated.truths), None), settings=settings)
+        sim_findings, simulated = by_itself.findings, None
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
         return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
@@ -152,10 +152,10 @@ def _beside_reference(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     diagnosis = replace(diagnosis, findings=summarize.with_similar(diagnosis.findings, selection, similar.result()))
-    caveat = reference_caveat(recordings) if (poses := any(not pair.exact for pair in pairs)) else ""
+    poses = any(not pair.exact for pair in pairs)
     follows = [own_poses_sentence(pairs)] if poses and simulated is not None else []
     remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
-    diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, caveat)
+    diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, reference_caveat(recordings) if poses else "")
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
     return diagnosis

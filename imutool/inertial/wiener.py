@@ -21,7 +21,7 @@ OVERLAP = 4  # windows begin a quarter of a window apart
 INDEPENDENT = 0.5, 0.65  # of such Hann windows, and of their neighbouring frequencies (noise alone: 0.5 and 0.67)
 CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
-ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the top, no noise
+ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the largest power, as good as none
 CALM = 1.2  # times `white_noise`, that pure white noise is
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
 Parts = Complex128[np.ndarray, "f t k"]
@@ -72,7 +72,8 @@ def denoised(
     mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
     parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
     shared = None if recorded is None else _shared(x, recorded, stft, settings)
-    std = _noise_std(parts, shared, settings)[:, None]
+    std, untold = _noise_std(parts, shared, settings)
+    std = std[:, None]
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
     power = uniform_filter1d(power, settings.short_time_parts, axis=0, mode="nearest")
@@ -86,8 +87,7 @@ def denoised(
     gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
     left = 2.0 * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0] / (rate_hz * float((stft.win**2).sum()))
-    if shared is not None:  # as much as calm samples show, of which the filter took nothing
-        left = np.where(shared.mean(axis=0) > ALMOST_ALL, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
+    left = np.where(untold, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
     return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
 
 
@@ -107,14 +107,17 @@ def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Floa
     return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
 
 
-def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings) -> Float64[np.ndarray, "f k"]:
-    """Noise of the parts by frequency: by those that are not shared, and as white as the top where nothing is compared.
+def _noise_std(
+    parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings
+) -> tuple[Float64[np.ndarray, "f k"], Bool[np.ndarray, " k"]]:
+    """Noise of the parts by frequency, and the signals in which it cannot be told from the motion.
 
-    Where almost all are shared it cannot be told from the motion, and none is taken.
+    It is that of the frequencies that are not shared, and as white as the top where nothing is compared. Where almost all are
+    shared it cannot be told, and is next to nothing here: a filter takes none of it.
     """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
-    out = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1))
+    out, untold = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1)), np.zeros(top.shape[2], bool)
     apart = APART * settings.short_time_parts
     for k, column in enumerate(shared.T if shared is not None else ()):
         own = np.flatnonzero(binary_erosion(~column, iterations=apart, border_value=True))
@@ -123,8 +126,8 @@ def _noise_std(parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: W
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
         elif column.mean() > ALMOST_ALL:
-            out[:, k] = NO_NOISE * power[:, k].max()
-    return np.asarray(np.sqrt(np.maximum(out, 1e-300)))
+            out[:, k], untold[k] = NO_NOISE * power[:, k].max(), True
+    return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold
 
 
 def _shared(

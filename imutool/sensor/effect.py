@@ -144,8 +144,9 @@ class Effect:
         return np.array([parameter.null_value for parameter in self.parameters])
 
     def without_lag(self, theta: Theta) -> Effect:
-        """Its gain at some parameters, whatever a fit makes of them, and without its lag."""
-        lagless = self.lagless or self.forward
+        """The effect at these parameters, which a fit no longer changes, and without its lag."""
+        lagless = self.lagless
+        assert lagless is not None, f"{self.key} has a lag"
         return replace(self, forward=lambda ideal, _: lagless(ideal, theta))
 
 

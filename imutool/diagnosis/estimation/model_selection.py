@@ -43,7 +43,7 @@ from imutool.diagnosis.estimation.significance import (
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import shrinks_motion, smoothing, with_finer_curve
+from imutool.diagnosis.estimation.unnamed_effects import smoothing, takes_noise, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
@@ -84,8 +84,8 @@ def select_effects(
         answers.insert(0 if better else 1, (replace(second, unnamed=unnamed[: described.unnamed], progress=report), trial))
     elif other is not None:
         other.end()
-    least = len(always) + 1  # what came in later may have spoilt the first
-    alone = ((search, fit(logs, found.chosen[:least])) for search, found in answers if len(found.chosen) > least)
+    count = len(always) + 1  # with the first effect alone: what came in later may have spoilt it
+    alone = ((search, fit(logs, found.chosen[:count])) for search, found in answers if len(found.chosen) > count)
     selections = (search.tested(search.simplified(found)) for search, found in chain(answers, alone))
     best = next(selections)
     best = best if best.selected else next((one for one in selections if one.selected), best)  # unseen time refuted the best
@@ -288,7 +288,7 @@ class _Search:
         effect, theta = whole.chosen[k]
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
-        no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or shrinks_motion(effect, theta, self.logs)
+        no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
         no_answer = no_answer or is_coloured_noise(effect, theta, whole)
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None

@@ -213,12 +213,12 @@ def finer_curve(logs: Sequence[WhitenedLog], curve: Effect) -> Effect | None:
     return finer(curve, like([log.pair for log in logs if isinstance(log.pair, Pair)]))
 
 
-def shrinks_motion(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) -> bool:
-    """Whether a term, a curve or a limit takes most of an axis' motion by poses.
+def takes_noise(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog]) -> bool:
+    """Whether a term, a curve or a limit takes the noise of poses or of a simulation.
 
     On an axis that hardly moves, what poses say is their own noise, and whatever shrinks it removes a misfit (regression
-    dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7). No sensor loses so much. A term or a curve takes the noise of
-    a simulation as well, if it is no larger.
+    dilution; Fuller, Measurement Error Models, 1987, eq. 1.1.7). So a limit, a term or a curve takes it, if it takes most of
+    the axis' motion: no sensor loses so much. Of a simulation a term or a curve takes it, if it is no larger than this noise.
     """
     if effect.kind == "unknown" and any(_within_noise(effect, theta, log.pair) for log in logs):
         return True
@@ -255,8 +255,9 @@ def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
     others, lagless = tuple(one for one in found.chosen if one[0] is not effect), (effect.without_lag(theta), theta)
     without, alike = (fit(found.logs, chosen, part=found.part) for chosen in (others, (*others, lagless)))
     gain, of_lag = without.objective - found.objective, alike.objective - found.objective
-    left = sum(_smoothed_squares(log, float(theta[0]), found.part) for log in found.logs)
-    return of_lag < LAG_SHARE * gain and gain < SMOOTHED_SHARE * left
+    if of_lag >= LAG_SHARE * gain:
+        return False
+    return gain < SMOOTHED_SHARE * sum(_smoothed_squares(log, float(theta[0]), found.part) for log in found.logs)
 
 
 def _smoothed_squares(log: WhitenedLog, cutoff_hz: float, part: str) -> float:

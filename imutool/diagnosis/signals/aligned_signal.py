@@ -147,7 +147,7 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
     t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
     lag_s, aligned_s = 0.0, pair.clock_s or None
     if pair.clock_s is None:
-        lag_s, aligned_s = lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, settings)
+        lag_s, aligned_s = lag_at_first_sight(pair, settings)
     if aligned_s is not None:
         t_sim, lag_s = t_sim - aligned_s, 0.0
     period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))

@@ -27,7 +27,7 @@ MOST_FINE = 20_000_000  # samples
 WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
 STEP_ROUNDS = 3
 SEGMENT = 512  # samples of a velocity's spectrum
-WAY_S, CONTRADICTS, WHOLE = 1.0, 0.5, 0.8  # of a way; the share of it by which two may differ; of its most samples
+WAY_S, CONTRADICTS, WHOLE = 1.0, 0.5, 0.8  # of a way, the share by which two may differ, and of its samples without a gap
 ENDS_S = 0.5  # of a motion, where its derivatives are not known
 Column = Float64[np.ndarray, "_"]
 
@@ -176,7 +176,7 @@ def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: st
     if share > CONTRADICTS:
         raise DataError(
             f"the velocity beside {name} is not the rate of the position in the {log}:"
-            f" {by_velocity:.3g} rad a second by the one, {by_position:.3g} by the other",
+            f" {by_velocity:.3g} rad a second by the velocity, {by_position:.3g} by the position",
             where=name,
             expected="velocities that are the rates of the positions",
             fix="Record both of the same joint and in one unit, or the positions alone",

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import correlate, correlation_lags
 
 from imutool.array_types import Float64
 from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.errors import DataError
 from imutool.inertial.correlation import dependent_samples
+from imutool.recording import seconds
 
 Column = Float64[np.ndarray, "_"]
+Columns = Float64[np.ndarray, "_ k"]
 LEAST_COPIED = 0.9  # of the longer log's time, that two copies share
 SAME, DIGITS = 1e-6, 1e-7  # of a column's deviation, and of its largest value, as float32 has it
 INTERPOLATED, MOST_INTERPOLATED = 0.1, 1e-4  # of the error over twice the step; of a column's deviation
@@ -23,24 +24,17 @@ LEAST_SIZE = 1e-100  # of a constant
 SHIFTS = 4  # Newton steps from a lag at first sight
 
 
-def lag_at_first_sight(
-    t_real: Column,
-    real: Float64[np.ndarray, "_ k"],
-    t_sim: Column,
-    sim: Float64[np.ndarray, "_ k"],
-    names: Sequence[str],
-    settings: DiagnoseSettings,
-) -> tuple[float, float | None]:
+def lag_at_first_sight(pair: SignalPair, settings: DiagnoseSettings) -> tuple[float, float | None]:
     """Lag (s) of the recording at first sight, and the clock shift (s) if no epoch is shared.
 
     Raises:
         DataError: nowhere are the two alike.
     """
-    own = settings.signal
+    own, ((t_real, real), (t_sim, sim)) = settings.signal, _sides(pair)
     a, b = (
         np.stack([_smooth(t_s, column, own.align_hz) for column in values.T]) for t_s, values in ((t_real, real), (t_sim, sim))
     )
-    if len(names) > 1:  # columns of one size each, so that none decides for all
+    if len(pair.names) > 1:  # columns of one size each, so that none decides for all
         size = np.maximum(b.std(axis=1, keepdims=True), 1e-300)
         a, b = a / size, b / size
     total = np.sum([correlate(x, y, mode="full") for x, y in zip(a, b, strict=True)], axis=0)
@@ -55,9 +49,9 @@ def lag_at_first_sight(
     best = int(np.argmax(correlation))
     if correlation[best] < least[1]:
         raise DataError(
-            f"recording and simulation of {names[0]} are not alike (correlation {correlation[best]:.2f} at best; two unrelated"
-            f" motions reach {least[1]:.2f})",
-            where=names[0],
+            f"recording and simulation of {pair.names[0]} are not alike (correlation {correlation[best]:.2f} at best;"
+            f" two unrelated motions reach {least[1]:.2f})",
+            where=pair.names[0],
             expected="one motion",
             fix="Simulate what was recorded, or choose another field",
         )
@@ -78,33 +72,32 @@ def _smooth(t_s: Column, values: Column, rate_hz: float) -> Float64[np.ndarray, 
     return np.asarray(even - even.mean())
 
 
+def _sides(pair: SignalPair) -> list[tuple[Column, Columns]]:
+    """Stamps (s from the recording's first) and values of the recording, and of the simulation."""
+    start_ns = int(pair.real_ns[0])
+    return [(seconds(pair.real_ns, start_ns), pair.real), (seconds(pair.sim_ns, start_ns), pair.sim)]
+
+
 # ── copies ──
 
 
-def is_copy(
-    t_real: Column,
-    real: Float64[np.ndarray, "_ k"],
-    t_sim: Column,
-    sim: Float64[np.ndarray, "_ k"],
-    names: Sequence[str],
-    settings: DiagnoseSettings,
-) -> bool:
+def is_copy(pair: SignalPair, settings: DiagnoseSettings) -> bool:
     """Whether one log copies the other, but for epoch, digits and interpolation.
 
     No sensor reads what a simulation computes to a millionth of its motion.
     """
-    sides = [(t_real, real), (t_sim, sim)]
+    sides = _sides(pair)
     if any(len(t) < LEAST_INTERPOLATED or (np.diff(t) <= 0.0).any() for t, _ in sides):
         return False
-    sizes = [np.maximum(values.std(axis=0), LEAST_SIZE) for values in (real, sim)]
+    sizes = [np.maximum(values.std(axis=0), LEAST_SIZE) for _, values in sides]
     if (np.abs(np.log(sizes[0] / sizes[1])) > UNLIKE_SIZE).any():  # saves the correlation
         return False
     try:
-        shift_s = lag_at_first_sight(t_real, real, t_sim, sim, names, settings)[1]
+        shift_s = lag_at_first_sight(pair, settings)[1]
     except DataError:  # too short or too unlike for a lag: copies have none on one clock
         shift_s = None
     if shift_s is not None:
-        sides[1] = (t_sim - shift_s, sim)
+        sides[1] = sides[1][0] - shift_s, sides[1][1]
     coarse, dense = sorted(sides, key=lambda side: -float(np.median(np.diff(side[0]))))
     return any(_is_within(*one, *other, 1 if shift_s is None else SHIFTS) for one, other in ((coarse, dense), (dense, coarse)))
 

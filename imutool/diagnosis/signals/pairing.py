@@ -22,7 +22,6 @@ from imutool.file_location import Location
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import ODOMETRY, PRESSURE
 from imutool.mcap_io.fields import Fields
-from imutool.recording import seconds
 from imutool.sensor.channels import is_quantity
 
 MOST_COMPARED, MOST_DRIVERS = 24, 6
@@ -59,7 +58,7 @@ def paired(real: Location, sim: Location) -> Pairing:
     remarks, pairs, same = _remarks(own, other, topics), list[SignalPair](), list[str]()
     wheels = _wheels(own, other, topics)
     for given in (pair for topic, theirs in topics.items() for pair in _of_topic(own, other, topic, theirs, wheels)):
-        if _is_copy(given):
+        if is_copy(given, DiagnoseSettings()):
             same.extend(given.names)
         else:
             for to_usual in (in_radians, in_one_unit):
@@ -72,13 +71,6 @@ def paired(real: Location, sim: Location) -> Pairing:
     compared = {name for pair in pairs for name in pair.names}
     remarks += _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
     return Pairing(tuple(pairs), _drivers(own, compared), tuple(remarks))
-
-
-def _is_copy(pair: SignalPair) -> bool:
-    """Whether one log's numbers are those of the other."""
-    start_ns = int(pair.real_ns[0])
-    t_real, t_sim = seconds(pair.real_ns, start_ns), seconds(pair.sim_ns, start_ns)
-    return is_copy(t_real, pair.real, t_sim, pair.sim, pair.names, DiagnoseSettings())
 
 
 def _listed(what: str, names: list[str]) -> list[str]:

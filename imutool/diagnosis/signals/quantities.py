@@ -13,7 +13,6 @@ from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
-from imutool.recording import seconds
 from imutool.sensor.robot_effects.joint_dynamics import identified
 
 FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
@@ -102,9 +101,8 @@ def in_one_unit(pair: SignalPair) -> tuple[SignalPair, str]:
 
 def _is_one_motion(pair: SignalPair) -> bool:
     """Whether both logs move alike."""
-    t_real, t_sim = (seconds(t_ns, int(pair.real_ns[0])) for t_ns in (pair.real_ns, pair.sim_ns))
     try:
-        lag_at_first_sight(t_real, pair.real, t_sim, pair.sim, pair.names, DiagnoseSettings())
+        lag_at_first_sight(pair, DiagnoseSettings())
     except DataError:
         return False
     return True

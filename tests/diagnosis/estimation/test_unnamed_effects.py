@@ -202,4 +202,4 @@ def test_a_term_that_takes_away_the_motion_of_poses_is_their_noise(gain: float, 
     """Beside gravity of 9.81 m/s² along z, a rate times the force is a scale of ten times the gain."""
     pair = replace(planted.pair(planted.planar()), band_hz=6.0 if poses else None)
     (term,) = (one for one in unnamed.terms(unnamed.like([pair])) if one.variant == "gyro.z:omega_z f_z")
-    assert unnamed.shrinks_motion(term, np.array([gain]), [planted.weighed(pair)]) == shrinks
+    assert unnamed.takes_noise(term, np.array([gain]), [planted.weighed(pair)]) == shrinks
