@@ -35,6 +35,7 @@ from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
     check_without_reference,
+    clock_difference,
     is_another_motion,
     own_poses_sentence,
     with_unique_names,
@@ -145,8 +146,7 @@ def _beside_reference(
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
-    similar = Forked(selection.similar)
-    hidden = unobservable(logs, candidates, settings.search)
+    similar, hidden = Forked(selection.similar), unobservable(logs, candidates, settings.search)
     diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), sim_findings, hidden, settings)
     if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
         report(3, 4, "simulating again")
@@ -157,7 +157,7 @@ def _beside_reference(
     remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
     diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, reference_caveat(recordings) if poses else "")
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
-        diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings)
+        diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
     return diagnosis
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation import timestamps
-from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.aligned_log import ClockDifference, Pair
+from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
@@ -29,6 +30,8 @@ from imutool.units import AXES, SENSORS, UNITS
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
 MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 COPIED = 0.5  # share of a simulation's poses whose stamps the recording has, too: above, it may follow them
+DRIFTING = frozenset({"clock_skew", "clock_jump", "clock_wander"})
+KNOWN_S = 1e-3  # deviation of a clock difference, below which delays of other signals are seen beside it
 BY_THEMSELVES = frozenset({"saturation", "quantization"})  # of the catalogue
 
 
@@ -72,6 +75,18 @@ def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -
     offset = tuple(one for one in candidates if one.name == "clock_offset" and any(pair.aligned_s for pair in pairs))
     kept = tuple(one for one in candidates if one not in offset)
     return kept, tuple((one, one.null_value.astype(float)) for one in offset)
+
+
+def clock_difference(pairs: Sequence[Pair], found: Fit) -> ClockDifference | None:
+    """Difference of the two clocks by the motion.
+
+    None where the logs share an epoch, the clocks drift apart, or too little motion shows it.
+    """
+    offsets = [float(theta[0]) for effect, theta in found.chosen if effect.name == "clock_offset"]
+    if not offsets or not pairs[0].aligned_s or any(effect.name in DRIFTING for effect, _ in found.chosen):
+        return None
+    std_s = float(found.stds()["clock_offset"][0]) * float(np.sqrt(max(found.reduced_chi_square, 1.0)))
+    return ClockDifference(pairs[0].aligned_s + offsets[0], std_s) if std_s < KNOWN_S else None
 
 
 def with_unique_names(recordings: Sequence[Recording]) -> list[Recording]:

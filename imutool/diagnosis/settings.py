@@ -65,6 +65,10 @@ class NoiseSettings(Settings, frozen=True):
     walk_hz: Positive = 0.5  # corner of the fastest one: the accelerometer of EuRoC's sensor.yaml has 0.25 Hz
     walk_corners: Count = 14  # tried between these
 
+    def segment_of(self, samples: int) -> int:
+        """Samples of a segment of a signal's spectrum."""
+        return min(self.segment_samples, max(samples // self.least_segments, self.least_segment_samples), samples)
+
 
 class SignificanceSettings(Settings, frozen=True):
     """Robust covariance and onsets: by experience on poses with coloured errors."""

@@ -19,6 +19,7 @@ from imutool.errors import DataError, LogError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
+from imutool.recording import Scalars
 from imutool.report import json_values
 from imutool.sensor import catalogue
 from imutool.sensor.made_up_flight import flight
@@ -208,6 +209,25 @@ def test_an_offset_of_clocks_that_share_no_epoch_is_no_finding(made: Made, tmp_p
     found = diagnose([real], tmp_path / "sim.mcap")
     assert effects(found) == ["lever_arm"]
     assert near(found, "lever_arm", dict(zip("xyz", ARM, strict=True)))
+
+
+def test_a_lag_of_another_signal_shows_by_the_clock_of_the_imu_where_the_logs_share_no_epoch(tmp_path: Path) -> None:
+    """A gauge that is late and slow, beside one that both logs copy from the motion."""
+    rng, t_s = np.random.default_rng(4), planted.clock(40.0)
+    path = planted.moving(4, 40.0)
+    imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
+    samples, every = np.concatenate([imu.gyro, imu.accel], axis=1), slice(5, -5, 5)
+    logs, delay_s = [tmp_path / "real.mcap", tmp_path / "sim.mcap"], 0.12
+    for log, start_ns, late_s in zip(logs, (planted.START_NS, 0), (delay_s, 0.0), strict=True):
+        recorded = planted.recording(log.stem, t_s, samples + planted.noise(len(t_s), len(log.stem)), start_ns)
+        gauge = np.interp(t_s - late_s, t_s, imu.gyro[:, 0])[every] + 0.01 * rng.normal(size=len(t_s[every]))
+        t_ns, copied = recorded.imu.t_ns[every], imu.gyro[every, 1]
+        scalars = {name: Scalars(t_ns, values[:, None]) for name, values in (("/gauge", gauge), ("/copied", copied))}
+        write(replace(recorded, scalars=scalars), log)
+    found = diagnose(logs[:1], logs[1])
+    assert [(one.effect, one.signal) for one in found.findings] == [("delay", "/gauge.data")]
+    assert near(found, "delay", {"delay": delay_s})
+    assert any("/copied" in remark and "same in both" in remark for remark in found.remarks)
 
 
 def test_impacts_and_noise_of_both_are_no_mismatch(tmp_path: Path) -> None:

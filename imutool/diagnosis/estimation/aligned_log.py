@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,13 @@ DEFAULT = DiagnoseSettings()
 Blocks = tuple[tuple[int, Float64[np.ndarray, "n _"]], ...]
 Variables = Mapping[str, tuple[str, Float64[np.ndarray, " n"]]]
 IMU_SIGNALS: Mapping[str, slice] = {"gyro": slice(0, 3), "accel": slice(3, 6)}
+
+
+class ClockDifference(NamedTuple):
+    """How far a simulation's clock is ahead of the recording's, and its deviation (s)."""
+
+    ahead_s: float
+    std_s: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -252,8 +252,7 @@ def spectrum(
 
     A segment counts if all of it is usable, or most of it where none is.
     """
-    least = max(len(x) // settings.least_segments, settings.least_segment_samples)
-    size = min(settings.segment_samples, least, len(x))
+    size = settings.segment_of(len(x))
     starts = range(0, len(x) - size + 1, max(1, size // 2))
     whole = np.array([float(usable[s : s + size].mean()) for s in starts])
     taken = [s for s, share in zip(starts, whole, strict=True) if share >= min(1.0, float(whole.max()))]

@@ -8,9 +8,11 @@ from functools import reduce
 
 import numpy as np
 
+from imutool.diagnosis.estimation.aligned_log import ClockDifference
 from imutool.diagnosis.result import Closer, Diagnosis
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, without_others
+from imutool.diagnosis.signals.lag import on_recorded_clock
 from imutool.diagnosis.signals.log_fields import on_one_clock
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
@@ -20,6 +22,8 @@ from imutool.mcap_io.fields import others, read_field
 
 BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal
 
+ONE_CLOCK = "The other signals have the clock that the IMU's motion shows; a delay of theirs is against the IMU"
+
 
 def with_signals(
     diagnosis: Diagnosis,
@@ -28,8 +32,11 @@ def with_signals(
     named: Sequence[str],
     report: Callable[[int, int, str], None],
     settings: DiagnoseSettings,
+    clock: ClockDifference | None = None,
 ) -> Diagnosis:
     """Diagnosis with the signals `named` (TOPIC.field), or with all that both logs hold.
+
+    Logs that share no epoch have the `clock` that the IMU's motion shows.
 
     Raises:
         ConfigError, LogError: a log cannot be read, or has no such topic.
@@ -39,9 +46,9 @@ def with_signals(
         for name in named:
             pair = SignalPair.of_fields(on_one_clock(read_field(real, name)), on_one_clock(read_field(sim, name)), name)
             report(3, 4, name)
-            diagnosis = _with_signal(diagnosis, diagnose_signal(pair, others(real, name), settings))
+            diagnosis = _with_signal(diagnosis, diagnose_signal(on_recorded_clock(pair, clock), others(real, name), settings))
         return diagnosis
-    pairing = paired(real, sim)
+    pairing = paired(real, sim, clock)
     if not pairing.pairs and not diagnosis.unexplained:
         raise DataError(
             "recording and simulation share no IMU and no other varying number",
@@ -50,7 +57,8 @@ def with_signals(
             fix=". ".join(["Give both logs the topics of one robot", *pairing.remarks]),
         )
     if pairing.pairs:
-        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks))
+        one_clock = [] if clock is None else [ONE_CLOCK]
+        diagnosis = replace(diagnosis, remarks=(*diagnosis.remarks, *pairing.remarks, *one_clock))
     clocks, later = list[float](), list[SignalPair]()
     for pair in pairing.pairs:
         report(3, 4, pair.name)

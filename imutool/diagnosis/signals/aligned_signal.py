@@ -49,6 +49,7 @@ class AlignedSignal(AlignedLog):
     lag_s: float
     sim_density: Float64[np.ndarray, " k"]
     shares_epoch: bool
+    clock_std_s: float = 0.0
     constants: tuple[float, ...] = ()
 
     exact = True
@@ -212,6 +213,7 @@ def _aligned(
         lag_s=lag_s,
         sim_density=density,
         shares_epoch=shares_epoch,
+        clock_std_s=pair.clock_std_s,
         settings=settings,
     )
 

@@ -23,9 +23,8 @@ from imutool.sensor.robot_effects.joint_dynamics import WELL_DETERMINED, Dynamic
 from imutool.sensor.robot_effects.signal_samples import IdealSignal
 from imutool.sensor.robot_effects.wheel import WheelRelation
 
-MOST_FINE = 20_000_000  # samples
+MOST_FINE, STEP_ROUNDS = 20_000_000, 3  # samples; until the half step of a simulator is known
 WIDER, FILTER_PERIODS = 2.0, 2.0  # of a motion's filter: it changes nothing within the band
-STEP_ROUNDS = 3
 SEGMENT = 512  # samples of a velocity's spectrum
 WAY_S, CONTRADICTS, WHOLE = 1.0, 0.5, 0.8  # of a way, the share by which two may differ, and of its samples without a gap
 ENDS_S = 0.5  # of a motion, where its derivatives are not known
@@ -52,6 +51,7 @@ class SignalPair:
     state: Mapping[str, Fields] = field(default_factory=dict)
     sim_state: Mapping[str, Fields] = field(default_factory=dict)
     clock_s: float | None = None  # of the simulation, which other signals of the two logs know
+    clock_std_s: float = 0.0  # of the simulation's stamps against the recording's
 
     @classmethod
     def of_fields(cls, real: Fields, sim: Fields, name: str) -> SignalPair:
@@ -279,7 +279,7 @@ def from_simulation(
     fine, density = [], []
     for column in values.T:
         even, jumps = _resampled(t_sim, column, t_even), _jumps(column)
-        f_hz, power = welch(even, 1.0 / period_sim, nperseg=min(settings.noise.segment_samples, len(even)), average="median")
+        f_hz, power = welch(even, 1.0 / period_sim, nperseg=settings.noise.segment_of(len(even)), average="median")
         top = (f_hz >= settings.signal.noise_band / period_sim) & (f_hz <= settings.signal.noise_band_end / period_sim)
         clean = wiener_filter(even[:, None], 1.0 / period_sim, settings.alignment)[:, 0]
         fine.append(np.interp(t_fine, t_even, clean) if jumps else np.asarray(make_interp_spline(t_even, clean, k=3)(t_fine)))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import correlate, correlation_lags
 
 from imutool.array_types import Float64
+from imutool.diagnosis.estimation.aligned_log import ClockDifference
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.errors import DataError
@@ -58,6 +61,15 @@ def lag_at_first_sight(pair: SignalPair, settings: DiagnoseSettings) -> tuple[fl
     return 0.0, -float(lags[best])
 
 
+def on_recorded_clock(pair: SignalPair, clock: ClockDifference | None) -> SignalPair:
+    """Pair with both logs on one clock, where the difference is known."""
+    if clock is None:
+        return pair
+    ahead_ns = round(1e9 * clock.ahead_s)
+    state = {name: replace(values, t_ns=values.t_ns - ahead_ns) for name, values in pair.sim_state.items()}
+    return replace(pair, sim_ns=pair.sim_ns - ahead_ns, sim_state=state, clock_std_s=clock.std_s)
+
+
 def _chance(a: Float64[np.ndarray, "k n"], b: Float64[np.ndarray, "k m"]) -> float:
     """Deviation of the correlation of two independent signals with these spectra."""
     n = min(a.shape[1], b.shape[1])
@@ -98,8 +110,9 @@ def is_copy(pair: SignalPair, settings: DiagnoseSettings) -> bool:
         shift_s = None
     if shift_s is not None:
         sides[1] = sides[1][0] - shift_s, sides[1][1]
+    shifts = 1 if shift_s is None and not pair.clock_std_s else SHIFTS
     coarse, dense = sorted(sides, key=lambda side: -float(np.median(np.diff(side[0]))))
-    return any(_is_within(*one, *other, 1 if shift_s is None else SHIFTS) for one, other in ((coarse, dense), (dense, coarse)))
+    return any(_is_within(*one, *other, shifts) for one, other in ((coarse, dense), (dense, coarse)))
 
 
 def _is_within(

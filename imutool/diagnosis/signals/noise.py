@@ -85,7 +85,7 @@ def _density(
 
     The mean counts what comes off and on, as a joint turns round, for noise.
     """
-    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=min(settings.segment_samples, len(x)), average=average)
+    f_hz, power = welch(np.where(usable, x, 0.0), rate_hz, nperseg=settings.segment_of(len(x)), average=average)
     return f_hz, np.asarray(median_filter(power, settings.line_bins, mode="nearest")) / max(float(usable.mean()), 1e-3)
 
 
@@ -103,7 +103,10 @@ def rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]
     for values in (x, dx, pair.stamp_s, *states):
         if np.ptp(values) > 0:
             columns += [*SplineBasis(np.linspace(values.min(), values.max(), RICH_KNOTS - 2)).basis(values).T]
-    return np.asarray(pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], pair.usable[:, 0]))
+    usable = pair.usable[:, 0]
+    taken = len(columns) / max(int(usable.sum()), 2 * len(columns))  # of the noise, by the fit
+    left = pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], usable)
+    return np.asarray(left / np.sqrt(1.0 - taken))
 
 
 def lsb_of(pair: SignalPair, settings: DiagnoseSettings) -> list[float]:

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imutool.diagnosis.estimation.aligned_log import ClockDifference
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
-from imutool.diagnosis.signals.lag import is_copy
+from imutool.diagnosis.signals.lag import is_copy, on_recorded_clock
 from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
 from imutool.diagnosis.signals.quantities import in_one_unit, in_radians, metres, unwrapped
 from imutool.file_location import Location
@@ -48,8 +49,8 @@ class Pairing:
     remarks: tuple[str, ...]
 
 
-def paired(real: Location, sim: Location) -> Pairing:
-    """Signals that both logs hold, in the order of the recording.
+def paired(real: Location, sim: Location, clock: ClockDifference | None = None) -> Pairing:
+    """Signals that both logs hold, in the order of the recording; on one clock by `clock`.
 
     Raises:
         ConfigError, LogError: a log cannot be opened, or is damaged.
@@ -57,7 +58,8 @@ def paired(real: Location, sim: Location) -> Pairing:
     own, other, topics = read_both(real, sim)
     remarks, pairs, same = _remarks(own, other, topics), list[SignalPair](), list[str]()
     wheels = _wheels(own, other, topics)
-    for given in (pair for topic, theirs in topics.items() for pair in _of_topic(own, other, topic, theirs, wheels)):
+    found = (pair for topic, theirs in topics.items() for pair in _of_topic(own, other, topic, theirs, wheels))
+    for given in (on_recorded_clock(pair, clock) for pair in found):
         if is_copy(given, DiagnoseSettings()):
             same.extend(given.names)
         else:

@@ -66,6 +66,13 @@ def delay(lag_s: float, step_s: float) -> Effect:
     return _effect("delay", Stage.CLOCK, "y(t) = x(t - delay)", numbers, lambda taken_s, theta: taken_s - theta[0], starts)
 
 
+def clock(std_s: float, step_s: float) -> Effect:
+    """A difference of the clocks within its deviation, which is no finding."""
+    numbers = (Parameter("delay", "s", std_s, step=step_s),)
+    text = "y(t) = x(t - delay)"
+    return _effect("clock", Stage.CLOCK, text, numbers, lambda taken_s, theta: taken_s - theta[0], [np.zeros(1)])
+
+
 def delay_step_s(signal: AlignedSignal) -> float:
     """A delay that moves the signal by `MOVED` of its size."""
     return MOVED * float(np.min(signal.sampled.x.std(axis=0) / signal.sampled.dx.std(axis=0)))

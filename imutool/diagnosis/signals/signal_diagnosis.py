@@ -137,6 +137,8 @@ class _Prepared(NamedTuple):
         if not signal.shares_epoch:
             always = ((common.delay(0.0, common.delay_step_s(signal)), np.zeros(1)), *always)
             candidates = [effect for effect in candidates if effect.name not in DELAYS]
+        elif signal.clock_std_s and not pair.sim_state:
+            always = ((common.clock(signal.clock_std_s, common.delay_step_s(signal)), np.zeros(1)), *always)
         log = whitened(signal, np.stack([rich_residual(signal, k) for k in columns], axis=1), lsb)
         return cls(log, candidates, always, lsb)
 

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from support.seeds import seeds
 
+from imutool.diagnosis.estimation.noise_estimate import noise_std
+from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.diagnosis.signals.aligned_signal import aligned
 from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.noise import rich_residual, whitened
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
@@ -259,6 +263,16 @@ def test_clocks_without_a_common_epoch_are_aligned_and_say_that_a_delay_cannot_b
     within(d, "gain", {"gain": 1.05})
     assert d.not_identifiable == ("/odom.v.delay",)
     assert "share no epoch" in d.remarks[0]
+
+
+def test_the_noise_of_a_slow_sensor_is_known_from_few_samples() -> None:
+    """Six hundred samples are two long segments of a spectrum, and a fit of forty numbers takes some of the noise."""
+    levels = []
+    for seed in seeds(16):
+        real, sim, _ = pair(nothing, seed, rate_hz=10.0)
+        signal = aligned(SignalPair.of_fields(real, sim, NAME), {}, DiagnoseSettings())
+        levels.append(noise_std(whitened(signal, rich_residual(signal, 0)[:, None], [0.0]).whiten)[0])
+    assert np.mean(levels) == pytest.approx(NOISE, rel=0.05)
 
 
 def test_what_serves_as_well_is_listed() -> None:
