@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import lfilter
 
 from imutool.array_types import Complex128, Float64
@@ -23,6 +24,7 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
 from imutool.sensor.samples import IdealMotion, Vectors
 
 START_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
+FORGOTTEN = 4.0  # periods of the cut-off frequency, after which less than 1e-10 of a sample is left
 AHEAD, BEHIND = 5, 8  # samples that a tap looks ahead and back: this is no filter for samples as they arrive
 BAND = 0.35  # of the sample rate
 OMEGA = np.linspace(0.0, 2.0 * np.pi * BAND, 48)  # rad a sample
@@ -41,17 +43,41 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
 
 
 def _lagless(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
-    columns = (smoothed(x, motion.rate_hz, float(cutoff_hz[0])) for x in (motion.gyro, motion.accel, motion.alpha))
+    gain = _Gain.of(len(motion.gyro), float(cutoff_hz[0]) / motion.rate_hz)
+    columns = (motion.sampler.behind.changed(x, gain, gain.on) for x in (motion.gyro, motion.accel, motion.alpha))
     gyro, accel, alpha = columns
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
 def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, cutoff_hz: float) -> Float64[np.ndarray, "n k"]:
     """Columns with the gain of a first-order low-pass and without its lag."""
-    n, mean = len(x), x.mean(axis=0)
-    y = np.concatenate([2.0 * x[0] - x[::-1], x, 2.0 * x[-1] - x[::-1]]) - mean
-    gain = 1.0 / np.hypot(1.0, np.fft.rfftfreq(len(y), 1.0 / rate_hz) / cutoff_hz)
-    return np.asarray(np.fft.irfft(np.fft.rfft(y, axis=0) * gain[:, None], len(y), axis=0)[n : 2 * n] + mean)
+    gain = _Gain.of(len(x), cutoff_hz / rate_hz)
+    return np.stack([gain.on(column) for column in x.T], axis=1)
+
+
+class _Gain(NamedTuple):
+    """Gain of a low-pass at the frequencies of a column that is mirrored about its ends."""
+
+    margin: int
+    length: int
+    gain: Float64[np.ndarray, " f"]
+
+    @staticmethod
+    @lru_cache(maxsize=8)
+    def of(n: int, cutoff: float) -> _Gain:
+        """Gain for n samples, cutoff in cycles a sample; the same object again, by which a motion knows its columns."""
+        margin = min(n - 1, math.ceil(FORGOTTEN / cutoff))
+        length = next_fast_len(n + 2 * margin, real=True)
+        return _Gain(margin, length, 1.0 / np.hypot(1.0, rfftfreq(length) / cutoff))
+
+    def on(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        """The column behind the gain."""
+        before, after = (
+            2.0 * x[end] - x[part] for end, part in ((0, slice(self.margin, 0, -1)), (-1, slice(-2, -self.margin - 2, -1)))
+        )
+        mean = x.mean()
+        y = np.concatenate([before, x, after]) - mean
+        return np.asarray(irfft(rfft(y, self.length) * self.gain, self.length)[self.margin : self.margin + len(x)] + mean)
 
 
 class Filter(NamedTuple):
