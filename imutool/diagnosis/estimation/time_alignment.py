@@ -25,7 +25,7 @@ from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
 from imutool.inertial.stationary import nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
-from imutool.recording import Imu, Poses, Recording, seconds
+from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.sensor.channels import channels_at
 from imutool.sensor.samples import IdealMotion
 
@@ -55,7 +55,7 @@ def with_simulation(
     stamp_s = seconds(real.imu.t_ns, start_ns)
     found: list[tuple[Simulated, Bool[np.ndarray, " n"]]] = []
     for part in _stretches(sim, settings):
-        t_sim = seconds(part.imu.t_ns, start_ns) - shift_s  # on the recording's clock
+        t_sim = seconds(part.imu.t_ns, start_ns + nanoseconds(shift_s))  # on the recording's clock
         simulated = _simulated(t_sim, part, shift_s, start_ns, real, settings, own_poses)
         found.append((simulated, (stamp_s >= simulated[0].t_s[0]) & (stamp_s <= simulated[0].t_s[-1])))
     shared_s = [_shared_s(stamp_s, inside) for _, inside in found]
@@ -172,7 +172,7 @@ def _simulated(
     period_s = float(np.median(np.diff(t_sim)))
     ideal = _by_poses(sim, samples, noise, 1.0 / period_s, settings)
     if ideal is not None:
-        t_s = seconds(sim.truth.t_ns[:1], start_ns)[0] - shift_s + ideal.t_s
+        t_s = seconds(sim.truth.t_ns[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
         t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
         return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6), None
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
@@ -279,7 +279,7 @@ def _rests(imu: Imu) -> bool:
 def _refined(real: Imu, sim: Imu, lag_s: float, settings: AlignmentSettings) -> float:
     """Lag (s) refined by Gauss-Newton, beside any linear map of the simulated rates."""
     t_s = seconds(real.t_ns, int(real.t_ns[0]))
-    t_sim, off_s = seconds(sim.t_ns, int(real.t_ns[0])) - lag_s, 0.0
+    t_sim, off_s = seconds(sim.t_ns, int(real.t_ns[0]) + nanoseconds(lag_s)), 0.0
     rate = make_interp_spline(t_sim, sim.gyro, k=3)
     for _ in range(REFINEMENTS):
         inside = (t_s + off_s >= t_sim[0]) & (t_s + off_s <= t_sim[-1])

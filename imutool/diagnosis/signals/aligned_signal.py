@@ -23,7 +23,7 @@ from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.fields import Fields
-from imutool.recording import seconds
+from imutool.recording import nanoseconds, seconds
 from imutool.sensor.effect import SignalState
 from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
@@ -150,7 +150,7 @@ def aligned(pair: SignalPair, others: Mapping[str, Fields], settings: DiagnoseSe
     if pair.clock_s is None:
         lag_s, aligned_s = lag_at_first_sight(pair, settings)
     if aligned_s is not None:
-        t_sim, lag_s = t_sim - aligned_s, 0.0
+        t_sim, lag_s = seconds(pair.sim_ns, start_ns + nanoseconds(aligned_s)), 0.0
     period_real, period_sim = float(np.median(np.diff(t_real))), float(np.median(np.diff(t_sim)))
     early, late = min(0.0, lag_s), max(0.0, lag_s)
     rows = np.flatnonzero((t_real - late >= t_sim[0]) & (t_real - early <= t_sim[-1]))

@@ -14,7 +14,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.errors import DataError
 from imutool.inertial.correlation import dependent_samples
-from imutool.recording import seconds
+from imutool.recording import nanoseconds, seconds
 
 Column = Float64[np.ndarray, "_"]
 Columns = Float64[np.ndarray, "_ k"]
@@ -109,7 +109,7 @@ def is_copy(pair: SignalPair, settings: DiagnoseSettings) -> bool:
     except DataError:  # too short or too unlike for a lag: copies have none on one clock
         shift_s = None
     if shift_s is not None:
-        sides[1] = sides[1][0] - shift_s, sides[1][1]
+        sides[1] = seconds(pair.sim_ns, int(pair.real_ns[0]) + nanoseconds(shift_s)), pair.sim
     shifts = 1 if shift_s is None and not pair.clock_std_s else SHIFTS
     coarse, dense = sorted(sides, key=lambda side: -float(np.median(np.diff(side[0]))))
     return any(_is_within(*one, *other, shifts) for one, other in ((coarse, dense), (dense, coarse)))

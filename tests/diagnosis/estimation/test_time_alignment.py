@@ -181,6 +181,13 @@ def test_clocks_without_a_common_epoch_are_aligned_below_the_step_of_the_correla
     assert pair.aligned_s - (YEAR_NS + off_ns) * 1e-9 == pytest.approx(0.0, abs=REFINED_S)
 
 
+def test_a_clock_that_begins_at_zero_keeps_the_samples_of_a_simulation_where_they_are() -> None:
+    """Seconds of a float since 1970 are known to a quarter of a microsecond: an even clock of a rate by them drifts away."""
+    real, sim = logs(sim_hz=1000.0, sim_start_ns=0)
+    (pair,) = with_simulation(real, sim)
+    assert len(pair.ideal.t_s) == len(sim.imu.t_ns)
+
+
 def test_clocks_aligned_by_the_motion_leave_the_same_misfit_but_for_the_step_of_the_search() -> None:
     (pair,) = with_simulation(*logs(sim_start_ns=planted.START_NS + YEAR_NS, with_poses=True))
     there = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
