@@ -39,6 +39,7 @@ class SplitSettings(Settings, frozen=True):
     """Fitted and held-out blocks of a log, and its constant bias: by experience on blind cases."""
 
     block_s: Positive = 6.0  # of one block
+    block_samples: Count = 40  # of one block at least: the first ones only begin the whitening filter
     held_out_each: Annotated[int, msgspec.Meta(ge=2)] = 3  # of so many blocks the last is never fitted
     margin_s: Positive = 0.3  # around a border between blocks and around a gap: part of neither
     gap_periods: Positive = 3.0  # a longer step between samples is a gap
@@ -124,7 +125,7 @@ class SignalSettings(Settings, frozen=True):
     """Any other signal of a log: by experience on planted effects."""
 
     least_s: Positive = 15.0  # two blocks to fit and one to test
-    least_samples: Count = 300  # of a spectrum
+    least_samples: Count = 100  # of a spectrum
     oversampling: Positive = 4.0  # so that a straight line between fine samples is the signal
     align_hz: Positive = 100.0  # of the clock on which recording and simulation are correlated
     least_correlation: Share = 0.3  # below which nothing says that the two are one motion

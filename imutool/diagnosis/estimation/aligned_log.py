@@ -210,7 +210,8 @@ def split(
     """
     each, margin_s = settings.held_out_each, settings.margin_s
     since = stamp_s - stamp_s[0]
-    block_s = min(settings.block_s, since[-1] / (2 * each))
+    block_s = max(settings.block_s, settings.block_samples * float(np.median(np.diff(stamp_s))))
+    block_s = min(block_s, since[-1] / (2 * each))
     block = np.floor(since / block_s).astype(int)
     held_out = block % each == each - 1
     inside = since - block * block_s

@@ -25,7 +25,7 @@ from imutool.diagnosis.signals.aligned_signal import AlignedSignal, Column
 from imutool.diagnosis.signals.ideal_signal import SignalPair
 from imutool.sensor.effect import Effect
 
-RICH_KNOTS = 12
+RICH_KNOTS, RICH_SAMPLES = 12, 6  # of a curve; for each number of a fit
 INTERPOLATION_ERROR = 1e-5  # of a signal's size, between the stamps of two logs; the digits of a sensor are coarser
 LEARNT_ERROR = 0.003  # of the efforts themselves
 SMALL_GAIN = 3e-3  # of the largest effect's squares, which such an error may take (5 % of its size)
@@ -99,12 +99,14 @@ def rich_residual(pair: AlignedSignal, column: int) -> Float64[np.ndarray, " n"]
     columns = [np.interp(at, k, values) for each in derivatives for values in each.T]
     x, dx = columns[column], columns[column + pair.columns]
     states = [np.interp(at, k, values) for values in ideal.state.values()]
-    columns += [np.sign(x), np.sign(dx), *states, *(np.sign(values) for values in states)]
+    columns += [np.sign(x), np.sign(dx)]
     for values in (x, dx, pair.stamp_s, *states):
         if np.ptp(values) > 0:
             columns += [*SplineBasis(np.linspace(values.min(), values.max(), RICH_KNOTS - 2)).basis(values).T]
+    columns += [*states, *(np.sign(values) for values in states)]
     usable = pair.usable[:, 0]
-    taken = len(columns) / max(int(usable.sum()), 2 * len(columns))  # of the noise, by the fit
+    columns = columns[: int(usable.sum()) // RICH_SAMPLES]  # of few samples a rich fit would leave nothing
+    taken = len(columns) / max(int(usable.sum()), 1)  # of the noise, by the fit
     left = pair.real[:, column] - ridge_fit(np.stack(columns, axis=1), pair.real[:, column], usable)
     return np.asarray(left / np.sqrt(1.0 - taken))
 

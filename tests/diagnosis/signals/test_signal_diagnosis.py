@@ -275,6 +275,16 @@ def test_the_noise_of_a_slow_sensor_is_known_from_few_samples() -> None:
     assert np.mean(levels) == pytest.approx(NOISE, rel=0.05)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.12])
+def test_a_sensor_slower_than_its_motion_shows_a_delay_and_nothing_else(late_s: float) -> None:
+    """Two samples a second of a motion of 2.5 Hz, 120 in all: blocks and a fit's numbers are fewer than for a fast sensor."""
+    for seed in seeds(3):
+        d = diagnosed(lambda x, t, c: x(t - late_s), seed, rate_hz=2.0)
+        assert names(d) == ({"delay"} if late_s else set())
+        if late_s:
+            within(d, "delay", {"delay": late_s})
+
+
 def test_what_serves_as_well_is_listed() -> None:
     d = diagnosed(lambda x, t, c: x.low(t, 400.0))  # 0.4 ms behind, and nothing else that could be seen
     (one,) = d.findings
@@ -308,7 +318,7 @@ def test_what_cannot_be_compared_is_refused_with_what_to_do(which: str) -> None:
     if which == "short":
         real = Fields(real.t_ns[:800], real.values[:800])
     elif which == "few":
-        real = Fields(real.t_ns[::40], real.values[::40])
+        real = Fields(real.t_ns[::60], real.values[::60])
     elif which == "constant recording":
         real = Fields(real.t_ns, np.full(len(real), 2.5))
     elif which == "constant simulation":
