@@ -20,7 +20,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog
 from imutool.diagnosis.result import Closer, Estimate, Finding, HeldOut, Unexplained
 from imutool.diagnosis.settings import HeldOutSettings, RingingSettings
 from imutool.errors import DataError
-from imutool.recording import Recording
+from imutool.recording import Recording, nanoseconds
 from imutool.sensor.effect import Acting, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.sensor.samples import IdealMotion
@@ -245,7 +245,7 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
 
 def _on_clock_of(ideal: IdealMotion, start_ns: int, pair: Pair) -> IdealMotion:
     """On the recording's clock, with its channels."""
-    t_s = ideal.t_s + (start_ns - pair.log_start_ns) * 1e-9 - pair.aligned_s
+    t_s = ideal.t_s + (start_ns - pair.log_start_ns - nanoseconds(pair.aligned_s)) * 1e-9
     channels = {name: np.interp(t_s, pair.ideal.t_s, values) for name, values in pair.ideal.channels.items()}
     return replace(ideal, t_s=t_s, channels=channels)
 
