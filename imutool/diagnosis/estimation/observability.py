@@ -19,6 +19,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects import vibration
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", "low_pass", "mount_resonance")}
@@ -252,29 +253,16 @@ def exclude_each_other(a: Effect, b: Effect) -> bool:
     return a.key == b.key or variants or a.name in REPLACES.get(b.name, ()) or b.name in REPLACES.get(a.name, ())
 
 
-def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:
-    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own.
-
-    A curve's coefficients move together by a constant, which the bias takes: each is as unsure as its prior, however sure
-    the curve.
-    """
-    if curve:
-        return False
-    vague = any(
-        parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
-    )
-    # what has another null value than zero, a time constant or a frequency, has no size by itself
-    amounts = [k for k, n in enumerate(effect.parameters) if n.null_value == 0.0 and not n.begins]
-    return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
-
-
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
     """Whether a fit is no answer: beyond the poses' band, too slow, too loud, or noise."""
     if any(n.least is not None and value < n.least for n, value in zip(effect.parameters, theta, strict=True)):
         return True
+    by_poses = [log.pair for log in logs if log.pair.band_hz is not None]
+    if effect.name == vibration.EFFECT.name and any(_is_motion(effect, theta, pair) for pair in by_poses):
+        return True
     # smoothed poses lose and delay motion beyond their band by themselves, which looks alike
     factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
-    reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
+    reach = [factor * pair.band_hz for pair in by_poses if pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
     outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
     if effect.name == "mount_resonance":  # no spring takes back what it passes on
@@ -282,6 +270,13 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
     least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
     return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
+
+
+def _is_motion(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
+    """Whether a line is one of the body's own motion, of which smoothed poses lose a part."""
+    by_poses, chance = expected(pair, ()), pair.settings.search.false_discovery_rate
+    line = expected(pair, ((effect, theta),)) - by_poses
+    return vibration.is_motion(pair.stamp_s, by_poses, line, float(theta[0]), chance)
 
 
 def _rings_too_loud(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

@@ -244,6 +244,22 @@ def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
     return bool((added.var(axis=0) < trapezoid(pair.noise_left.density, pair.noise_left.f_hz, axis=0)).all())
 
 
+def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:
+    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own.
+
+    A curve's coefficients move together by a constant, which the bias takes: each is as unsure as its prior, however sure
+    the curve.
+    """
+    if curve:
+        return False
+    vague = any(
+        parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
+    )
+    # what has another null value than zero, a time constant or a frequency, has no size by itself
+    amounts = [k for k, n in enumerate(effect.parameters) if n.null_value == 0.0 and not n.begins]
+    return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
+
+
 def smoothing(found: Fit, first: int) -> Chosen:
     """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
     filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]

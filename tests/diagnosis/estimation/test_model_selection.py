@@ -60,6 +60,14 @@ def names(found: Selection) -> list[str]:
     return [one.effect.key for one in found.selected]
 
 
+@pytest.mark.parametrize("turned", [[0.0, 0.0, np.pi / 2], [-2.2214, 2.2214, 0.0], [1.2, 1.2, -1.2]])
+def test_a_sensor_may_be_mounted_in_any_direction(turned: list[float]) -> None:
+    """By a right angle, upside down, with its axes exchanged: no fit from no rotation gets there."""
+    found = select_effects([planted.weighed(planted.pair(planted.shaken(2), {"mount_rotation": turned}))], planted.catalogue())
+    assert names(found) == ["mount_rotation"]
+    assert found.selected[0].theta == pytest.approx(turned, abs=1e-3)
+
+
 def sure(found: Selection, name: str, truth: list[float]) -> bool:
     one = next(one for one in found.selected if one.effect.key == name)
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
