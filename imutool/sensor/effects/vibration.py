@@ -37,14 +37,17 @@ def line_power(
 def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: float) -> float:
     """p-value of a line, all columns together.
 
-    That noise of any colour stands out as far from its own level, at any frequency.
+    That noise of any colour stands out as far from its own level on both sides, at any frequency.
     """
     from scipy.ndimage import median_filter
     from scipy.signal import periodogram
     from scipy.stats import gamma
 
     frequency, power = periodogram(samples, rate_hz, "hann", axis=0)
-    level = median_filter(power, (ABOUT // FINER, 1)) / np.log(2.0) + np.finfo(np.float64).tiny  # mean of what is exponential
+    side, half = ABOUT // FINER // 2, ABOUT // FINER // 4 + 2  # frequencies beside it, and to their middle
+    medians = np.pad(median_filter(power, (side, 1)), ((half, half), (0, 0)), "edge")
+    beside = np.maximum(medians[: -2 * half], medians[2 * half :])  # where a motion ends, one side is far quieter
+    level = beside / np.log(2.0) + np.finfo(np.float64).tiny  # mean of what is exponential
     at = int(np.argmin(np.abs(frequency - f_hz)))
     highest = (power[at - 1 : at + 2] / level[at - 1 : at + 2]).sum(axis=1).max()
     return float(min(1.0, len(frequency) * gamma.sf(highest, samples.shape[1])))
