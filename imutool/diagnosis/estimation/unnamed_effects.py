@@ -19,6 +19,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, SplineBasis, SplineCurve, expected
+from imutool.diagnosis.estimation.observability import values_of, without_implausible
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
@@ -242,6 +243,15 @@ def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
         return False
     added = (expected(pair, ((effect, theta),)) - expected(pair, ()))[pair.fitted | pair.held_out]
     return bool((added.var(axis=0) < trapezoid(pair.noise_left.density, pair.noise_left.f_hz, axis=0)).all())
+
+
+def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
+    """Effects without implausible parameters; None if all are plausible."""
+    reduced = [without_implausible(effect, theta, factor) for effect, theta in chosen]
+    if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
+        return None
+    kept = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
+    return tuple(pair for pair in kept if len(pair[1]))
 
 
 def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:

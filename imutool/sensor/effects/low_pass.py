@@ -11,6 +11,7 @@ in frequency there, a hold by half a sample).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -28,6 +29,7 @@ BAND = 0.35  # of the sample rate
 OMEGA = np.linspace(0.0, 2.0 * np.pi * BAND, 48)  # rad a sample
 SLOW, FALL = 0.02, 3  # of half the sample rate, from where on, and by which power of the frequency, relative errors may grow
 WEIGHT = 1.0 / (SLOW**FALL + (OMEGA / np.pi) ** FALL)
+Gain = Callable[[Float64[np.ndarray, " f"]], Float64[np.ndarray, " f"]]
 WAVES = np.exp(-1j * OMEGA[:, None] * np.arange(-AHEAD, BEHIND + 1))
 
 
@@ -40,6 +42,12 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
+def lag_s(theta: Theta) -> float:
+    """Lag (s) far below the cut-off (Hz), of a first order, or of a second by its damping."""
+    twice_zeta = 2.0 * float(theta[1]) if len(theta) > 1 else 1.0
+    return twice_zeta / (2.0 * math.pi * float(theta[0]))
+
+
 def _lagless(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     columns = (smoothed(x, motion.rate_hz, float(cutoff_hz[0])) for x in (motion.gyro, motion.accel, motion.alpha))
     gyro, accel, alpha = columns
@@ -48,10 +56,15 @@ def _lagless(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
 
 def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, cutoff_hz: float) -> Float64[np.ndarray, "n k"]:
     """Columns with the gain of a first-order low-pass and without its lag."""
+    return with_gain(x, rate_hz, lambda f_hz: np.asarray(1.0 / np.hypot(1.0, f_hz / cutoff_hz)))
+
+
+def with_gain(x: Float64[np.ndarray, "n k"], rate_hz: float, gain: Gain) -> Float64[np.ndarray, "n k"]:
+    """Columns with a gain by frequency (Hz), without a lag."""
     n, mean = len(x), x.mean(axis=0)
     y = np.concatenate([2.0 * x[0] - x[::-1], x, 2.0 * x[-1] - x[::-1]]) - mean
-    gain = 1.0 / np.hypot(1.0, np.fft.rfftfreq(len(y), 1.0 / rate_hz) / cutoff_hz)
-    return np.asarray(np.fft.irfft(np.fft.rfft(y, axis=0) * gain[:, None], len(y), axis=0)[n : 2 * n] + mean)
+    by = gain(np.fft.rfftfreq(len(y), 1.0 / rate_hz))
+    return np.asarray(np.fft.irfft(np.fft.rfft(y, axis=0) * by[:, None], len(y), axis=0)[n : 2 * n] + mean)
 
 
 class Filter(NamedTuple):

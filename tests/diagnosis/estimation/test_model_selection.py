@@ -36,6 +36,7 @@ SINGLE = {
     "lever_arm": [0.2, -0.05, 0.1],
     "clock_offset": [0.01],
     "low_pass": [12.0],
+    "second_order_low_pass": [5.0, 0.7],
     "gyro_scale": [0.02, -0.03, 0.01],
     "accel_misalignment": [0.01, -0.02, 0.005, 0.01, -0.01, 0.02],
     "mount_rotation": [0.03, -0.02, 0.04],
