@@ -132,7 +132,8 @@ def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"]
     A sensor at rest, whose digits are coarser than its noise, repeats itself as well: there axis after axis changes alone.
     """
     equal = np.concatenate([np.zeros((1, 6), bool), np.diff(values, axis=0) == 0])[: len(values)]
-    same, again = equal.all(axis=1), np.zeros(len(values), bool)
+    same: Bool[np.ndarray, " n"] = np.asarray(equal.all(axis=1))
+    again = np.zeros(len(same), bool)
     for first, end in true_ranges(same):
         around = [equal[k].sum() for k in (first - 1, end) if 0 < k < len(same)]
         again[first:end] = end - first >= LEAST - 1 and not (around and max(around) > MOST_EQUAL)
