@@ -39,7 +39,8 @@ def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
     read = motion.sample(samples.stamp_s, samples.stamp_s)
     pairs = [(read.gyro - read.gyro.mean(axis=0), samples.gyro - samples.gyro.mean(axis=0)), (read.accel, samples.accel)]
     body, sensor = (np.concatenate([pair[k] / max(pair[0].std(), NOTHING_MOVES) for pair in pairs]) for k in (0, 1))
-    turned = Rotation.align_vectors(body, sensor)[0]
+    U, _, Vt = np.linalg.svd(body.T @ sensor)
+    turned = Rotation.from_matrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
     left, before = (float(((body - one) ** 2).sum()) for one in (turned.apply(sensor), sensor))
     return [np.zeros(3), *([turned.as_rotvec()] if turned.magnitude() > NEAR_RAD and left < MOST * before else [])]
 
