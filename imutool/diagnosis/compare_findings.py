@@ -15,7 +15,8 @@ import numpy as np
 
 from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.observability import exclude_each_other, plausible_part, values_of
+from imutool.diagnosis.estimation.observability import exclude_each_other, values_of
+from imutool.diagnosis.estimation.unnamed_effects import plausible_part
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped
@@ -25,7 +26,10 @@ ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two 
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
 CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
-OF_READING = ("gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_dead_band")
+OF_READING = (  # or of its rest, where rounding errs by a constant
+    *("gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_dead_band"),
+    *("gyro_bias_drift", "accel_bias_drift"),
+)
 NAMED_SHARE = 0.05  # of the squares that rounding adds, which an effect with a name has to remove
 OF_UNIT = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "mount_rotation")  # its own, or its mount's
 ANOTHER_MOTION = "the simulation is of another motion; each was compared with its own true poses"

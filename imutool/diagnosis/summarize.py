@@ -36,13 +36,12 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
-from imutool.sensor.effects.vibration import line_p_value, line_power
+from imutool.sensor.effects.vibration import IN_POSES, line_p_value, line_power
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS
 
 RESONANT = {"mount_resonance", "vibration", "timestamp_jitter"}
 JITTER, QUANTIZATION = "timestamp_jitter", "quantization"
-IN_POSES = 0.1  # of the power of a line in the samples, from which the poses have it, too
 SHOWN_KNOTS = 41  # of a curve without a name in the report
 
 

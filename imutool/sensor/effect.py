@@ -8,7 +8,7 @@ error of a bias model is derived from it (`imutool.sensor.linear_form`). Effects
 |---|---|---|
 | MOTION | `IdealMotion` | motion where the sensor sits: gravity, earth_rotation, lever_arm, size_effect, vibration |
 | MOUNT | `IdealMotion` | how the sensor is mounted: mount_resonance, mount_rotation |
-| BANDWIDTH | `IdealMotion` | the sensor's own bandwidth: low_pass, gyro_delay |
+| BANDWIDTH | `IdealMotion` | the sensor's own bandwidth: low_pass, second_order_low_pass, gyro_delay |
 | CLOCK | times | when samples are taken: clock_offset, clock_skew, clock_jump, clock_wander |
 | SENSOR | `SensorSamples` | scale, misalignment, nonlinearity, g-sensitivity, temperature, drift, bias |
 | CONVERTER | `SensorSamples` | saturation, then quantization |

@@ -291,3 +291,14 @@ def test_samples_of_a_stuck_sensor_are_left_out_and_those_of_one_without_noise_s
     still = replace(recording, imu=replace(recording.imu, gyro=0.0 * gyro, accel=0.0 * accel + 1.0))
     assert measured_recording(recording).imu is recording.imu
     assert measured_recording(still).imu is still.imu
+
+
+def test_a_sensor_at_rest_whose_digits_are_coarser_than_its_noise_is_not_stuck() -> None:
+    """It repeats itself, and then one axis alone changes."""
+    recording = flight(1, duration_s=5.0)
+    gyro, accel = recording.imu.gyro.copy(), recording.imu.accel.copy()
+    gyro[400:], accel[400:] = gyro[400], accel[400]
+    gyro[460:, 1] += 1e-3
+    gyro[520:, 0] -= 1e-3
+    resting = replace(recording, imu=replace(recording.imu, gyro=gyro, accel=accel))
+    assert measured_recording(resting).imu is resting.imu

@@ -71,9 +71,10 @@ def test_a_curve_of_an_axis_that_does_no_more_than_its_digits_is_theirs(
 
 
 @pytest.mark.parametrize(("lsb", "rounding"), [(0.3, True), (0.2, False)])
-def test_two_gains_that_remove_a_fraction_of_what_the_digits_add_are_theirs(lsb: float, rounding: bool) -> None:
+@pytest.mark.parametrize("name", ["gyro_scale_asymmetry", "gyro_bias_drift"])
+def test_what_removes_a_fraction_of_what_the_digits_add_is_theirs(name: str, lsb: float, rounding: bool) -> None:
     digits = finding("quantization", parameters={"gyro_lsb": Estimate(lsb, 1e-3 * lsb, "rad/s")})
-    assert is_of_digits(finding("gyro_scale_asymmetry"), digits) is rounding
+    assert is_of_digits(finding(name), digits) is rounding
     assert not is_of_digits(finding("gyro_misalignment"), digits)
 
 

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.reference_coverage import align, align_all
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
-from imutool.recording import Recording
+from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.simulate import TRUTH_TOPIC, simulated
 
@@ -88,3 +90,24 @@ def test_errors_of_its_poses_are_no_physics(tmp_path: Path) -> None:
     assert {one.effect for one in found.findings}.isdisjoint({"mount_resonance", "lever_arm", "size_effect"})
     assert any("follows the recording's own poses" in remark for remark in found.remarks)
     assert all(closer.by == "second simulation" for closer in found.closer.values())
+
+
+def test_splines_through_poses_take_nothing_of_a_motion_in_their_band() -> None:
+    """Of what moves near its edge they took 0.5 per cent, which a quiet accelerometer tells from nothing."""
+    rng, t_s = np.random.default_rng(0), np.arange(0.0, 120.0, 0.01)
+    w, phase = 2.0 * np.pi * rng.uniform(0.1, 2.5, 60), rng.uniform(0.0, 2.0 * np.pi, 60)  # a boat in a chop
+    heave = 0.2 * rng.normal(size=60) / (1.0 + w**2)
+    wave, t_ns = np.sin(w * t_s[:, None] + phase), np.round(t_s * 1e9).astype(np.int64)
+    accel = -wave @ (w**2 * heave)
+    p_wb = np.outer(wave @ heave, [0.0, 0.0, 1.0]) + 2e-4 * rng.normal(size=(len(t_s), 3))
+    turned = Rotation.from_rotvec(np.outer(wave @ heave[::-1], [1.0, 0.0, 0.0]))  # so that rotations are no smoother
+    sensed = turned.inv().apply(np.outer(accel + GRAVITY_M_S2, [0.0, 0.0, 1.0]))
+    measured = turned * Rotation.from_rotvec(4e-4 * rng.normal(size=(len(t_s), 3)))
+    poses = Poses(t_ns, p_wb, measured.as_quat(scalar_first=True))
+    real = Recording("boat", Imu(t_ns, np.zeros((len(t_s), 3)), sensed), truths={TRUTH_TOPIC: poses})
+    (pair,) = align(real, None, None, DiagnoseSettings())
+    assert pair.band_hz is not None
+    band = butter(4, [0.8 * pair.band_hz, pair.band_hz], "bandpass", fs=100.0, output="sos")
+    z = np.interp(pair.ideal.t_s, t_s, sensed[:, 2])
+    one, other = (sosfiltfilt(band, x - GRAVITY_M_S2)[500:-500] for x in (z, pair.ideal.accel[:, 2]))
+    assert one @ other / (one @ one) == pytest.approx(1.0, abs=3.5e-3)

@@ -119,3 +119,14 @@ def test_coloured_noise_has_no_line() -> None:
     assert line_p_value(coloured, 100.0, strongest) > SETTINGS.search.false_discovery_rate
     line = coloured + 0.05 * np.sin(2.0 * np.pi * 12.3 * t_s)[:, None]
     assert line_p_value(line, 100.0, 12.3) < 1e-9
+
+
+def test_a_motion_that_ends_at_a_frequency_has_no_line_there() -> None:
+    """Beyond 9 Hz there is noise alone, of which any frequency of the motion stands out."""
+    rng, hz = np.random.default_rng(6), np.fft.rfftfreq(6000, 0.01)
+    spectrum = (rng.normal(size=(len(hz), 6)) + 1j * rng.normal(size=(len(hz), 6))) * np.where(hz < 9.0, 1.0, 1e-3)[:, None]
+    motion = np.fft.irfft(spectrum, 6000, axis=0)
+    near = hz[(hz > 8.6) & (hz < 9.0)]
+    assert min(line_p_value(motion, 100.0, float(at)) for at in near) > SETTINGS.search.false_discovery_rate
+    line = motion + 0.2 * motion.std() * np.sin(2.0 * np.pi * 8.9 * np.arange(6000) / 100.0)[:, None]
+    assert line_p_value(line, 100.0, 8.9) < 1e-9

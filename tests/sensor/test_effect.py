@@ -169,6 +169,7 @@ def test_the_catalogue_of_left_out_physics_is_there() -> None:
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {
         "gyro_dead_band",
+        "second_order_low_pass",
         "gyro_delay",
         "clock_offset",
         "clock_skew",
@@ -405,6 +406,16 @@ def test_a_soft_mount_has_the_gain_and_phase_of_its_formula(f_hz: float, f0_hz: 
     assert abs(response(out.accel[:, 1], f_hz, felt.t_s) - (0.5 + 0.5 * exact)) < promised(f_hz) * abs(exact)
     np.testing.assert_array_equal(out.accel[:, 2], felt.accel[:, 2])
     np.testing.assert_array_equal(out.gyro, felt.gyro)
+
+
+@pytest.mark.parametrize("f_hz", [0.5, 11.0, 50.0])
+@pytest.mark.parametrize(("cutoff_hz", "zeta"), [(8.0, 0.3), (30.0, 0.7071), (30.0, 1.0), (90.0, 2.5)])
+def test_a_second_order_low_pass_has_the_gain_and_phase_of_its_formula(f_hz: float, cutoff_hz: float, zeta: float) -> None:
+    felt = sine(f_hz)
+    out = act("second_order_low_pass", felt, cutoff_hz, zeta)
+    exact = 1.0 / (1.0 - (f_hz / cutoff_hz) ** 2 + 2.0j * zeta * f_hz / cutoff_hz)
+    for values in (out.gyro, out.accel, out.alpha):
+        assert abs(response(values[:, 0], f_hz, felt.t_s) / exact - 1.0) < promised(f_hz)
 
 
 @pytest.mark.parametrize(("name", "theta"), [("low_pass", (3.0,)), ("mount_resonance", (9.0, 0.05, 1.0, 1.0, 1.0))])

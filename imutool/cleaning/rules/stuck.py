@@ -19,6 +19,7 @@ from imutool.cleaning.samples import Samples, padded
 from imutool.recording.columns import median, true_ranges
 
 LEAST = 10  # equal samples in a row
+MOST_EQUAL = 3  # of six axes, beside a run: as one sensor does that is slower than the other
 AXIS_LEAST, AXIS_LEAST_S = 100, 1.0  # of one axis alone; the longest in real recordings is 17, or 0.17 s
 HELD_SHARE = 0.3  # of neighbours that are equal: the topic is faster than its sensor
 AXIS_DISTRUST = 0.1  # of the time
@@ -126,11 +127,16 @@ def repeated(values: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
 
 
 def _repeats(values: Float64[np.ndarray, "n 6"]) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Samples that repeat the one before, and those of them in runs of `LEAST` and more."""
-    same = np.concatenate([[False], (np.diff(values, axis=0) == 0).all(axis=1)])[: len(values)]
+    """Samples that repeat the one before, and those of them in runs of `LEAST` and more.
+
+    A sensor at rest, whose digits are coarser than its noise, repeats itself as well: there axis after axis changes alone.
+    """
+    equal = np.concatenate([np.zeros((1, 6), bool), np.diff(values, axis=0) == 0])[: len(values)]
+    same: Bool[np.ndarray, " n"] = np.asarray(equal.all(axis=1))
     again = np.zeros(len(same), bool)
     for first, end in true_ranges(same):
-        again[first:end] = end - first >= LEAST - 1
+        around = [equal[k].sum() for k in (first - 1, end) if 0 < k < len(same)]
+        again[first:end] = end - first >= LEAST - 1 and not (around and max(around) > MOST_EQUAL)
     return same, again
 
 

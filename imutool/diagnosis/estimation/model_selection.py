@@ -22,8 +22,6 @@ from imutool.diagnosis.estimation.observability import (
     WANDER,
     below_model_error,
     beyond_the_band,
-    has_no_size,
-    plausible_part,
     unidentified,
     values_of,
     with_common_arm,
@@ -43,7 +41,7 @@ from imutool.diagnosis.estimation.significance import (
     unnamed_count,
     with_onsets_of,
 )
-from imutool.diagnosis.estimation.unnamed_effects import smoothing, takes_noise, with_finer_curve
+from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, smoothing, takes_noise, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each

@@ -13,15 +13,17 @@ from scipy.signal import welch
 from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects import low_pass, vibration
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
-NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", "low_pass", "mount_resonance")}
+LOW_PASSES = ("low_pass", "second_order_low_pass")
+NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", *LOW_PASSES, "mount_resonance")}
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
 STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
 UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
@@ -32,8 +34,11 @@ PLAINER = {  # of one that is no better: another effect, and its parameters, by 
 }
 SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth
 CLOCKS = (*STEADY, WANDER)
-FILTERS = ("low_pass", "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
-REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": ("low_pass",)}  # together they would cancel
+FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
+REPLACES = {  # together they would cancel
+    **{WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": LOW_PASSES},
+    LOW_PASSES[1]: LOW_PASSES[:1],
+}
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 Starts = Mapping[str, Sequence[Theta]]
 
@@ -113,8 +118,8 @@ def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequen
     """Fit with a clock offset for a low pass beyond the poses' band, which its delay shows."""
     offset = next((e for e in named if e.name == "clock_offset" and e.key not in now.keys), None)
     for k, (effect, theta) in enumerate(now.chosen):
-        if offset is not None and effect.name == "low_pass" and beyond_the_band(effect, theta, logs, settings):
-            delayed = offset, -1.0 / (2.0 * np.pi * theta)  # a first order far below its cut-off
+        if offset is not None and effect.name in LOW_PASSES and beyond_the_band(effect, theta, logs, settings):
+            delayed = offset, np.array([-low_pass.lag_s(theta)])  # far below its cut-off
             return fit(logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
     return now
 
@@ -157,6 +162,11 @@ def _plainer(name: str, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequ
     """
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
+    if name == LOW_PASSES[1]:
+        return {
+            "clock_offset": ([0], [-low_pass.lag_s(theta)]),
+            "low_pass": ([0], [1.0 / (2.0 * np.pi * low_pass.lag_s(theta))]),
+        }
     if name == "gyro_delay" and poses:
         return {"clock_offset": ([0], [-theta[0]])}
     if name in PLAINER:
@@ -194,15 +204,6 @@ def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
     """Values of the parameters that a reduced effect still has."""
     names = [parameter.name for parameter in reduced.parameters]
     return np.array([value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.name in names])
-
-
-def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
-    """Effects without implausible parameters; None if all are plausible."""
-    reduced = [without_implausible(effect, theta, factor) for effect, theta in chosen]
-    if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
-        return None
-    kept = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
-    return tuple(pair for pair in kept if len(pair[1]))
 
 
 def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
@@ -252,29 +253,16 @@ def exclude_each_other(a: Effect, b: Effect) -> bool:
     return a.key == b.key or variants or a.name in REPLACES.get(b.name, ()) or b.name in REPLACES.get(a.name, ())
 
 
-def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:
-    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own.
-
-    A curve's coefficients move together by a constant, which the bias takes: each is as unsure as its prior, however sure
-    the curve.
-    """
-    if curve:
-        return False
-    vague = any(
-        parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
-    )
-    # what has another null value than zero, a time constant or a frequency, has no size by itself
-    amounts = [k for k, n in enumerate(effect.parameters) if n.null_value == 0.0 and not n.begins]
-    return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
-
-
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:
     """Whether a fit is no answer: beyond the poses' band, too slow, too loud, or noise."""
     if any(n.least is not None and value < n.least for n, value in zip(effect.parameters, theta, strict=True)):
         return True
+    by_poses = [log.pair for log in logs if log.pair.band_hz is not None]
+    if effect.name == vibration.EFFECT.name and any(_is_motion(effect, theta, pair) for pair in by_poses):
+        return True
     # smoothed poses lose and delay motion beyond their band by themselves, which looks alike
-    factor = settings.beyond_band_low_pass if effect.name == "low_pass" else settings.beyond_band
-    reach = [factor * log.pair.band_hz for log in logs if log.pair.band_hz is not None]
+    factor = settings.beyond_band_low_pass if effect.name in LOW_PASSES else settings.beyond_band
+    reach = [factor * pair.band_hz for pair in by_poses if pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
     outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
     if effect.name == "mount_resonance":  # no spring takes back what it passes on
@@ -282,6 +270,13 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
     least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
     return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
+
+
+def _is_motion(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
+    """Whether a line is one of the body's own motion, of which smoothed poses lose a part."""
+    by_poses, chance = expected(pair, ()), pair.settings.search.false_discovery_rate
+    line = expected(pair, ((effect, theta),)) - by_poses
+    return vibration.is_motion(pair.stamp_s, by_poses, line, float(theta[0]), chance)
 
 
 def _rings_too_loud(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

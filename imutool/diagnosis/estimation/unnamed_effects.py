@@ -19,6 +19,7 @@ from imutool.array_types import Float64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, SplineBasis, SplineCurve, expected
+from imutool.diagnosis.estimation.observability import values_of, without_implausible
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
@@ -244,6 +245,31 @@ def _within_noise(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
     return bool((added.var(axis=0) < trapezoid(pair.noise_left.density, pair.noise_left.f_hz, axis=0)).all())
 
 
+def plausible_part(chosen: Chosen, factor: float) -> Chosen | None:
+    """Effects without implausible parameters; None if all are plausible."""
+    reduced = [without_implausible(effect, theta, factor) for effect, theta in chosen]
+    if all(new is effect for new, (effect, _) in zip(reduced, chosen, strict=True)):
+        return None
+    kept = [(new, values_of(effect, new, theta)) for new, (effect, theta) in zip(reduced, chosen, strict=True)]
+    return tuple(pair for pair in kept if len(pair[1]))
+
+
+def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> bool:
+    """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own.
+
+    A curve's coefficients move together by a constant, which the bias takes: each is as unsure as its prior, however sure
+    the curve.
+    """
+    if curve:
+        return False
+    vague = any(
+        parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)
+    )
+    # what has another null value than zero, a time constant or a frequency, has no size by itself
+    amounts = [k for k, n in enumerate(effect.parameters) if n.null_value == 0.0 and not n.begins]
+    return vague or (bool(amounts) and bool((np.abs(theta[amounts]) < std[amounts]).all()))
+
+
 def smoothing(found: Fit, first: int) -> Chosen:
     """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
     filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]
@@ -257,10 +283,10 @@ def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
     gain, of_lag = without.objective - found.objective, alike.objective - found.objective
     if of_lag >= LAG_SHARE * gain:
         return False
-    return gain < SMOOTHED_SHARE * sum(_smoothed_squares(log, float(theta[0]), found.part) for log in found.logs)
+    return gain < SMOOTHED_SHARE * sum(_smoothed_squares(log, theta, found.part) for log in found.logs)
 
 
-def _smoothed_squares(log: WhitenedLog, cutoff_hz: float, part: str) -> float:
+def _smoothed_squares(log: WhitenedLog, theta: Theta, part: str) -> float:
     """White squares that a low-pass takes from the noise that is left of a simulation; infinite if that is unknown."""
     left = log.pair.noise_left if isinstance(log.pair, Pair) else None
     if left is None:
@@ -269,5 +295,5 @@ def _smoothed_squares(log: WhitenedLog, cutoff_hz: float, part: str) -> float:
     density = make_interp_spline(left.f_hz, left.density, k=1)(np.fft.rfftfreq(n, 1.0 / rate_hz).clip(max=left.f_hz[-1]))
     white = np.fft.rfft(np.random.default_rng(0).normal(scale=np.sqrt(rate_hz / 2.0), size=(n, 6)), axis=0)
     noise = np.fft.irfft(np.sqrt(density) * white, n, axis=0)
-    before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, cutoff_hz)))
+    before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, theta)))
     return float((before**2).sum() - (after**2).sum())

@@ -114,7 +114,7 @@ def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
 
 
 def _lagless(ideal: IdealSignal, theta: Theta) -> IdealSignal:
-    return replace(ideal, fine=smoothed(ideal.fine, ideal.rate_hz, float(theta[0])))
+    return replace(ideal, fine=smoothed(ideal.fine, ideal.rate_hz, theta))
 
 
 def _dead_bands(size: float, unit: str) -> Iterator[Effect]:

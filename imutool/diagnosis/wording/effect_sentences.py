@@ -109,6 +109,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "accel_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
     "gyro_dead_band": "{w.it} reads zero below {w.main}",
     "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
+    "second_order_low_pass": "{w.it} is too slow for fast motion, {w.main.labelled} (second-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",
     "gravity": "gravity differs from that of {w.other}, {w.main.labelled}",

@@ -42,17 +42,24 @@ def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
-def _lagless(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
-    gain = _Gain.of(len(motion.gyro), float(cutoff_hz[0]) / motion.rate_hz)
+def lag_s(theta: Theta) -> float:
+    """Lag (s) far below the cut-off (Hz), of a first order, or of a second by its damping."""
+    twice_zeta = 2.0 * float(theta[1]) if len(theta) > 1 else 1.0
+    return twice_zeta / (2.0 * math.pi * float(theta[0]))
+
+
+def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, theta: Theta) -> Float64[np.ndarray, "n k"]:
+    """Columns with the gain of a low-pass, of first or second order by its numbers, and without its lag."""
+    gain = _Gain.of(len(x), float(theta[0]) / rate_hz, *theta[1:].tolist())
+    return np.stack([gain.on(column) for column in x.T], axis=1)
+
+
+def without_lag(motion: IdealMotion, theta: Theta) -> IdealMotion:
+    """Motion with the gain of a low-pass, and without its lag."""
+    gain = _Gain.of(len(motion.gyro), float(theta[0]) / motion.rate_hz, *theta[1:].tolist())
     columns = (motion.sampler.behind.changed(x, gain, gain.on) for x in (motion.gyro, motion.accel, motion.alpha))
     gyro, accel, alpha = columns
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
-
-
-def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, cutoff_hz: float) -> Float64[np.ndarray, "n k"]:
-    """Columns with the gain of a first-order low-pass and without its lag."""
-    gain = _Gain.of(len(x), cutoff_hz / rate_hz)
-    return np.stack([gain.on(column) for column in x.T], axis=1)
 
 
 class _Gain(NamedTuple):
@@ -64,11 +71,12 @@ class _Gain(NamedTuple):
 
     @staticmethod
     @lru_cache(maxsize=8)
-    def of(n: int, cutoff: float) -> _Gain:
+    def of(n: int, cutoff: float, zeta: float | None = None) -> _Gain:
         """Gain for n samples, cutoff in cycles a sample; the same object again, by which a motion knows its columns."""
-        margin = min(n - 1, math.ceil(FORGOTTEN / cutoff))
+        margin = min(n - 1, math.ceil(FORGOTTEN / (cutoff * min(1.0, zeta or 1.0))))
         length = next_fast_len(n + 2 * margin, real=True)
-        return _Gain(margin, length, 1.0 / np.hypot(1.0, rfftfreq(length) / cutoff))
+        x = rfftfreq(length) / cutoff
+        return _Gain(margin, length, 1.0 / (np.hypot(1.0, x) if zeta is None else np.hypot(1.0 - x**2, 2.0 * zeta * x)))
 
     def on(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """The column behind the gain."""
@@ -136,5 +144,5 @@ EFFECT = Effect(
     _forward,
     linear=False,
     starts=starts_at(*([hz] for hz in START_HZ)),
-    lagless=_lagless,
+    lagless=without_lag,
 )

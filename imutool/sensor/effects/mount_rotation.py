@@ -9,8 +9,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
-from imutool.sensor.samples import IdealMotion, Vectors
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
+
+NOTHING_MOVES = 1e-9  # rad/s or m/s², below which a sensor says nothing
+NEAR_RAD = 0.3  # up to which a fit that begins without a rotation finds it
+MOST = 0.5  # of the squares, that may be left: between noise and noise every rotation leaves as much
 
 
 def _forward(motion: IdealMotion, phi: Theta) -> IdealMotion:
@@ -30,6 +34,17 @@ def _rotation(*phi: float) -> Float64[np.ndarray, "3 3"]:
     return np.asarray(Rotation.from_rotvec(phi).as_matrix())
 
 
+def _starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+    """No rotation; also the nearest of both sensors (Kabsch, Acta Cryst. 1976), if it is large and takes most of the misfit."""
+    read = motion.sample(samples.stamp_s, samples.stamp_s)
+    pairs = [(read.gyro - read.gyro.mean(axis=0), samples.gyro - samples.gyro.mean(axis=0)), (read.accel, samples.accel)]
+    body, sensor = (np.concatenate([pair[k] / max(pair[0].std(), NOTHING_MOVES) for pair in pairs]) for k in (0, 1))
+    U, _, Vt = np.linalg.svd(body.T @ sensor)
+    turned = Rotation.from_matrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    left, before = (float(((body - one) ** 2).sum()) for one in (turned.apply(sensor), sensor))
+    return [np.zeros(3), *([turned.as_rotvec()] if turned.magnitude() > NEAR_RAD and left < MOST * before else [])]
+
+
 EFFECT = Effect(
     "mount_rotation",
     Stage.MOUNT,
@@ -39,5 +54,5 @@ EFFECT = Effect(
     "two axes turn, or one turns and gravity tilts",
     _forward,
     linear=False,
-    starts=starts_at([0.0, 0.0, 0.0]),
+    starts=_starts,
 )

@@ -15,6 +15,7 @@ LEAST_HZ = 3.0  # slower is motion, drift or another effect, and no vibration
 LINES = 3  # starts: the strongest lines of the residual
 FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
 ABOUT = 401  # frequencies whose median tells what a line stands out from
+IN_POSES = 0.1  # of the power of a line, from which the poses have it, too
 
 
 def _waves(t_s: Float64[np.ndarray, " n"], f_hz: float) -> Float64[np.ndarray, "n 2"]:
@@ -36,17 +37,37 @@ def line_power(
 def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: float) -> float:
     """p-value of a line, all columns together.
 
-    That noise of any colour stands out as far from its own level, at any frequency.
+    That noise of any colour stands out as far from its own level on both sides, at any frequency.
     """
     from scipy.ndimage import median_filter
     from scipy.signal import periodogram
     from scipy.stats import gamma
 
     frequency, power = periodogram(samples, rate_hz, "hann", axis=0)
-    level = median_filter(power, (ABOUT // FINER, 1)) / np.log(2.0) + np.finfo(np.float64).tiny  # mean of what is exponential
+    side, half = ABOUT // FINER // 2, ABOUT // FINER // 4 + 2  # frequencies beside it, and to their middle
+    medians = np.pad(median_filter(power, (side, 1)), ((half, half), (0, 0)), "edge")
+    beside = np.maximum(medians[: -2 * half], medians[2 * half :])  # where a motion ends, one side is far quieter
+    level = beside / np.log(2.0) + np.finfo(np.float64).tiny  # mean of what is exponential
     at = int(np.argmin(np.abs(frequency - f_hz)))
     highest = (power[at - 1 : at + 2] / level[at - 1 : at + 2]).sum(axis=1).max()
     return float(min(1.0, len(frequency) * gamma.sf(highest, samples.shape[1])))
+
+
+def is_motion(
+    stamp_s: Float64[np.ndarray, " n"],
+    by_poses: Float64[np.ndarray, "n k"],
+    line: Float64[np.ndarray, "n k"],
+    f_hz: float,
+    chance: float,
+) -> bool:
+    """Whether a line is motion of the body: the poses have it as well, as a line of their own.
+
+    A body that moves periodically, as in walking, has lines, and poses that were smoothed lose a part of each.
+    """
+    noise = white_noise(by_poses + line)
+    here, there = (line_power(stamp_s, one, f_hz, noise=noise) for one in (line, by_poses))
+    rate_hz = (len(stamp_s) - 1) / (stamp_s[-1] - stamp_s[0])
+    return there > IN_POSES * here and line_p_value(by_poses, float(rate_hz), f_hz) < chance
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:

@@ -36,6 +36,7 @@ SINGLE = {
     "lever_arm": [0.2, -0.05, 0.1],
     "clock_offset": [0.01],
     "low_pass": [12.0],
+    "second_order_low_pass": [5.0, 0.7],
     "gyro_scale": [0.02, -0.03, 0.01],
     "accel_misalignment": [0.01, -0.02, 0.005, 0.01, -0.01, 0.02],
     "mount_rotation": [0.03, -0.02, 0.04],
@@ -58,6 +59,14 @@ def asked(pair: Pair, beyond: bool = True) -> Selection:
 
 def names(found: Selection) -> list[str]:
     return [one.effect.key for one in found.selected]
+
+
+@pytest.mark.parametrize("turned", [[0.0, 0.0, np.pi / 2], [-2.2214, 2.2214, 0.0], [1.2, 1.2, -1.2]])
+def test_a_sensor_may_be_mounted_in_any_direction(turned: list[float]) -> None:
+    """By a right angle, upside down, with its axes exchanged: no fit from no rotation gets there."""
+    found = select_effects([planted.weighed(planted.pair(planted.shaken(2), {"mount_rotation": turned}))], planted.catalogue())
+    assert names(found) == ["mount_rotation"]
+    assert found.selected[0].theta == pytest.approx(turned, abs=1e-3)
 
 
 def sure(found: Selection, name: str, truth: list[float]) -> bool:

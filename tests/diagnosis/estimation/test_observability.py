@@ -26,6 +26,7 @@ from imutool.sensor import catalogue
 from imutool.sensor.effects import clock_wander
 
 SETTINGS = SearchSettings()
+STEPS_HZ = 5.9  # a harmonic of a walk
 
 
 def shown(felt: object, names: list[str] | None = None, *, noise: float = 1.0, known: np.ndarray | None = None) -> set[str]:
@@ -127,6 +128,16 @@ def test_a_dead_band_within_the_noise_of_a_simulation_is_that_noise(sim_noise: f
     """In rad/s of a sample: what the filter leaves of it at rest, no gyro reads."""
     pair = replace(planted.pair(planted.shaken(2)), sim_noise=np.full(6, sim_noise))
     ((effect, theta),) = planted.acting({"gyro_dead_band": [0.015]})
+    assert beyond_the_band(effect, theta, [planted.weighed(pair)], SETTINGS) == beyond
+
+
+@pytest.mark.parametrize(("periodic", "beyond"), [(True, True), (False, False)])
+def test_a_line_of_the_bodys_own_motion_is_no_vibration(periodic: bool, beyond: bool) -> None:
+    """A gait repeats itself, and smoothed poses lose a part of each of its lines."""
+    felt, rng = planted.shaken(2), np.random.default_rng(2)
+    shaken = 0.2 * rng.normal(size=(len(felt.t_s), 3)) + periodic * np.sin(2.0 * np.pi * STEPS_HZ * felt.t_s)[:, None]
+    pair = replace(planted.pair(replace(felt, accel=felt.accel + shaken)), band_hz=STEPS_HZ + 2.0)
+    ((effect, theta),) = planted.acting({"vibration": [STEPS_HZ, *(0.05 * np.ones(6)), *np.zeros(6)]})
     assert beyond_the_band(effect, theta, [planted.weighed(pair)], SETTINGS) == beyond
 
 
