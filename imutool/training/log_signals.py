@@ -61,7 +61,10 @@ def without_nuisances(
 
 
 def with_poses_of_sensor(recordings: Sequence[Recording], own: Iterable[Float[Tensor, "logs _"]]) -> list[Recording]:
-    """Recordings without the nuisances that each sensor's fit found: a network would take a log's own for the sensor's."""
+    """Recordings without the nuisances of their poses, by each sensor's fit.
+
+    A network would take what belongs to a log for the sensor's.
+    """
     of_logs = zip(recordings, *(of_sensor.cpu().numpy() for of_sensor in own), strict=True)
     return [without_nuisances(*of_log) for of_log in of_logs]
 

@@ -213,7 +213,7 @@ def _drift_first(
 
 
 def helps(before: LogErrors, after: LogErrors) -> bool:
-    """Whether a descent lowers one sensor's errors by more than the logs scatter, and does not raise the other's."""
+    """Whether a descent lowers a sensor's errors beyond the scatter of logs, and harms none."""
     harm = max(float(np.mean(after[sensor] - before[sensor])) for sensor in before)
     return harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
 
