@@ -17,6 +17,7 @@ sensors, and from made-up sensors as those of `tests/bench/units.py`.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -113,7 +114,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
     if doubts:
         return Fitness("doubtful", tuple(doubts))
-    agreement = _shown_share(share) if confirmed else _agreement(found, prior)
+    agreement = _shown_share(share) if confirmed else _agreement(found, prior, share)
     followed = [] if model.log_drift is None else [f"its bias follows {model.log_drift.name}"]
     if model.load_before is not None:
         followed.append("the sensor was in use before the log, so its drift does not start cold")
@@ -289,7 +290,11 @@ def _same_unit(model: BiasModel, about: Mapping[str, str]) -> bool:
     return model.card.get("name") in shipped_for(about) or about.get("sequence") in names
 
 
-def _agreement(found: _Evidence, prior: BiasPrior) -> str:
-    """Sentence on a log that agrees with a model."""
+def _agreement(found: _Evidence, prior: BiasPrior, share: Share) -> str:
+    """Sentence on a log that agrees with a model, and on what it does not show."""
     deviations = _deviations(found, prior).max()
-    return f"the bias that the log shows lies within {deviations:.1f} standard deviations of the training runs"
+    agrees = f"the bias that the log shows lies within {deviations:.1f} standard deviations of the training runs"
+    if math.isinf(share.std):  # nothing is corrected in motion
+        return agrees
+    unclear = share.std > HALF
+    return f"{agrees}; {'it does not show the share of the correction in motion' if unclear else _shown_share(share)}"

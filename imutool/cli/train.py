@@ -158,6 +158,6 @@ def _named_by(physics: Path, method: str) -> tuple[list[str], tuple[str, ...]]:
     """
     if method != "hybrid":
         raise ConfigError(f"{method} has no effects", where="--physics", fix="Leave it out, or train --method hybrid")
-    from imutool.training.run import settings_from_physics
+    from imutool.training.settings import settings_from_physics
 
     return settings_from_physics(physics)

@@ -59,7 +59,7 @@ class Calibration:
     effects: tuple[str, ...]
     theta: Float[Tensor, " p"]
     covariance: Float[Tensor, "p p"]
-    rest: Float[Tensor, "logs 3"]
+    own: Float[Tensor, "logs o"]
     gains: Mapping[str, float]
     unseen: tuple[str, ...]
     forms: tuple[LinearForm, ...]  # candidates
@@ -110,12 +110,12 @@ def calibrate(
         effects = tuple(effect for effect in effects if effect.name in gains)
         problem = linearise(seen, effects, part, every.own_prior)
     theta, covariance = problem.solve(range(len(problem.theta)))
-    rest = problem.own_at(theta)[:, :3]
+    own = problem.own_at(theta)
     return Calibration(
         tuple(effect.name for effect in effects),
         theta,
         covariance,
-        rest.reshape(len(pool.names), -1, 3).mean(1),
+        own.reshape(len(pool.names), -1, own.shape[1]).mean(1),
         gains,
         _unseen(effects, problem, covariance),
         forms,
@@ -238,7 +238,7 @@ class PhysicsFirst:
             model.take(sensor, fits[sensor].effects, fits[sensor].theta, fits[sensor].covariance)
             if sensor == "gyro":
                 error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)
-                gyro = pool.gyro - error - fits[sensor].rest[pool.log]
+                gyro = pool.gyro - error - fits[sensor].own[pool.log, :3]
         if scale is not None and _warm(model.config):
             model.take_temperature(scale.channel, temperature_tensors(scale, recordings, model.temperature_theta()))
         return cls(model, fits, _corrected(model, recordings, scale, loads), scale, loads)

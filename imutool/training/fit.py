@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from imutool import registry
-from imutool.array_types import Int
+from imutool.array_types import Float, Int
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.threads import of_each
@@ -142,15 +142,20 @@ class Training:
         if statistics:
             self.store_statistics()
 
-    def store_statistics(self) -> None:
-        """Store priors, spreads and noise in the model, which is final then."""
+    def store_statistics(self, pool: Pool | None = None) -> None:
+        """Store priors, spreads and noise of a pool with the same logs in the model, which is final then."""
         lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        self.turn_on = bias_spread.store_statistics(self.model, self.pool, self.tracks.per_log().detach(), lengths)
+        self.turn_on = bias_spread.store_statistics(self.model, pool or self.pool, self.tracks.per_log().detach(), lengths)
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:
-        """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s).
+        """Error over the longest windows that fit the held-out parts: the mean without the worst tenth (rad or m/s)."""
+        errors, _ = self.held_out_errors(sensor, model)
+        return float(errors.sort().values[: max(1, int(TRIM * len(errors)))].mean())
+
+    def held_out_errors(self, sensor: Sensor, model: BiasNetwork) -> tuple[Float[Tensor, " m"], Int[Tensor, " m"]]:
+        """Errors over the longest windows that fit the held-out parts (rad or m/s), and the log of each.
 
         Each log's constant is solved for on that part first: it belongs to the run, and what is judged here is the sensor.
         """
@@ -163,9 +168,8 @@ class Training:
         rest[:, columns] = solved.rest
         with torch.no_grad():
             parts = torch.split(first, max(1, BATCH_SAMPLES // n))
-            errors = torch.cat(of_each(lambda some: error(scored, sensor, pool.windows(some, n, rest[pool.log[some]])), parts))
-        kept = errors.sort().values[: max(1, int(TRIM * len(errors)))]
-        return float(kept.mean())
+            errors = of_each(lambda some: error(scored, sensor, pool.windows(some, n, rest[pool.log[some]])), parts)
+        return torch.cat(errors), pool.log[first]
 
     def _held_out_windows(self, sensor: Sensor) -> tuple[Int[Tensor, " m"], int]:
         pool, window_s, of_log = self.pool, LONGEST_HELD_OUT_S[sensor], [torch.empty(0)] * len(self.pool.names)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
 from imutool.bias import static
@@ -34,9 +33,10 @@ from imutool.errors import DataError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
-from imutool.recording import Imu, Poses, Recording, nanoseconds
+from imutool.recording import Imu, Recording, nanoseconds
 from imutool.training.bias_spread import speed_of, turn_on_prior
 from imutool.training.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.log_signals import without_nuisances
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
@@ -252,12 +252,7 @@ def _names(fit: Calibration, candidate: str, sensor: Sensor, index: int) -> tupl
 def _without_nuisances(log: Recording, fit: Calibration, names: Sequence[str], index: int) -> Recording:
     """Recording whose poses are turned and shifted onto the sensor, as far as a log left out shows that to some effects."""
     columns = parameter_columns(fit.forms, names)
-    own = fit.problem.own_at(fit.problem.solve(columns, without=index).theta)[index].cpu().numpy()
-    turn, late_s = Rotation.from_rotvec(-own[3:6]), float(own[6])
-    truth = log.truth
-    q_wb_wxyz = (Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * turn).as_quat(scalar_first=True)
-    poses = Poses(truth.t_ns - nanoseconds(late_s), truth.p_wb, np.ascontiguousarray(q_wb_wxyz), truth.v_w)
-    return replace(log, truths={next(iter(log.truths)): poses})
+    return without_nuisances(log, fit.problem.own_at(fit.problem.solve(columns, without=index).theta)[index].cpu().numpy())
 
 
 def _known(fit: Calibration, candidate: str, sensor: Sensor) -> bool:

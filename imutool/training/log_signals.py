@@ -11,10 +11,12 @@ a small matrix for each log and time puts K z_0 in the place of its amplitude.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from imutool.array_types import Float, Float64, Int
@@ -22,13 +24,14 @@ from imutool.bias import temperature
 from imutool.bias.networks.temperature import online_signals
 from imutool.bias_start.earlier_load import EARLIER_S, PRIOR, loads_after
 from imutool.bias_start.fitness import head
-from imutool.recording import Recording, seconds
+from imutool.inertial.strapdown import truth_velocity
+from imutool.recording import Poses, Recording, nanoseconds, seconds
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
-from imutool.training.closed_form import Integrated, integrated, minus_log_likelihood
+from imutool.training.closed_form import CLOCK, LEVER, ROTATION, Integrated, integrated, minus_log_likelihood
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
@@ -37,6 +40,33 @@ from imutool.units import AXES
 COLD = 0  # index of the time zero
 SWEEPS = 5
 CLEAR = 10.0  # of twice the log-likelihood, by which different times beat one for all (as BIC: Kass and Raftery 1995)
+
+
+def without_nuisances(
+    log: Recording, gyro: Float64[np.ndarray, " o"], accel: Float64[np.ndarray, " u"] | None = None
+) -> Recording:
+    """Recording whose poses are those of the sensor, by each sensor's own unknowns of this log.
+
+    The gyro's turn and shift them, the accelerometer's lever arm moves them.
+    """
+    late_s, truth = gyro[CLOCK["gyro"]].item(), log.truth
+    R_wb = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(-gyro[ROTATION["gyro"]])
+    q_wb_wxyz = np.ascontiguousarray(R_wb.as_quat(scalar_first=True))
+    poses = Poses(truth.t_ns - nanoseconds(late_s), truth.p_wb, q_wb_wxyz, truth.v_w)
+    if accel is not None:
+        arm = replace(poses, p_wb=R_wb.apply(accel[LEVER["accel"]]), v_w=None)
+        v_w = None if poses.v_w is None else poses.v_w - truth_velocity(arm)
+        poses = replace(poses, p_wb=poses.p_wb - arm.p_wb, v_w=v_w)
+    return replace(log, truths={next(iter(log.truths)): poses})
+
+
+def with_poses_of_sensor(recordings: Sequence[Recording], own: Iterable[Float[Tensor, "logs _"]]) -> list[Recording]:
+    """Recordings without the nuisances of their poses, by each sensor's fit.
+
+    A network would take what belongs to a log for the sensor's.
+    """
+    of_logs = zip(recordings, *(of_sensor.cpu().numpy() for of_sensor in own), strict=True)
+    return [without_nuisances(*of_log) for of_log in of_logs]
 
 
 def _decayed(samples: SensorSamples, theta: Theta) -> SensorSamples:

@@ -17,6 +17,7 @@ from imutool.bias.networks.network import BiasNetwork
 from imutool.training.fit import Stage, Training
 from imutool.training.objectives.objective import AdamW
 from imutool.training.objectives.paper_loss import PaperLoss, biases_from_poses
+from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
 
@@ -30,10 +31,10 @@ class PaperTraining(Training):
         super().__init__(*args, **options)
         self.model.get_submodule("drift").float()
 
-    def store_statistics(self) -> None:
+    def store_statistics(self, pool: Pool | None = None) -> None:
         """Store priors, spreads and noise of what the logs add to the model's bias."""
         self.model.prior_mean.copy_(self.tracks.per_log().detach().mean(0))
-        super().store_statistics()
+        super().store_statistics(pool)
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:
         """Root of the mean square over segments of the held-out part, as in the paper."""

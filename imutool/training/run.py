@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,9 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import torch
+from torch import Tensor
 
 from imutool import __version__, registry
+from imutool.array_types import Float64
 from imutool.bias import hybrid, linear, model_file, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode as neural_ode_network
@@ -25,12 +27,12 @@ from imutool.errors import ConfigError
 from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
-from imutool.sensor import catalogue, physics_file
 from imutool.training import checkpoint
 from imutool.training.bias_spread import speed_of
 from imutool.training.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import compare, simpler_effects
+from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare, simpler_effects
+from imutool.training.log_signals import with_poses_of_sensor
 from imutool.training.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
@@ -39,7 +41,7 @@ from imutool.units import SENSORS, Sensor
 UNITS = {"gyro": "rad", "accel": "m/s"}
 logger = logging.getLogger(__name__)
 
-LEAST_ODE_GAIN = 0.03  # of the held-out error, for an ODE to be worth its weights
+LogErrors = Mapping[Sensor, Float64[np.ndarray, " logs"]]
 
 
 def checkpoint_path(out: Path) -> Path:
@@ -154,12 +156,13 @@ def _physics_first(
     alone = msgspec.structs.replace(settings, model={})
     without = descent(physics.recordings, static.Model.method, alone)
     compared: dict[str, Any] = {}
+    constant: set[Sensor] = set()
     if settings.compare:
         descent.say(note("scoring left-out logs"))
-        comparison = compare(
-            recordings, Pool.of(recordings, floors=settings.pose_floors), physics.fits, without.model, physics.scale
-        )
+        pool = Pool.of(recordings, floors=settings.pose_floors)
+        comparison = compare(recordings, pool, physics.fits, without.model, physics.scale)
         compared["left_out"] = comparison.card()
+        constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
         if simpler := simpler_effects(physics.fits, comparison.kept):
             named = msgspec.structs.replace(settings, model=settings.model | simpler)
             physics = PhysicsFirst.of(recordings, named, descent.device, descent.say)
@@ -167,11 +170,14 @@ def _physics_first(
     held_out: dict[str, Any] = {"effects": _held_out(without)}
     kept = without
     if physics.model.config.remainder:
-        ode = descent(physics.recordings, neural_ode.Model.method, physics.ode_settings(settings))
-        held_out["effects and neural_ode"] = _held_out(ode)
-        kept = ode if helps(without.done, ode.done) else without
+        shared = with_poses_of_sensor(physics.recordings, [fit.own for fit in physics.fits.values()])
+        before = descent(shared, static.Model.method, alone, statistics=False)
+        of_ode = physics.ode_settings(settings)
+        ode = descent(shared, neural_ode.Model.method, of_ode, constant, statistics=False)
+        held_out = {"effects": _held_out(before), "effects and neural_ode": _held_out(ode)}
+        kept = ode if helps(*(_log_errors(training) for training in (before, ode))) else before
     if kept.turn_on is None:
-        kept.store_statistics()
+        kept.store_statistics(without.pool)
     model = physics.finish(kept.model)
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
@@ -206,27 +212,20 @@ def _drift_first(
     return training.model, {"held_out": _held_out(training), **_turn_on(training)}
 
 
-def settings_from_physics(physics: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Settings for `hybrid` with the effects of a physics.toml, and names that it cannot have.
-
-    Their parameters are fitted anew to the logs. Effects that it cannot have, or without a name, are left to the neural ODE.
-
-    Raises:
-        ConfigError: the file cannot be read, or names no effect that `hybrid` can have.
-    """
-    names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
-    by_sensor = {sensor: [form.name for form in catalogue.trained(sensor) if form.name in names] for sensor in SENSORS}
-    taken = {name for some in by_sensor.values() for name in some}
-    if not taken:
-        raise ConfigError("no effect that a bias model can correct", where=physics, expected="for instance gyro_scale")
-    words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
-    return words, tuple(name for name in names if name not in taken)
+def helps(before: LogErrors, after: LogErrors) -> bool:
+    """Whether a descent lowers a sensor's errors beyond the scatter of logs, and harms none."""
+    harm = max(float(np.mean(after[sensor] - before[sensor])) for sensor in before)
+    return harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
 
 
-def helps(before: Mapping[Sensor, float], after: Mapping[Sensor, float]) -> bool:
-    """Whether a descent lowers one held-out error enough and does not raise the other."""
-    gains = [1 - after[sensor] / before[sensor] for sensor in before]
-    return max(gains) >= LEAST_ODE_GAIN and min(gains) > -LEAST_ODE_GAIN
+def _log_errors(training: Training) -> LogErrors:
+    """Logarithms of each log's mean held-out error."""
+
+    def of_logs(errors: Tensor, log: Tensor) -> Float64[np.ndarray, " logs"]:
+        means = [float(errors[log == index].mean()) for index in range(len(training.pool.names))]
+        return np.log(np.maximum(means, LEAST_ERROR))
+
+    return {sensor: of_logs(*training.held_out_errors(sensor, training.model)) for sensor in training.done}
 
 
 def _described(fits: Mapping[Sensor, Calibration]) -> dict[str, Any]:
@@ -285,10 +284,8 @@ def _card(method: str, settings: TrainSettings, parts: Sequence[tuple[Path, Reco
         "torch": torch.__version__,
         "method": method,
         "training": plain(settings),
-        "logs": [{"name": r.name, "file": p.name, "sha256": sha256(p), "poses": _kind(r)} for p, r in parts],
+        "logs": [
+            {"name": r.name, "file": p.name, "sha256": sha256(p), "poses": r.kind_of(next(iter(r.truths), ""))}
+            for p, r in parts
+        ],
     }
-
-
-def _kind(recording: Recording) -> str:
-    """What the poses that a model was trained on are worth."""
-    return recording.kind_of(next(iter(recording.truths), ""))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import json
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -14,7 +16,9 @@ from imutool import registry
 from imutool.array_types import Float64
 from imutool.config import Settings
 from imutool.errors import ConfigError
+from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
+from imutool.units import SENSORS
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -176,3 +180,20 @@ def placed(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     general = {key: value for key, value in settings.items() if full_name(method, key) == key}
     own = {key: value for key, value in settings.items() if key not in general}
     return {**general, "model": {**general.get("model", {}), **own}} if own else general
+
+
+def settings_from_physics(physics: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Settings for `hybrid` with the effects of a physics.toml, and names that it cannot have.
+
+    Their parameters are fitted anew to the logs. Effects that it cannot have, or without a name, are left to the neural ODE.
+
+    Raises:
+        ConfigError: the file cannot be read, or names no effect that `hybrid` can have.
+    """
+    names = tuple(dict.fromkeys(entry.name for entry in physics_file.read(physics).effect))
+    by_sensor = {sensor: [form.name for form in catalogue.trained(sensor) if form.name in names] for sensor in SENSORS}
+    taken = {name for some in by_sensor.values() for name in some}
+    if not taken:
+        raise ConfigError("no effect that a bias model can correct", where=physics, expected="for instance gyro_scale")
+    words = [f"model.{sensor}_effects={json.dumps(some)}" for sensor, some in by_sensor.items()]
+    return words, tuple(name for name in names if name not in taken)

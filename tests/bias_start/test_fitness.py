@@ -116,6 +116,16 @@ def test_the_correction_of_another_unit_is_caught_though_its_bias_agrees(
         assert "another unit's" in " ".join(found.reasons)
 
 
+def test_a_small_correction_of_another_unit_fits_but_the_reason_says_what_the_log_does_not_show(
+    model: BiasModel, recording: Recording
+) -> None:
+    """A thousandth of scale and axes is too little for a minute of flight."""
+    found = judged(corrects(model, 0.02 * WRONG), recording.imu)
+    assert found.verdict == "fits"
+    assert "correction in motion" in found.reasons[0]
+    assert "correction in motion" not in judged(model, recording.imu).reasons[0], "this model has none"
+
+
 def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(model: BiasModel, scaled: Imu) -> None:
     shifted = replace(scaled, gyro=scaled.gyro + np.array([0.0, 0.015, 0.0]))
     found = judged(corrects(model, WRONG), shifted)

@@ -153,7 +153,7 @@ def test_a_curve_that_no_name_describes_is_found_as_a_curve(flights: list[Record
 
 def test_a_rest_bias_of_its_own_is_found_for_every_log(without_effects: Callable[[int, Sensor], Calibration]) -> None:
     calibration = without_effects(1, "gyro")
-    for seed, rest in enumerate(calibration.rest.numpy()):
+    for seed, rest in enumerate(calibration.own[:, :3].numpy()):
         planted = REST["gyro"] * np.random.default_rng(seed).normal(size=3)
         np.testing.assert_allclose(
             rest, planted, rtol=0, atol=5 * NOISE["gyro"] / np.sqrt(0.8 * RATE_HZ * FLIGHT["duration_s"])
@@ -164,7 +164,7 @@ def test_two_logs_are_cut_into_parts_that_predict_one_another(flights: list[Reco
     calibration = found(flights[:2], "gyro", catalogue.trained("gyro", ["gyro_scale"]))
     assert next(iter(calibration.gains)) == "gyro_scale"
     assert set(calibration.effects) == set(LINEAR["gyro"])
-    assert calibration.rest.shape == (2, 3)
+    assert calibration.own[:, :3].shape == (2, 3)
     pool = Pool.of(flights[:2])
     parts = folded(pool)
     assert len(parts.names) == 2 * FOLDS

@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
 from imutool.config import load
@@ -124,3 +125,31 @@ def test_logs_that_need_no_matrix_contradict_nothing() -> None:
 def test_parts_of_a_log_contradict_nothing() -> None:
     """They are one unit, and two logs do not tell which of them is the stranger."""
     assert not contradictions([log(seed, 0, msgspec.structs.replace(KIND, sensor_seed=seed)) for seed in range(2)])
+
+
+def test_a_network_does_not_learn_what_belongs_to_the_poses_of_each_log(tmp_path: Path) -> None:
+    """A sensor without any error but its bias: mount, clock and lever arm of the poses are no reason for a neural ODE."""
+    none = {"scale": 0.0, "misalignment_rad": 0.0, "walk_rad_s2_rthz": 0.0, "noise_rad_s_rthz": 1e-5, "truth_noise": 1e-4}
+    kind = Switchings(sensor_seed=0, rest_s=5.0, duration_s=30.0, mount_rad=np.radians(0.3), **none)
+    paths = [tmp_path / f"{seed}.mcap" for seed in range(4)]
+    for seed, path in enumerate(paths):
+        write(with_lever_arm(log(seed, seed, kind), np.array([0.03, -0.02, 0.05])), path)
+    quick = [
+        "steps=30",
+        "samples=2000",
+        "model.ode.curve_width=8",
+        "model.gyro_effects=[]",
+        "model.accel_effects=[]",
+        "compare=false",
+    ]
+    model = train(paths[:3], tmp_path / "m.safetensors", settings=load(settings_of("hybrid"), None, quick))
+    assert not model.config.remainder, model.card["compared"]
+    _, static, trained = (r["aoe_deg"] for r in evaluate(paths[3], models=["static", str(tmp_path / "m.safetensors")]))
+    assert trained < 1.1 * static
+
+
+def with_lever_arm(recording: Recording, arm_m: np.ndarray) -> Recording:
+    """Recording whose poses are those of a point of the body."""
+    truth = recording.truth
+    p_wb = truth.p_wb + Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True).apply(arm_m)
+    return replace(recording, truths={name: replace(truth, p_wb=p_wb, v_w=None) for name in recording.truths})

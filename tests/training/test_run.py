@@ -26,8 +26,8 @@ from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.effect_selection import config_of
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.objectives.objective import AdamW, WindowEndObjective
-from imutool.training.run import checkpoint_path, helps, settings_from_physics, train
-from imutool.training.settings import settings_of
+from imutool.training.run import checkpoint_path, helps, train
+from imutool.training.settings import settings_from_physics, settings_of
 from imutool.units import Sensor
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -381,12 +381,14 @@ def test_a_slip_of_the_pen_is_told_before_any_log_is_read(tmp_path: Path, model:
         train([tmp_path / "none.mcap"], tmp_path / "m.safetensors", settings=TrainSettings(model=model))
 
 
-def test_helps_asks_for_a_gain_on_one_sensor_and_no_harm_to_the_other() -> None:
-    before: dict[Sensor, float] = {"gyro": 1.0, "accel": 2.0}
-    assert helps(before, {"gyro": 0.9, "accel": 2.0})
-    assert helps(before, {"gyro": 1.0, "accel": 1.8})
-    assert not helps(before, {"gyro": 0.99, "accel": 1.99}), "too little"
-    assert not helps(before, {"gyro": 0.5, "accel": 2.2}), "harm"
+def test_helps_asks_for_a_gain_beyond_the_scatter_of_logs_and_no_harm_to_the_other_sensor() -> None:
+    before: dict[Sensor, np.ndarray] = {"gyro": np.zeros(4), "accel": np.ones(4)}
+    alike, few = np.array([-0.2, -0.25, -0.22, -0.18]), np.array([-0.9, 0.0, 0.05, 0.02])
+    assert helps(before, {"gyro": before["gyro"] + alike, "accel": before["accel"]})
+    assert helps(before, {"gyro": before["gyro"], "accel": before["accel"] + alike})
+    assert not helps(before, {"gyro": before["gyro"] + few, "accel": before["accel"]}), "one log of four"
+    assert not helps(before, {"gyro": before["gyro"] + 0.1 * alike, "accel": before["accel"]}), "too little"
+    assert not helps(before, {"gyro": before["gyro"] + alike, "accel": before["accel"] + 0.1}), "harm"
     assert not helps(before, before)
 
 
