@@ -186,9 +186,9 @@ def _before_and_after(d: Diagnosis) -> Iterator[str]:
     for k, trace in enumerate(d.traces[:MAX_LOGS]):
         drawn = figures.residual(trace, found=found)
         yield _figure(drawn, f"r{k}", f"{text(trace.log)}: over time{_band(trace)}. {legend}{HELD}")
-    for k, (signal, traces) in enumerate(d.signals.items()):
-        of_it = any(f"{signal}.".startswith(f"{finding.signal}.") for finding in d.findings)  # or of a whole topic
-        drawn = figures.scalar_signal(traces, found=of_it)
+    found_in = {s: any(f"{s}.".startswith(f"{f.signal}.") for f in d.findings) for s in d.signals}  # or in a whole topic
+    for k, signal in enumerate(sorted(d.signals, key=lambda signal: not found_in[signal])):
+        drawn = figures.scalar_signal(d.signals[signal], found=found_in[signal])
         yield _figure(drawn, f"g{k}", f"{text(signal)}: over time. {legend}{HELD}")
     if len(d.traces) > MAX_LOGS:
         yield f'<p class="note">The first {MAX_LOGS} of {len(d.traces)} logs are drawn; all are in the .rrd.</p>'

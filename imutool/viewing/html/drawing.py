@@ -44,7 +44,7 @@ STYLE = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "figure.constrained_layout.use": True,
-    "figure.constrained_layout.w_pad": 0.12,  # inches: labels are measured once, and grow by a digit
+    "figure.constrained_layout.w_pad": 0.2,  # inches: labels are measured once, and grow by a digit and a sign
     "grid.color": GRID,
     "text.color": INK,
     "axes.labelcolor": INK,
