@@ -254,14 +254,14 @@ def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> 
 
 
 @pytest.mark.parametrize(("of", "drawn"), [("/odom", True), ("/odom.x", True), ("/odom.y", False), ("/od", False)])
-def test_what_a_finding_of_a_whole_topic_removes_is_drawn(of: str, drawn: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_finding_of_a_whole_topic_removes_is_drawn_and_first(of: str, drawn: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
     monkeypatch.setattr(figures, "scalar_signal", lambda _, found: asked.append(found) or "<svg></svg>")
     t_s = np.arange(500) / 50.0
     beside = SignalTraces(t_s, t_s, t_s, t_s, t_s > 5.0, "m/s")
     finding = replace(diagnoses.BOTH.findings[0], signal=of)
-    html(replace(diagnoses.BOTH, traces=(), findings=(finding,), signals={"/odom.x": beside}))
-    assert asked == [drawn]
+    html(replace(diagnoses.BOTH, traces=(), findings=(finding,), signals={"/mag.x": beside, "/odom.x": beside}))
+    assert asked == [drawn, False]
 
 
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
