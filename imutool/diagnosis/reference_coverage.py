@@ -81,10 +81,7 @@ def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -
 
 
 def clock_difference(pairs: Sequence[Pair], found: Fit) -> ClockDifference | None:
-    """Difference of the two clocks by the motion.
-
-    None where the logs share an epoch, the clocks drift apart, or too little motion shows it.
-    """
+    """Difference of two clocks without a common epoch, if the motion shows one that stays."""
     offsets = [float(theta[0]) for effect, theta in found.chosen if effect.name == "clock_offset"]
     if not offsets or not pairs[0].aligned_s or any(effect.name in DRIFTING for effect, _ in found.chosen):
         return None

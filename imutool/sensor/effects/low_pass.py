@@ -49,7 +49,7 @@ def lag_s(theta: Theta) -> float:
 
 
 def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, theta: Theta) -> Float64[np.ndarray, "n k"]:
-    """Columns with the gain of a low-pass, of first or second order by its numbers, and without its lag."""
+    """Columns with the gain of a low-pass, of first or second order, and without its lag."""
     gain = _Gain.of(len(x), float(theta[0]) / rate_hz, *theta[1:].tolist())
     return np.stack([gain.on(column) for column in x.T], axis=1)
 
