@@ -254,7 +254,7 @@ def test_another_signal_is_drawn_as_recorded_and_expected_and_what_is_left() -> 
 
 
 @pytest.mark.parametrize(("of", "drawn"), [("/odom", True), ("/odom.x", True), ("/odom.y", False), ("/od", False)])
-def test_what_a_finding_of_a_whole_topic_removes_is_drawn_and_first(of: str, drawn: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_finding_of_a_topic_removes_is_drawn_and_first(of: str, drawn: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
     monkeypatch.setattr(figures, "scalar_signal", lambda _, found: asked.append(found) or "<svg></svg>")
     t_s = np.arange(500) / 50.0
