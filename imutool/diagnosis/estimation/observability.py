@@ -243,6 +243,11 @@ def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, d
     )
 
 
+def first_order(effects: Sequence[Effect]) -> list[Effect]:
+    """Effects but for second orders, beside which too little noise would be left."""
+    return [effect for effect in effects if effect.name != LOW_PASSES[1]]
+
+
 def exclude_each_other(a: Effect, b: Effect) -> bool:
     """Whether two effects never act together.
 
