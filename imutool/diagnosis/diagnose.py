@@ -26,7 +26,7 @@ from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.estimation.observability import first_order, unobservable, with_free
+from imutool.diagnosis.estimation.observability import unobservable, with_free, without_second_orders
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
@@ -135,7 +135,7 @@ def _beside_reference(
         return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
-    logs = [whitened(pair, (*first_order(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]
+    logs = [whitened(pair, (*without_second_orders(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]
     pairs = [log.pair for log in logs]
     report(2, 4, "searching")
     wrong, wrong_at = reference_errors(logs, settings.reference)
@@ -287,7 +287,7 @@ def effect_sizes(
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)
     candidates = [effect for effect in candidates_for(pairs) if effect.name not in of_poses]
-    logs = [whitened(pair, candidates, settings.band) for pair in pairs]
+    logs = [whitened(pair, without_second_orders(candidates), settings.band) for pair in pairs]
     named = catalogue.diagnosed([name for name in effects if name != SMOOTHED.name])
     wanted = [*_until_the_end(named, pairs), *((SMOOTHED,) if SMOOTHED.name in effects else ())]
     hidden = set(unobservable(logs, wanted, settings.search))

@@ -35,10 +35,8 @@ PLAINER = {  # of one that is no better: another effect, and its parameters, by 
 SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth
 CLOCKS = (*STEADY, WANDER)
 FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
-REPLACES = {  # together they would cancel
-    **{WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": LOW_PASSES},
-    LOW_PASSES[1]: LOW_PASSES[:1],
-}
+REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": LOW_PASSES, LOW_PASSES[1]: LOW_PASSES[:1]}
+"""What would cancel together."""
 FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 Starts = Mapping[str, Sequence[Theta]]
 
@@ -243,7 +241,7 @@ def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, d
     )
 
 
-def first_order(effects: Sequence[Effect]) -> list[Effect]:
+def without_second_orders(effects: Sequence[Effect]) -> list[Effect]:
     """Effects but for second orders, beside which too little noise would be left."""
     return [effect for effect in effects if effect.name != LOW_PASSES[1]]
 

@@ -22,7 +22,7 @@ from imutool.mcap_io.fields import others, read_field
 
 BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal
 
-ONE_CLOCK = "The other signals have the clock that the IMU's motion shows; a delay of theirs is against the IMU"
+ONE_CLOCK = "The motion of the IMU puts both logs on one clock, so a delay of another signal is relative to the IMU"
 
 
 def with_signals(

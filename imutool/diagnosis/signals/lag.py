@@ -65,7 +65,7 @@ def on_recorded_clock(pair: SignalPair, clock: ClockDifference | None) -> Signal
     """Pair with both logs on one clock, where the difference is known."""
     if clock is None:
         return pair
-    ahead_ns = round(1e9 * clock.ahead_s)
+    ahead_ns = nanoseconds(clock.ahead_s)
     state = {name: replace(values, t_ns=values.t_ns - ahead_ns) for name, values in pair.sim_state.items()}
     return replace(pair, sim_ns=pair.sim_ns - ahead_ns, sim_state=state, clock_std_s=clock.std_s)
 
@@ -109,7 +109,7 @@ def is_copy(pair: SignalPair, settings: DiagnoseSettings) -> bool:
     except DataError:  # too short or too unlike for a lag: copies have none on one clock
         shift_s = None
     if shift_s is not None:
-        sides[1] = seconds(pair.sim_ns, int(pair.real_ns[0]) + nanoseconds(shift_s)), pair.sim
+        sides = _sides(on_recorded_clock(pair, ClockDifference(shift_s, 0.0)))
     shifts = 1 if shift_s is None and not pair.clock_std_s else SHIFTS
     coarse, dense = sorted(sides, key=lambda side: -float(np.median(np.diff(side[0]))))
     return any(_is_within(*one, *other, shifts) for one, other in ((coarse, dense), (dense, coarse)))
