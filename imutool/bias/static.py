@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.bias.model import BiasModel, Stream, Vector6
+from imutool.bias.model import BiasModel, CovarianceModel, Stream, Vector6
 from imutool.config import Settings
+from imutool.units import Sensor
 
 # Without training runs a measurement outweighs the prior: spreads of a consumer sensor (Bosch BMI160 data sheet: zero-rate
 # offset 3 deg/s, zero-g offset 40 mg).
@@ -18,6 +19,10 @@ UNTRAINED: Mapping[str, np.ndarray] = {
     "prior_std": np.array([0.05] * 3 + [0.4] * 3, np.float32),  # single precision, as in a file
     "truth_std": np.array([2e-3] * 3 + [0.1] * 3, np.float32),
 }
+
+# Unknown scale of an axis and misalignment of two, relative: a third of the limit of a consumer sensor (InvenSense MPU-6050,
+# PS-MPU-6000A revision 3.4: ±3 % at 25 °C).
+CALIBRATION_STD = 0.01
 
 
 class Config(Settings, frozen=True):
@@ -46,3 +51,21 @@ class Model(BiasModel):
             return np.broadcast_to(rest, (len(t_s), 6)).copy()
 
         return constant
+
+    def calibration_covariance(self) -> CovarianceModel | None:
+        """Covariance of an unknown scale and misalignment, which the model leaves in the samples of a motion.
+
+        The accelerometer's bias at rest contains that of the gravity there: only the change from the first sample counts.
+        """
+        spread = CALIBRATION_STD * np.eye(3)
+        first: list[Float64[np.ndarray, "3"]] = []
+
+        def root_at(
+            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+        ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
+            if not first:
+                first.append(accel[0].copy())
+            samples: dict[Sensor, Float64[np.ndarray, "n 3"]] = {"gyro": gyro, "accel": accel - first[0]}
+            return {sensor: np.einsum("ip,nj->nipj", spread, u).reshape(len(u), 3, 9) for sensor, u in samples.items()}
+
+        return root_at

@@ -1,6 +1,6 @@
 """Whether debiasing knows how sure it is: errors of bias, attitude and velocity, and what their covariances say.
 
-    python tests/bench/consistency.py --model M.safetensors LOG... [--start truth] [--start auto] [--start smooth] [--each-log]
+    python tests/bench/consistency.py --model M.safetensors|static LOG... [--start truth|auto|smooth] [--each-log]
     python tests/bench/consistency.py --left-out TRAINING_LOG...
     python tests/bench/consistency.py --made-up SENSORS
 
@@ -46,11 +46,12 @@ from support.error_growth import Judged, Motion
 from support.nees import consistency
 from support.switchings_on import Switchings, log
 
+from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import InitialBias
-from imutool.bias_start.model_choice import find_initial_bias, smooth_in_memory
+from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.geometry import so3
 from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
@@ -119,7 +120,10 @@ def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
     logs = [read(path) for path in paths]
     logs = [r.with_truth(RECOMPUTED if RECOMPUTED in r.truths else next(iter(r.truths))) for r in logs]
     for one in logs:
-        yield Case(one, load(model) if model else learned_from([other for other in logs if other is not one]))
+        if model and str(model) == static.Model.method:
+            yield Case(one, static.Model())
+        else:
+            yield Case(one, load(model) if model else learned_from([other for other in logs if other is not one]))
 
 
 def made_up(sensors: int) -> Iterator[Case]:
@@ -165,7 +169,10 @@ def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
     """Errors and their covariances, by quantity."""
     model, recording = case.model, case.recording
     imu, smooth = recording.imu, start == "smooth"
-    begun = smooth_in_memory(model, imu, recording.name) if smooth else find_initial_bias(start, model, recording)
+    if start == "auto" and isinstance(model, static.Model):  # as the command does
+        model, begun = estimate_at_rest(imu, recording.name)
+    else:
+        begun = smooth_in_memory(model, imu, recording.name) if smooth else find_initial_bias(start, model, recording)
     from_s = TRUTH_S if start == "truth" else 0.0  # what it was found from proves nothing
     known = None if case.exact is None else np.zeros(6)
     one = Judged(model, begun, imu, case.exact or recording.truth, known)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.bias import hybrid
+from imutool.bias import hybrid, static
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.bias_tracking import BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
@@ -90,3 +90,16 @@ def test_the_bias_of_an_estimate_is_that_of_the_stream(turning: Samples, way: st
     model = model_of("gyro_scale")
     estimated = BiasEstimator(model, WAYS[way])(*turning)
     assert np.array_equal(estimated.bias, WAYS[way].stream(model)(*turning))
+
+
+def test_static_is_as_sure_in_motion_as_a_sensor_nobody_calibrated(turning: Samples) -> None:
+    estimator, model = BiasEstimator(static.Model(), WAYS["held"]), static.Model()
+    t_s, gyro, accel = turning
+    tilted = accel.copy()
+    tilted[SIZE // 2 :] = [9.81, 0.0, 0.0]
+    total = estimator(t_s, gyro, tilted).covariance
+    rest = BiasEstimator(model, WAYS["held"]).parts(t_s, gyro, tilted).rest
+    added = np.sqrt(np.diagonal(total - rest, axis1=1, axis2=2))
+    np.testing.assert_allclose(added[:, :3], static.CALIBRATION_STD * np.abs(gyro[:, :1]) * np.ones(3), atol=1e-9)
+    np.testing.assert_allclose(added[: SIZE // 2, 3:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(added[SIZE // 2 :, 3:], static.CALIBRATION_STD * 9.81 * np.sqrt(2.0), rtol=1e-6)
