@@ -14,7 +14,7 @@ from imutool.inertial.inertial_filter import FilterSettings, State
 
 MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
 MOST_DEVIATIONS = 5.0  # between a log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
-USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor without a trained model
+USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor whose training logs show no more
 BIASES = slice(inertial_filter.BIAS.start, inertial_filter.GROUND.stop)  # both biases in the filter's error
 BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
 LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior

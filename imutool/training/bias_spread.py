@@ -19,6 +19,7 @@ from imutool.bias.networks.threads import of_each
 from imutool.bias_start.bias_at_rest import rest_differences
 from imutool.bias_start.bias_from_truth import TRUTH_S, bias_from_truth
 from imutool.bias_start.initial_bias import AT_REST_STD, SESSION_GAP_S
+from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
@@ -182,7 +183,10 @@ def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float6
 def _walk(
     model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
 ) -> Float[Tensor, "6"]:
-    """How far rest biases walk in a second^1/2: the means over a log's two halves differ by walk sqrt(T / 3)."""
+    """How far rest biases walk in a second^1/2: the means over a log's two halves differ by walk sqrt(T / 3).
+
+    They also differ by their own errors, whose variances are subtracted: the walk is at least the usual one.
+    """
     begins = torch.searchsorted(pool.log, torch.arange(len(pool.names), device=pool.log.device))
     length = torch.bincount(pool.log)
     later = torch.arange(len(pool.t), device=pool.log.device) - begins[pool.log] >= length[pool.log] // 2
@@ -191,10 +195,13 @@ def _walk(
     both, out = rest.repeat_interleave(2, dim=0), []
     for sensor in pool.sensors:
         columns = COLUMNS[sensor]
-        both[:, columns] = closed_form.solve(model, sensor, halves, both, window_s[sensor], matrix=False, part="all").rest
-        change = both[1::2, columns] - both[::2, columns]
-        out.append((change.square() * (3.0 * pool.rate_hz / length)[:, None]).mean(0).sqrt())
-    return torch.cat([*out, *[rest.new_zeros(3)] * (len(SENSORS) - len(out))])
+        solution = closed_form.solve(model, sensor, halves, both, window_s[sensor], matrix=False, part="all")
+        both[:, columns] = solution.rest
+        change, variance = solution.rest[1::2] - solution.rest[::2], solution.std.square()
+        beyond = change.square() - variance[1::2] - variance[::2]
+        out.append((beyond * (3.0 * pool.rate_hz / length)[:, None]).mean(0).clamp_min(0.0).sqrt())
+    walk = torch.cat([*out, *[rest.new_zeros(3)] * (len(SENSORS) - len(out))])
+    return torch.maximum(walk, torch.from_numpy(USUAL_WALK).to(walk))
 
 
 @torch.no_grad()
