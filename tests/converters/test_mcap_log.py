@@ -75,7 +75,7 @@ def as_flatbuffer(n: int, t_ns: int) -> bytes:
 
 
 def write_log(path: Path, encoding: str, *, lacking: int | None = None, size: float = 1.0) -> Path:
-    """Log of an IMU with a topic beside it; the message `lacking` has no acceleration, those in JSON are `size` times as large."""
+    """Log of an IMU with a topic beside it; the message `lacking` has no acceleration, JSON's are `size` times as large."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
