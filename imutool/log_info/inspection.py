@@ -42,6 +42,7 @@ from imutool.units import SENSORS
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
+JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
 
 
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
@@ -84,7 +85,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
         samples = sound_samples(log, own[0].topic)
         truths = [_against_gyro(log, truth, samples) for truth in truths]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
-    warnings += [*_truth_warnings(own, truths), *refused]
+    warnings += [*_truth_warnings(own, truths, len(log.with_schema((schemas.VECTOR3,)))), *refused]
     stamps = [clock for clock in clocks.values() if len(clock)]
     first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
     return LogInfo(
@@ -284,9 +285,9 @@ def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
     return msgspec.structs.replace(truth, body_turned_deg=deg, body_turned_std_deg=std_deg)
 
 
-def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
+def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo], vectors: int) -> list[str]:
     if not own:
-        return ["no IMU topic"]
+        return [f"no IMU topic{JOIN_VECTORS if vectors > 1 else ''}"]
     usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
     if not usable:
         others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
