@@ -48,9 +48,17 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
     return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
 
 
+def constant_sensors(imu: Imu) -> list[str]:
+    """Warnings of a gyro or an accelerometer that never changes: a measurement has noise."""
+    why = "no sensor is behind it, or a simulation at rest without noise"
+    read = {"gyro": imu.gyro, "accel": imu.accel} if len(imu) > 1 else {}
+    constant = {name: values[0] + 0.0 for name, values in read.items() if not np.ptp(values, axis=0).any()}  # no -0.0
+    return [f"{name} reads {value.tolist()} in {len(imu)} samples in a row: {why}" for name, value in constant.items()]
+
+
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
     """Log the warnings about units, axes and frames of samples that are used uncorrected."""
-    warnings = convention_warnings(convention_summary(imu, truth)) if len(imu) else []
+    warnings = [*constant_sensors(imu), *convention_warnings(convention_summary(imu, truth))] if len(imu) else []
     found = agreement(truth, imu) if truth is not None and not warnings else None
     if truth is not None and found is not None:
         turned_deg = [] if found.turned is None else found.turned.deg.tolist()
@@ -158,3 +166,17 @@ def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: I
         starts_after_s=float(knots[0] - start) * 1e-9,
         ends_before_s=float(end - knots[-1]) * 1e-9,
     )
+
+
+def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:
+    """Warnings about the true poses of a log with an IMU."""
+    usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
+    if not usable:
+        others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
+        return [f"no true poses: {others}; imutool evaluate LOG --truth TOPIC takes one of them" if others else "no true poses"]
+    warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
+    for truth in usable:
+        warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
+        if isinstance(truth.gyro_explained, float) and isinstance(truth.gyro_rms_rad_s, float):
+            warnings += motion_warnings(truth.topic, truth.gyro_explained, truth.gyro_rms_rad_s)
+    return warnings

@@ -64,6 +64,21 @@ def logged(folder: Path, imu: Imu, **kwargs: object) -> dict[str, Any]:
     return described(path)
 
 
+def test_a_sensor_that_never_changes_is_warned_of(tmp_path: Path) -> None:
+    imu = resting()
+    for name, given in (
+        ("gyro", replace(imu, gyro=np.zeros_like(imu.gyro))),
+        ("accel", replace(imu, accel=0.0 * imu.accel + 5.0)),
+    ):
+        write(Recording("log", given), tmp_path / f"{name}.mcap")
+        warnings = [text for text in described(tmp_path / f"{name}.mcap")["warnings"] if "in a row" in text]
+        value = [0.0, 0.0, 0.0] if name == "gyro" else [5.0, 5.0, 5.0]
+        assert len(warnings) == 1
+        assert warnings[0].startswith(f"/imu0: {name} reads {value} in 4000 samples in a row: ")
+    write(Recording("log", replace(imu, gyro=imu.gyro * [0.0, 0.0, 1.0])), tmp_path / "one.mcap")  # one axis is left
+    assert not [text for text in described(tmp_path / "one.mcap")["warnings"] if "in a row" in text]
+
+
 def test_clocks_of_every_topic_are_measured(tmp_path):
     imu = resting(1000)
     truth = still_poses(imu.t_ns[::10])
