@@ -29,7 +29,9 @@ NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
 )
-TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
+NO_FORCE = (
+    "no order of the axes fits clearly: slow motion, noisy positions or positions in another unit, or forces without gravity"
+)
 NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns that hardly change"
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
@@ -104,8 +106,8 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     if found.accel is not None:
         yield "accel against poses", True, f"{found.accel.names}, {_ratio(found.accel)}"
     else:
-        yield "accel against poses", *_unknown(whole, TOO_SLOW)
-    yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, TOO_SLOW if turned else NO_TURN))
+        yield "accel against poses", *_unknown(whole, NO_FORCE)
+    yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, NO_FORCE if turned else NO_TURN))
     if found.delay is not None:
         side = "late" if found.delay.seconds > 0 else "early"
         late_s = abs(found.delay.seconds)

@@ -272,7 +272,7 @@ def _imu_warnings(
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.faults]
     warnings += jump_warnings(jumps)
-    if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S:
+    if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S and not stamps.faults:
         warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")
     return [*warnings, *constant_sensors(imu), *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 

@@ -93,7 +93,9 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]
     """Warning of poses that do not turn as the gyro does."""
     if explained > LEAST_EXPLAINED or rms_rad_s < UNLIKE_RAD_S:
         return []
-    causes = "clocks that differ, poses of another recording or body, or jumps and noise of the poses"
+    causes = (
+        "clocks that differ, poses of another recording or body, jumps or noise, or quaternions inverted or in another order"
+    )
     return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
 
 

@@ -102,6 +102,14 @@ def test_stamps_that_are_no_nanoseconds_are_told(tmp_path):
     assert any("2e+05 samples a second: the stamps are not in nanoseconds" in warning for warning in report["warnings"])
 
 
+def test_stamps_in_batches_are_not_called_another_unit(tmp_path):
+    number = np.arange(4000)
+    t_ns = START_NS + PERIOD_NS * (number // 10 * 10 + 9) + 1000 * (number % 10)  # as they arrive, ten at a time
+    warnings = logged(tmp_path, replace(resting(4000), t_ns=t_ns))["warnings"]
+    assert any("stamps come in batches of about 10.0 samples" in warning for warning in warnings)
+    assert not any("not in nanoseconds" in warning for warning in warnings)
+
+
 def test_jitter_and_gaps_are_those_of_the_periods(tmp_path):
     imu = resting(1001)
     shift = np.where(np.arange(1001) % 2, 500_000, 0)  # periods alternate between 5.5 and 4.5 ms
