@@ -264,3 +264,15 @@ def test_a_time_beyond_64_bits_with_a_sign_is_refused(convert, tmp_path):
     assert done.returncode == 4, done.stderr
     assert "expected a time from 1970 to 2262" in done.stderr
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_log_without_an_imu_is_converted_with_a_note(convert, tmp_path):
+    with (tmp_path / "in.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/notes", "text", 0), START_NS, b"hello", START_NS)
+        writer.finish()
+    done = convert(tmp_path / "in.mcap", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "note: out.mcap: no topic is an IMU" in done.stderr
+    assert "no topic is an IMU" not in convert(write_log(tmp_path / "imu.mcap", "json"), tmp_path / "with.mcap").stderr
