@@ -77,13 +77,13 @@ def pairs_by_name(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def choice_of(topics: Iterable[str]) -> str:
-    """What to do about several IMU topics: choose one, or join two that are one IMU."""
+    """Hint for several IMU topics: choose one, or join two that are one IMU."""
     joined = [f"gyro={gyro},accel={accel}" for gyro, accel in pairs_by_name(topics).values()]
     return f"Choose one with `imu`{''.join(f', or join two: {names}' for names in joined)}"
 
 
 def no_imu_fix(topics: Iterable[tuple[str, str]]) -> str:
-    """What to do about a log without an IMU, whose topics have these types and encodings; empty if nothing is known."""
+    """Hint for a log without an IMU, by the types and encodings of its topics; may be empty."""
     types, encodings = zip(*topics, strict=True) if (topics := list(topics)) else ((), ())
     if types.count(VECTOR3) > 1:
         return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"
