@@ -23,6 +23,8 @@ UNITS = {
     "us": r"us|µs|microseconds?|usec",
     "ms": r"ms|milliseconds?|msecs?",
     "s": r"s|sec|seconds?",
+    "min": r"min(ute)?s?",
+    "h": r"h|hrs?|hours?",
     "m": r"m|met(er|re)s?",
     "cm": r"cm|centimet(er|re)s?",
     "mm": r"mm|millimet(er|re)s?",

@@ -78,7 +78,7 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
 def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
     """Delimiter, place of the sensor's name in a row, and names of gyro and accel; None for any other text."""
     lines = [line for line in start.splitlines()[:-1] if line.strip() and not line.startswith(COMMENTS)]
-    marks = Counter(mark for line in lines for mark in ";\t," if line.count(mark) >= PLACES)
+    marks = Counter(mark for line in lines for mark in ";\t, " if line.count(mark) >= PLACES)  # of equals the first
     if not marks:
         return None
     mark = marks.most_common(1)[0][0]

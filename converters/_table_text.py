@@ -128,12 +128,13 @@ def _is_row(line: str, delimiter: str | None, least: int) -> bool:
 
 
 def _is_number(text: str) -> bool:
+    text = text.strip().strip('"')
     if "_" in text:  # Python reads 2026_06_15 as a number, nobody else does
         return False
     try:
         float(text)
     except ValueError:
-        return bool(COMMA_NUMBER.fullmatch(text.strip()))
+        return bool(COMMA_NUMBER.fullmatch(text))
     return True
 
 

@@ -15,7 +15,7 @@ from imutool.recording import GRAVITY_M_S2, Imu
 from ._table_text import Columns
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-TIME_NS = {**USUAL_TIME_NS, "100us": 1e5}
+TIME_NS = {**USUAL_TIME_NS, "100us": 1e5, "min": 60e9, "h": 3600e9}  # the last three only where they are stated
 GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01}

@@ -14,7 +14,7 @@ from msgspec import to_builtins
 
 from imutool.array_types import Bool, Float64
 from imutool.bias import static
-from imutool.bias.model import BiasModel
+from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.model_file import check_rate, find_model
 from imutool.bias_start.aided_path import aided_path, residual_prior
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
@@ -28,7 +28,7 @@ from imutool.inertial.aids import Aids, find_aids, parse_aids
 from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.log import Log
-from imutool.recording import Imu, Poses, Recording
+from imutool.recording import Imu, Poses, Recording, seconds
 
 logger = logging.getLogger(__name__)
 
@@ -55,8 +55,9 @@ def evaluate(
 
     A log whose clock jumps has these for each of its stretches, which are named NAME_1, NAME_2 and so on.
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
-    `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. With `smooth` each bias comes from the whole
-    log. With `aid` a second result each is the smoothed path of the same samples with those aids (`aids.parse_aids`).
+    `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. A warning counts gaps of the
+    IMU. With `smooth` each bias comes from the whole log. With `aid` a second result each is the smoothed path of the same
+    samples with those aids (`aids.parse_aids`).
 
     Raises:
         ConfigError: `smooth` with another `init`, an unknown aid, two models of one name, files that exist, no sample measured.
@@ -97,6 +98,8 @@ def _evaluated(
         fit = judge(model, start, [model_samples(model, recording.imu)], about) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
+        if name == RAW:
+            _warn_of_gaps(integrated, recording.name)
         estimates = {PURE: integrated}
         if aids is not None:
             estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), residual_prior(start, std), aids)
@@ -131,6 +134,16 @@ def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str
     rms = [float(np.sqrt(np.mean(errors**2))) for errors in (found.orientation_rad, found.velocity_m_s)]
     velocity = rms[1] if truth.has_positions else None
     return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": velocity, "drift_window_s": DRIFT_S}
+
+
+def _warn_of_gaps(path: Poses, name: str) -> None:
+    """Log the gaps of the IMU that an integration crosses."""
+    t = seconds(path.t_ns, int(path.t_ns[0]))
+    gaps = np.flatnonzero(np.diff(t) > GAP_S)
+    if len(gaps):
+        length, first = np.diff(t)[gaps].sum(), t[gaps[0]]
+        kept = "the integration keeps the last sample over a gap, and the scores include this"
+        logger.warning("%s: gaps of the IMU: %d, %.1f s in all, the first at %.3f s; %s", name, len(gaps), length, first, kept)
 
 
 def _over(imu: Imu, true: Poses) -> Imu:

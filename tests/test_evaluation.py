@@ -293,6 +293,17 @@ def test_masked_rows_count_nowhere(recording: Recording, log: Path, tmp_path: Pa
         assert len(lines) == part["samples"]
 
 
+def test_a_gap_of_the_imu_is_warned_of(recording: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    number = np.arange(len(recording.imu))
+    kept = recording.imu.rows((number < 1000) | (number >= 1500))  # at 200 Hz
+    write(replace(recording, imu=kept), tmp_path / "gap.mcap")
+    write(recording, tmp_path / "whole.mcap")
+    evaluate(tmp_path / "whole.mcap", models=["static"])
+    assert "gaps of the IMU" not in caplog.text
+    evaluate(tmp_path / "gap.mcap", models=["static"])
+    assert caplog.text.count("gaps of the IMU: 1, 2.5 s in all, the first at ") == 1
+
+
 def test_the_truth_that_is_named_gives_start_and_score(recording: Recording, tmp_path: Path) -> None:
     """A second truth, turned by ten degrees and moved: against the wrong start the raw error would show it."""
     turn = Rotation.from_euler("z", 10.0, degrees=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.recording.joined_imu import sensor_delay, unit_by_gravity
+from imutool.recording.joined_imu import in_order, sensor_delay, unit_by_gravity
 
 RNG = np.random.default_rng(11)
 DURATION_S = 60.0
@@ -62,3 +62,19 @@ def test_a_log_at_rest_or_of_vibration_shows_none():
     assert sensor_delay(gyro_ns, noise, accel_ns, np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.05, accel.shape)) is None
     assert sensor_delay(gyro_ns, noise, accel_ns, accel) is None
     assert sensor_delay(gyro_ns[:400], noise[:400], accel_ns[:250], accel[:250]) is None
+
+
+def test_a_clock_that_is_set_back_is_said_with_what_is_missing():
+    t_ns = 10_000_000 * np.arange(1000, dtype=np.int64)
+    values = np.ones((1000, 3))
+    assert in_order(t_ns, values, "imu").notes == []
+    late = t_ns.copy()
+    late[500] -= 2_000_000_000  # one stamp alone
+    assert in_order(late, values, "imu").notes == ["imu: 1 samples whose stamp repeats or goes back are left out"]
+    back = np.concatenate([t_ns[:600], t_ns[600:] - 2_000_000_000])
+    found = in_order(back, values, "imu")
+    assert len(found.t_ns) == 800
+    assert found.notes == [
+        "imu: 200 samples whose stamp repeats or goes back are left out",
+        "imu: the clock was set back by 1.99 s: that much of the motion is missing there",
+    ]

@@ -10,7 +10,7 @@ from imutool.api import NamedProgress, Progress
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError
 from imutool.file_location import LogPath, location
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
@@ -108,7 +108,7 @@ def survey_imus(
     with RecoveredLog(location(source), max_chunk=max_chunk) as log:
         topics = list(imus) or log.imu_topics
         if not topics:
-            raise LogError("no IMU topic", where=source, expected=log.listing())
+            raise log.no_imu()
         surveys = []
         for done, topic in enumerate(topics):
             tell(done, len(topics), topic)

@@ -91,7 +91,11 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str
                     fix="Train it again with this version of imutool",
                 )
             return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118  not a dict
-    except (OSError, SafetensorError, TypeError, AttributeError) as error:  # numpy knows fewer kinds of numbers than the format
+    except OSError as error:
+        raise ModelError(
+            f"cannot be read ({error.strerror or error})", where=path, expected="safetensors by imutool train"
+        ) from error
+    except (SafetensorError, TypeError, AttributeError) as error:  # numpy knows fewer kinds of numbers than the format
         raise ModelError(f"is not a model file ({error})", where=path, expected="safetensors by imutool train") from error
 
 

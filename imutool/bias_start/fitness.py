@@ -78,9 +78,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         return Fitness("unfit", (wrong,))
     if model.method == static.Model.method:
         units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
-        return Fitness(
-            "fits", (f"it is the bias at rest of this log, without training; trained models ship for {', '.join(units)}",)
-        )
+        return Fitness("fits", (f"it needs no training; trained models ship for {', '.join(units)}",))
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)

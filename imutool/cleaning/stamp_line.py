@@ -57,7 +57,7 @@ class Stamps(NamedTuple):
             f"the clock of the stamps wraps {count} times, as a counter of {name} does" for name, count in self.wraps.items()
         ]
         if self.batch > 1.0:
-            words.append(f"stamps come in batches of about {self.batch:.1f} samples: the driver's, not the sensor's")
+            words.append(batch_words(self.batch))
         return words
 
 
@@ -74,10 +74,25 @@ def read_stamps(stamp_ns: Int64[np.ndarray, " n"]) -> Stamps:
                 steps[row] += size
                 break
     whole = np.concatenate([stamp_ns[:1], stamp_ns[:1] + np.cumsum(steps)]) if len(stamp_ns) else stamp_ns
-    near = steps[(steps >= 0) & (steps < GAP_NS)]
-    share = float((near < BUNCHED * near.mean()).mean()) if len(near) > WINDOW else 0.0
     unset = len(steps) > 0 and not np.diff(stamp_ns).any()
-    return Stamps(whole, FRACTIONS.get(unit, ""), wraps, 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0, unset)
+    return Stamps(whole, FRACTIONS.get(unit, ""), wraps, batch_size(*bunched(steps)), unset)
+
+
+def bunched(steps_ns: Int64[np.ndarray, " n"]) -> tuple[int, int]:
+    """Numbers of steps within a batch, and of all steps that say anything of the period."""
+    near = steps_ns[(steps_ns >= 0) & (steps_ns < GAP_NS)]
+    return int((near < BUNCHED * near.mean()).sum()) if len(near) else 0, len(near)
+
+
+def batch_size(within: int, steps: int) -> float:
+    """Mean samples in a batch, from numbers of `bunched`; 1 where stamps come one by one."""
+    share = within / steps if steps > WINDOW else 0.0
+    return 1.0 / (1.0 - share) if BATCHED < share < 1.0 else 1.0
+
+
+def batch_words(size: float) -> str:
+    """Stamps in batches, in words."""
+    return f"stamps come in batches of about {size:.1f} samples: the driver's, not the sensor's"
 
 
 def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:

@@ -14,6 +14,7 @@ from imutool.errors import ImutoolError
 
 # The library's name of a parameter, and this command line's where it is another.
 ALIASES = {
+    "bias": ("method",),
     "check": ("verify", "quick"),
     "damage": ("damaged",),
     "folder": ("folder", "target"),
@@ -31,7 +32,7 @@ ALIASES = {
     "robots": ("robot_from",),
     "rules": ("rule",),
     "sequences": ("sequence",),
-    "settings": ("config",),
+    "settings": ("set_", "config"),  # those of a file name the file
     "signals": ("signal",),
 }
 # What a user types whom another command, or another tool, has taught; and what serves that purpose, if a command has it.

@@ -165,11 +165,13 @@ class _Stream:
 
 
 def _reflected(topic: MessageTopic, first: bytes) -> Reflected | None:
-    """Fields of an IMU or a pose in a topic of another encoding.
+    """Fields of an IMU or a pose in a topic of another encoding; None for the original of a translated topic.
 
     Raises:
         ConfigError: its messages are protobuf, which is not installed.
     """
+    if RECORDED_KEY in dict(topic.metadata):
+        return None
     try:
         return reflect(topic.message_encoding, topic.name, topic.schema_name, topic.schema, first)
     except ImportError as error:

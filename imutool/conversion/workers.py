@@ -14,6 +14,7 @@ from imutool.conversion.corrections import write_corrected
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.write import write
 from imutool.processes.worker_pool import WorkerBugError, WorkerPool
 from imutool.recording import Recording
@@ -85,7 +86,9 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
         return Outcome()
     write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
-    return Outcome(None, tuple(labelled.remarks.notes), tuple(labelled.remarks.losses))
+    with Log(job.target) as log:
+        lacking = () if log.imu_topics else ("no topic is an IMU",)
+    return Outcome(None, (*labelled.remarks.notes, *lacking), tuple(labelled.remarks.losses))
 
 
 def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:

@@ -29,7 +29,9 @@ NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
 )
-TOO_SLOW = "the motion is too slow to tell the accelerometer from its negative"
+NO_FORCE = (
+    "no order of the axes fits clearly: slow motion, noisy positions or positions in another unit, or forces without gravity"
+)
 NO_DELAY = "the sizes of the turns show no single delay: few poses, or turns that hardly change"
 NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or a vehicle's own acceleration"
 
@@ -48,9 +50,17 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
     return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
 
 
+def constant_sensors(imu: Imu) -> list[str]:
+    """Warnings of a gyro or an accelerometer that never changes: a measurement has noise."""
+    why = "no sensor is behind it, or a simulation at rest without noise"
+    read = {"gyro": imu.gyro, "accel": imu.accel} if len(imu) > 1 else {}
+    constant = {name: values[0] + 0.0 for name, values in read.items() if not np.ptp(values, axis=0).any()}  # no -0.0
+    return [f"{name} reads {value.tolist()} in {len(imu)} samples in a row: {why}" for name, value in constant.items()]
+
+
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
     """Log the warnings about units, axes and frames of samples that are used uncorrected."""
-    warnings = convention_warnings(convention_summary(imu, truth)) if len(imu) else []
+    warnings = [*constant_sensors(imu), *convention_warnings(convention_summary(imu, truth))] if len(imu) else []
     found = agreement(truth, imu) if truth is not None and not warnings else None
     if truth is not None and found is not None:
         turned_deg = [] if found.turned is None else found.turned.deg.tolist()
@@ -96,8 +106,8 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     if found.accel is not None:
         yield "accel against poses", True, f"{found.accel.names}, {_ratio(found.accel)}"
     else:
-        yield "accel against poses", *_unknown(whole, TOO_SLOW)
-    yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, TOO_SLOW if turned else NO_TURN))
+        yield "accel against poses", *_unknown(whole, NO_FORCE)
+    yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, NO_FORCE if turned else NO_TURN))
     if found.delay is not None:
         side = "late" if found.delay.seconds > 0 else "early"
         late_s = abs(found.delay.seconds)
@@ -158,3 +168,17 @@ def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: I
         starts_after_s=float(knots[0] - start) * 1e-9,
         ends_before_s=float(end - knots[-1]) * 1e-9,
     )
+
+
+def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:
+    """Warnings about the true poses of a log with an IMU."""
+    usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
+    if not usable:
+        others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
+        return [f"no true poses: {others}; imutool evaluate LOG --truth TOPIC takes one of them" if others else "no true poses"]
+    warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
+    for truth in usable:
+        warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
+        if isinstance(truth.gyro_explained, float) and isinstance(truth.gyro_rms_rad_s, float):
+            warnings += motion_warnings(truth.topic, truth.gyro_explained, truth.gyro_rms_rad_s)
+    return warnings

@@ -22,13 +22,15 @@ from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location
 from imutool.inertial.stationary import rest_stretches
 from imutool.log_info.convention_report import (
+    constant_sensors,
     convention_summary,
     convention_warnings,
     conventions,
     coverage,
     transforms,
+    truth_warnings,
 )
-from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings
+from imutool.log_info.pose_imu_rotation import agreement
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
@@ -42,6 +44,7 @@ from imutool.units import SENSORS
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
+JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
 
 
 def inspect(path: Location, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
@@ -84,7 +87,8 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
         samples = sound_samples(log, own[0].topic)
         truths = [_against_gyro(log, truth, samples) for truth in truths]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
-    warnings += [*_truth_warnings(own, truths), *refused]
+    vectors = log.with_schema((schemas.VECTOR3,))
+    warnings += [*(truth_warnings(truths) if own else [f"no IMU topic{JOIN_VECTORS if len(vectors) > 1 else ''}"]), *refused]
     stamps = [clock for clock in clocks.values() if len(clock)]
     first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
     return LogInfo(
@@ -268,9 +272,9 @@ def _imu_warnings(
     warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.faults]
     warnings += jump_warnings(jumps)
-    if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S:
+    if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S and not stamps.faults:
         warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")
-    return [*warnings, *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
+    return [*warnings, *constant_sensors(imu), *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]
 
 
 def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
@@ -282,18 +286,3 @@ def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
     truth = msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
     deg, std_deg = (UNSET, UNSET) if found.turned is None else (values.tolist() for values in found.turned)
     return msgspec.structs.replace(truth, body_turned_deg=deg, body_turned_std_deg=std_deg)
-
-
-def _truth_warnings(own: list[ImuInfo], truths: list[TruthInfo]) -> list[str]:
-    if not own:
-        return ["no IMU topic"]
-    usable = [truth for truth in truths if truth.kind in ("truth", "unknown")]
-    if not usable:
-        others = ", ".join(f"{truth.topic} is of kind {truth.kind}" for truth in truths)
-        return [f"no true poses: {others}; imutool evaluate LOG --truth TOPIC takes one of them" if others else "no true poses"]
-    warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
-    for truth in usable:
-        warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
-        if isinstance(truth.gyro_explained, float) and isinstance(truth.gyro_rms_rad_s, float):
-            warnings += motion_warnings(truth.topic, truth.gyro_explained, truth.gyro_rms_rad_s)
-    return warnings

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning.truth import Truth, read_truth, turning
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
-from imutool.recording import Imu, seconds
+from imutool.recording import GAP_FACTOR, Imu, seconds
 from imutool.recording.columns import median
 
 LEAST_TURNS = 20  # between poses
@@ -43,7 +43,8 @@ class Agreement(NamedTuple):
 def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     """Agreement of the turns of poses with the gyro; None where the two share too little motion.
 
-    gyro = b + R omega, with the constant bias b and rotation R that fit best (Kabsch), over intervals of a tenth of a second.
+    gyro = b + R omega, with the constant bias b and rotation R that fit best (Kabsch), over intervals of a tenth of a second
+    without a gap of the IMU.
     """
     if len(imu) < LEAST_TURNS or len(poses.t_ns) < LEAST_TURNS:
         return None
@@ -51,6 +52,7 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     first, last = int(imu.t_ns[0]), int(imu.t_ns[-1])
     steps = (end_ns - start_ns).astype(float)
     inside = (start_ns >= first) & (end_ns <= last) & (steps < 4.0 * median(steps)) & np.isfinite(rate).all(axis=1)
+    inside &= ~_has_gap(imu.t_ns, start_ns, end_ns)
     if inside.sum() < LEAST_TURNS:
         return None
     t = seconds(imu.t_ns, first)
@@ -69,6 +71,17 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     return Agreement(rms, explained, body)
 
 
+def _has_gap(
+    t_ns: Int64[np.ndarray, " n"], start_ns: Int64[np.ndarray, " m"], end_ns: Int64[np.ndarray, " m"]
+) -> Bool[np.ndarray, " m"]:
+    """Whether the samples have a gap inside each interval."""
+    steps = np.diff(t_ns).astype(float)
+    gaps = np.concatenate([[0], np.cumsum(steps > GAP_FACTOR * median(steps))])
+    before = np.clip(np.searchsorted(t_ns, start_ns, side="right") - 1, 0, len(steps))
+    after = np.clip(np.searchsorted(t_ns, end_ns, side="left"), 0, len(steps))
+    return np.asarray(gaps[after] > gaps[before])
+
+
 def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
     """Warning of poses whose body is turned far against the gyro."""
     deg = float(np.linalg.norm(turned_deg))
@@ -80,7 +93,9 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]
     """Warning of poses that do not turn as the gyro does."""
     if explained > LEAST_EXPLAINED or rms_rad_s < UNLIKE_RAD_S:
         return []
-    causes = "clocks that differ, poses of another recording or body, or jumps and noise of the poses"
+    causes = (
+        "clocks that differ, poses of another recording or body, jumps or noise, or quaternions inverted or in another order"
+    )
     return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
 
 

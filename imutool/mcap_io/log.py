@@ -17,7 +17,7 @@ from imutool.file_location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, decode_image
-from imutool.mcap_io.codec.joined_imu import pairs_by_name, parse_parts, whole_of
+from imutool.mcap_io.codec.joined_imu import choice_of, no_imu_fix, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
 from imutool.mcap_io.passthrough.chunk_check import KeptChunks, neighbours, unpack_together
@@ -121,16 +121,16 @@ class Log:
         """
         found = self.imu_topics
         if not found:
-            expected, fix = f"{schemas.IMU} among {self.listing()}", ""
-            if any(topic.message_encoding == "protobuf" for topic in self.topics.values()):
-                fix = "An IMU in protobuf is read with: pip install 'imutool[protobuf]'"
-            raise LogError("the log has no IMU topic", where=self.path, expected=expected, fix=fix)
+            raise self.no_imu()
         if len(found) > 1:
             what = f"the log has {len(found)} IMU topics: {', '.join(found)}"
-            joined = [f"gyro={gyro},accel={accel}" for gyro, accel in pairs_by_name(found).values()]
-            fix = f"Choose one with `imu`{''.join(f', or join two: {names}' for names in joined)}"
-            raise LogError(what, where=self.path, fix=fix)
+            raise LogError(what, where=self.path, fix=choice_of(found))
         return found[0]
+
+    def no_imu(self) -> LogError:
+        """Error of a log without an IMU."""
+        fix = no_imu_fix((topic.schema_name, topic.message_encoding) for topic in self.topics.values())
+        return LogError("the log has no IMU topic", where=self.path, expected=f"{schemas.IMU} among {self.listing()}", fix=fix)
 
     @property
     def pose_topics(self) -> list[str]:
@@ -180,7 +180,7 @@ class Log:
     def listing(self) -> str:
         """The log's topics and their schemas, for a message."""
         every = [f"{t.name} ({t.schema_name or 'no schema'})" for t in self.topics.values()]
-        return ", ".join(every) if every else "a log with topics (this one has none)"
+        return ", ".join(every) if every else "topics (the log has none)"
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name; in records of the same name, later entries replace earlier ones."""

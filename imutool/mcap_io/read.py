@@ -16,6 +16,7 @@ from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import (
+    CLEAN_FIX,
     DERIVED_KEY,
     ENCODINGS,
     MESSAGE_POSES,
@@ -45,7 +46,6 @@ def read(
     """The recording in a log: `read(write(r)) == r`, bit for bit.
 
     Of a log whose clock was set back it is the longest stretch, and a warning says so (`stretches.read_stretches`: all).
-
     Poses of every pose topic are truths (/tf, by child frame, where there are no others), but not those that are an estimate or
     odometry, unless `truth` names them. Of a log that imutool did not write, the name is that of the file, and Float64 and
     Vector3Stamped topics are scalars; one of these that a recording cannot hold (time going back, NaN) is left out and
@@ -155,7 +155,7 @@ class _Columns:
         if topic == self.imu_topic:
             with self.log.named(topic):
                 for imu in self.log.topics[topic].decode_imu(rows):
-                    check_finite(imu.sequence, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
+                    check_finite(imu.sequence, CLEAN_FIX, angular_velocity=imu.gyro, linear_acceleration=imu.accel)
                     self._keep(topic, imu.sequence, imu.stamp_ns, imu.gyro, imu.accel)
         elif topic in self.truth_topics:
             if topic not in self.left_out:
@@ -215,7 +215,7 @@ class _Columns:
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
         stamp_ns, sequence, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
         rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)
-        StampCheck(count=rows.start).check(stamp_ns[rows], sequence[rows])
+        StampCheck(rows.start, fix=CLEAN_FIX if name == self.imu_topic else "").check(stamp_ns[rows], sequence[rows])
         return stamp_ns[rows], [column[rows] for column in columns]
 
     def imu(self) -> Imu:

@@ -41,7 +41,7 @@ CUT = "Cut the log before or after it"
 UNIT_KEY = "unit"  # channel metadata of a scalar
 MESSAGE_POSES = (schemas.POSE, schemas.ODOMETRY, schemas.TRANSFORM, schemas.POSE_COVARIANCE)
 SCALARS = {schemas.FLOAT: 1, schemas.VECTOR3: 3}
-CLEAN_FIX = "See what is wrong with imutool clean LOG, and leave it out with imutool debias --clean"
+CLEAN_FIX = "See what is wrong with imutool clean LOG; imutool debias --clean LOG OUT leaves it out on TOPIC/debiased"
 RESTAMP = "imutool convert LOG OUT --restamp takes the log times"
 UNSET_FIX = f"A stamp of 0 is not set: {RESTAMP}"
 
@@ -158,7 +158,7 @@ def _runs(rows: Rows, schema_name: str, encoding: str) -> Iterator[tuple[Rows, s
         raise LogError(what, expected=error.expected, fix=error.fix or ("" if error.expected else CUT)) from error
 
 
-def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarray, "n _"]) -> None:
+def check_finite(sequence: UInt32[np.ndarray, " n"], fix: str = CUT, **fields: Float64[np.ndarray, "n _"]) -> None:
     """Refuses NaN and infinity, naming the message.
 
     Raises:
@@ -171,7 +171,7 @@ def check_finite(sequence: UInt32[np.ndarray, " n"], **fields: Float64[np.ndarra
             raise LogError(
                 f"message {sequence[row]} has {name} {values[row].tolist()}",
                 expected="finite numbers",
-                fix=CUT,
+                fix=fix,
             )
 
 
@@ -181,6 +181,7 @@ class StampCheck:
 
     count: int = 0
     last: int | None = None
+    fix: str = ""  # what to do about it
 
     def check(self, stamp_ns: Int64[np.ndarray, " n"], sequence: UInt32[np.ndarray, " n"]) -> None:
         """Takes in the next stamps.
@@ -199,7 +200,7 @@ class StampCheck:
                 f"message {self.count + row} (sequence {sequence[row]}) has the stamp {stamp_ns[row]} ns, which {how}: "
                 f"the message before has {before[row]} ns",
                 expected="stamps that increase",
-                fix="" if stamp_ns[row] else UNSET_FIX,
+                fix=self.fix if stamp_ns[row] else UNSET_FIX,
             )
         self.count, self.last = self.count + len(stamp_ns), int(stamp_ns[-1])
 
@@ -209,11 +210,9 @@ class StampCheck:
         Raises:
             LogError: NaN, infinity, or a stamp that does not come after the one before it.
         """
-        try:
-            check_finite(batch.sequence, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
-            self.check(batch.stamp_ns, batch.sequence)
-        except LogError as error:
-            raise LogError(error.what, expected=error.expected, fix=error.fix or CLEAN_FIX) from error
+        check_finite(batch.sequence, CLEAN_FIX, angular_velocity=batch.gyro, linear_acceleration=batch.accel)
+        self.fix = CLEAN_FIX
+        self.check(batch.stamp_ns, batch.sequence)
 
 
 def topics_of(index: LogIndex) -> dict[str, Topic]:

@@ -16,7 +16,7 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu
-from imutool.recording.columns import longest_run
+from imutool.recording.columns import clock_jumps, longest_run
 
 STEP_S = 0.005
 SMOOTHED = 11  # steps; the same of both sensors, so that it adds no delay
@@ -176,6 +176,8 @@ def in_order(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n k"], 
         notes.append(f"{name}: {int((~finite).sum())} samples that are not finite are left out")
     if (finite & ~fresh).any():
         notes.append(f"{name}: {int((finite & ~fresh).sum())} samples whose stamp repeats or goes back are left out")
+    if back_s := [-step_s for _, step_s in clock_jumps(t_ns) if step_s < 0.0]:
+        notes.append(f"{name}: the clock was set back by {sum(back_s):.6g} s: that much of the motion is missing there")
     keep = finite & fresh
     return Cleaned(t_ns[keep], values[keep], notes)
 

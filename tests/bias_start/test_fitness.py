@@ -52,7 +52,9 @@ def judged(model: BiasModel, imu: Imu, about: dict[str, str] | None = None) -> F
 def test_the_sensor_itself_fits(model: BiasModel, recording: Recording) -> None:
     assert judged(model, recording.imu).verdict == "fits"
     assert judged(model, recording.imu, MADE_FOR).verdict == "fits"
-    assert judge(static.Model(), from_numbers("0,0,0,0,0,0"), [], {}).verdict == "fits"
+    given = judge(static.Model(), from_numbers("0,0,0,0,0,0"), [], {})
+    assert given.verdict == "fits"
+    assert "at rest" not in given.reasons[0]
 
 
 def test_another_name_is_doubtful_however_well_it_agrees(model: BiasModel, recording: Recording) -> None:

@@ -383,3 +383,14 @@ def test_stamps_that_were_never_set_are_told_with_what_to_do(made: ImuBatch) -> 
     first, second = look(made._replace(stamp_ns=0 * made.stamp_ns)).reasons
     assert first == f"valid samples: 1 of {len(made.stamp_ns)}"
     assert second == "the stamps were never set: imutool convert LOG OUT --restamp takes the log times"
+
+
+def test_stamps_in_batches_are_no_missing_samples(made: ImuBatch) -> None:
+    number = np.arange(len(made.stamp_ns))
+    last = np.minimum(number // 10 * 10 + 9, len(number) - 1)
+    survey = look(made._replace(stamp_ns=made.stamp_ns[last] + 1000 * (number % 10)))  # as they arrive, ten at a time
+    assert (survey.missing, survey.verdict) == (0, "quarantine")
+    assert (
+        "stamps come in batches of about 10.0 samples: the driver's, not the sensor's; imutool convert LOG OUT --restamp"
+        in (survey.reasons[0])
+    )

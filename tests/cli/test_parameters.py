@@ -107,6 +107,12 @@ def test_a_place_is_a_parameter_only_if_the_command_has_it(where: str, shown: st
     assert error_with_flags(ConfigError("x", where=where), flags(COMMANDS["debias"])).where == shown
 
 
+def test_a_method_and_a_setting_go_by_the_option_that_gave_them() -> None:
+    flag_of = flags(COMMANDS["train"])
+    assert error_with_flags(ConfigError("'liner' is not known", where="bias"), flag_of).where == "--method"
+    assert error_with_flags(ConfigError("stps is not a setting", where="settings"), flag_of).where == "--set"
+
+
 @pytest.mark.parametrize(("verb", "name"), [("debias", "init"), ("evaluate", "html"), ("info", "json")])
 def test_a_file_that_is_called_like_a_parameter_stays_a_file(verb: str, name: str, imutool: Run, tmp_path: Path) -> None:
     line = [verb, name, *(["out.mcap"] if verb == "debias" else [])]

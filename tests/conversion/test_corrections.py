@@ -112,6 +112,22 @@ def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_
     assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "right.mcap"]
 
 
+def test_a_small_delay_does_not_turn_the_body(tmp_path: Path) -> None:
+    """At 60 ms the poses still explain most of the gyro, by a rotation that is off by degrees."""
+    made = flight(3, duration_s=60.0, rate_hz=100.0, truth_rate_hz=50.0)
+    turn = Rotation.from_rotvec([20.0, -30.0, 25.0], degrees=True)
+    true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
+    for name, late_ns in (("late", 60_000_000), ("punctual", 0)):
+        poses = Poses(made.truth.t_ns + late_ns, made.truth.p_wb, (true * turn).as_quat(scalar_first=True))
+        write(replace(made, truths={"/vicon/pose": poses}), tmp_path / f"{name}.mcap")
+        convert(tmp_path / f"{name}.mcap", tmp_path / f"{name}_right.mcap", correct=["conventions"])
+    late, punctual = (
+        Rotation.from_quat(read(tmp_path / f"{name}_right.mcap").truth.q_wb_wxyz.copy(), scalar_first=True)
+        for name in ("late", "punctual")
+    )
+    assert np.degrees((late * punctual.inv()).magnitude()).max() < 0.2
+
+
 def test_poses_of_another_frame_keep_their_clock(tmp_path: Path) -> None:
     """Odometry on the IMU's clock, in a frame of its own, beside a motion capture on another clock."""
     made = flight(3, duration_s=60.0, rate_hz=100.0, truth_rate_hz=50.0)

@@ -26,8 +26,8 @@ GYRO = np.random.default_rng(3).normal(0, 0.003, (COUNT, 3))
 ACCEL = np.random.default_rng(4).normal(0, 0.02, (COUNT, 3)) + np.array([0.0, 0.0, 9.81])
 
 
-def as_json(n: int, t_ns: int) -> bytes:
-    xyz = [dict(zip("xyz", row.tolist(), strict=True)) for row in (GYRO[n], ACCEL[n])]
+def as_json(n: int, t_ns: int, size: float = 1.0) -> bytes:
+    xyz = [dict(zip("xyz", row.tolist(), strict=True)) for row in (GYRO[n], ACCEL[n] * size)]
     stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
     return json.dumps({"timestamp": stamp, "frame_id": "imu", "angularVelocity": xyz[0], "linearAcceleration": xyz[1]}).encode()
 
@@ -74,8 +74,8 @@ def as_flatbuffer(n: int, t_ns: int) -> bytes:
     return flatbuffer().new([*stamp, *values])
 
 
-def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:
-    """Log of an IMU with a topic beside it; the message `lacking` has no acceleration."""
+def write_log(path: Path, encoding: str, *, lacking: int | None = None, size: float = 1.0) -> Path:
+    """Log of an IMU with a topic beside it; the message `lacking` has no acceleration, JSON's are `size` times as large."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -87,7 +87,7 @@ def write_log(path: Path, encoding: str, *, lacking: int | None = None) -> Path:
             schema = writer.register_schema("robot.Inertial", "protobuf", protobuf_type()[0])
         imu = writer.register_channel("/robot/imu", encoding, schema)
         note = writer.register_channel("/notes", "text", 0)
-        make = {"json": as_json, "protobuf": as_protobuf, "flatbuffer": as_flatbuffer}[encoding]
+        make = {"json": functools.partial(as_json, size=size), "protobuf": as_protobuf, "flatbuffer": as_flatbuffer}[encoding]
         for n in range(COUNT):
             t_ns = START_NS + n * 5_000_000
             payload = make(n, t_ns) if n != lacking else b"{}" if encoding == "json" else b""
@@ -115,6 +115,19 @@ def test_an_imu_in_another_encoding_becomes_one_that_every_command_reads(convert
         every = list(make_reader(b, validate_crcs=True).iter_messages())
         ours = [(kept[c.topic], m.log_time, m.publish_time, m.data) for _, c, m in every if c.topic in kept]
     assert sorted(ours) == sorted(theirs)
+
+
+def test_an_original_is_not_translated_again(convert, imutool, tmp_path):
+    """`--fix` converts in rounds: its log has one IMU, and the recorded messages under one name."""
+    convert(write_log(tmp_path / "in.mcap", "json", size=1 / 9.80665), tmp_path / "once.mcap")
+    for source, options in (("once.mcap", ()), ("in.mcap", ("--fix",)), ("once.mcap", ("--fix",))):
+        done = imutool("convert", source, "again.mcap", *options, "--overwrite", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        with Log(tmp_path / "again.mcap") as log:
+            assert sorted(log.topics) == ["/notes", "/robot/imu", "/robot/imu/as_recorded"]
+            assert log.imu_topics == ["/robot/imu"]
+            assert log.topics["/robot/imu/as_recorded"].message_encoding == "json"
+        assert np.allclose(read(tmp_path / "again.mcap").imu.accel, ACCEL / (1.0 if options else 9.80665), rtol=1e-12)
 
 
 def test_a_message_without_a_sample_is_a_loss(convert, tmp_path):
@@ -251,3 +264,15 @@ def test_a_time_beyond_64_bits_with_a_sign_is_refused(convert, tmp_path):
     assert done.returncode == 4, done.stderr
     assert "expected a time from 1970 to 2262" in done.stderr
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_log_without_an_imu_is_converted_with_a_note(convert, tmp_path):
+    with (tmp_path / "in.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/notes", "text", 0), START_NS, b"hello", START_NS)
+        writer.finish()
+    done = convert(tmp_path / "in.mcap", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "note: out.mcap: no topic is an IMU" in done.stderr
+    assert "no topic is an IMU" not in convert(write_log(tmp_path / "imu.mcap", "json"), tmp_path / "with.mcap").stderr

@@ -111,6 +111,14 @@ SHAPES = {
         + "\n"
         + rows_of([iso(t, "%d.%m.%Y %H:%M:%S,FRACTION") for t in T_NS.tolist()], VALUES, ";")
     ).encode(),
+    "every field in quotes, a comma behind the last": "".join(
+        ",".join(f'"{field}"' for field in line.split(",")) + ",\n"
+        for line in [",".join(PLAIN), *rows_of(STAMPS, VALUES).splitlines()]
+    ).encode("utf-8-sig"),
+    "German in quotes": "".join(
+        ";".join(f'"{field}"' for field in line.split(";")) + "\n"
+        for line in [";".join(GERMAN), *rows_of(STAMPS, VALUES, ";").replace(".", ",").splitlines()]
+    ).encode(),
     "UTF-16": ("\t".join(PLAIN) + "\n" + rows_of(STAMPS, VALUES, "\t")).encode("utf-16"),
 }
 

@@ -52,7 +52,9 @@ def read(path: Path, lines: list[str]) -> MessageLog:
 
 
 @pytest.mark.parametrize(
-    "lines", [ANDROID, GETSENSORDATA, GNSSLOGGER, NAMED], ids=["android", "getsensordata", "gnsslogger", "named"]
+    "lines",
+    [ANDROID, [line.replace("\t", " ") for line in ANDROID], GETSENSORDATA, GNSSLOGGER, NAMED],
+    ids=["android", "spaces", "getsensordata", "gnsslogger", "named"],
 )
 def test_rows_that_name_their_sensor_become_one_imu(tmp_path, lines):
     log = read(tmp_path / "walk.txt", lines)

@@ -33,6 +33,19 @@ def read(path: Path, mapping: Path | None = None) -> Any:
     return table.read_sequence(table.sequences(path)[0], mapping=mapping)
 
 
+@pytest.mark.parametrize(("unit", "size_s"), [("min", 60.0), ("minutes", 60.0), ("h", 3600.0), ("hours", 3600.0)])
+def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s):
+    """A step of 1/15 ms would be plausible in seconds, too."""
+    names = [f"time [{unit}]", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    path = write_csv(tmp_path / "log.csv", names, [T_S / size_s, *GYRO.T, *ACCEL.T])
+    assert np.abs(read(path).imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+    (tmp_path / "map.toml").write_text(
+        f'time = "{names[0]}"\ntime_unit = "{unit[0] if size_s > 60 else "min"}"\n'
+        f'gyro = {names[1:4]}\ngyro_unit = "rad/s"\naccel = {names[4:]}\naccel_unit = "m/s^2"\n'
+    )
+    assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
 @pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms", "Fs_imu", "gyro_rate_hz"])
 def test_a_mat_file_with_a_sampling_rate_has_times(tmp_path, stated):
     number = {"dt": 1.0 / RATE_HZ, "sample_period_ms": 1e3 / RATE_HZ}.get(stated, RATE_HZ)

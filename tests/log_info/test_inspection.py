@@ -64,6 +64,21 @@ def logged(folder: Path, imu: Imu, **kwargs: object) -> dict[str, Any]:
     return described(path)
 
 
+def test_a_sensor_that_never_changes_is_warned_of(tmp_path: Path) -> None:
+    imu = resting()
+    for name, given in (
+        ("gyro", replace(imu, gyro=np.zeros_like(imu.gyro))),
+        ("accel", replace(imu, accel=0.0 * imu.accel + 5.0)),
+    ):
+        write(Recording("log", given), tmp_path / f"{name}.mcap")
+        warnings = [text for text in described(tmp_path / f"{name}.mcap")["warnings"] if "in a row" in text]
+        value = [0.0, 0.0, 0.0] if name == "gyro" else [5.0, 5.0, 5.0]
+        assert len(warnings) == 1
+        assert warnings[0].startswith(f"/imu0: {name} reads {value} in 4000 samples in a row: ")
+    write(Recording("log", replace(imu, gyro=imu.gyro * [0.0, 0.0, 1.0])), tmp_path / "one.mcap")  # one axis is left
+    assert not [text for text in described(tmp_path / "one.mcap")["warnings"] if "in a row" in text]
+
+
 def test_clocks_of_every_topic_are_measured(tmp_path):
     imu = resting(1000)
     truth = still_poses(imu.t_ns[::10])
@@ -85,6 +100,14 @@ def test_clocks_of_every_topic_are_measured(tmp_path):
 def test_stamps_that_are_no_nanoseconds_are_told(tmp_path):
     report = logged(tmp_path, replace(resting(400), t_ns=(START_NS + PERIOD_NS * np.arange(400)) // 1000))
     assert any("2e+05 samples a second: the stamps are not in nanoseconds" in warning for warning in report["warnings"])
+
+
+def test_stamps_in_batches_are_not_called_another_unit(tmp_path):
+    number = np.arange(4000)
+    t_ns = START_NS + PERIOD_NS * (number // 10 * 10 + 9) + 1000 * (number % 10)  # as they arrive, ten at a time
+    warnings = logged(tmp_path, replace(resting(4000), t_ns=t_ns))["warnings"]
+    assert any("stamps come in batches of about 10.0 samples" in warning for warning in warnings)
+    assert not any("not in nanoseconds" in warning for warning in warnings)
 
 
 def test_jitter_and_gaps_are_those_of_the_periods(tmp_path):

@@ -51,6 +51,17 @@ def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias()
     assert motion_warnings("/mocap", found.explained, found.rms_rad_s) == []
 
 
+def test_a_gap_of_the_imu_counts_for_nothing():
+    whole = imu()
+    rows = np.r_[0:2000, 3001:4100, 4120:6000]  # 5 s and 0.1 s are missing; no gap begins at a pose
+    found = agreement(poses(), Imu(whole.t_ns[rows], whole.gyro[rows], whole.accel[rows]))
+    assert found is not None
+    assert found.explained > 0.999
+    assert found.rms_rad_s < 2 * NOISE_RAD_S
+    assert found.turned is not None
+    assert np.abs(found.turned.deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * found.turned.std_deg.max()
+
+
 def test_poses_of_another_motion_do_not():
     found = agreement(poses(tempo=1.7), imu())
     assert found is not None

@@ -11,6 +11,7 @@ from imutool.array_types import Float64, Int64
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
+from imutool.cleaning.stamp_line import batch_size, batch_words, bunched
 from imutool.recording import nanoseconds
 from imutool.recording.columns import median
 
@@ -46,6 +47,7 @@ class Gaps(Rule):
         self.missing = 0
         self._last: tuple[int, int] | None = None
         self._period_ns = 0.0
+        self._within, self._steps = 0, 0  # a batch of stamps, and in all
         self._rows: list[Gap] = []
         self._pauses: list[Gap] = []
 
@@ -58,6 +60,8 @@ class Gaps(Rule):
             number, stamp = np.append(self._last[0], number), np.append(self._last[1], stamp)
         self._last = int(number[-1]), int(stamp[-1])
         steps = np.diff(stamp)
+        within, near = bunched(steps)
+        self._within, self._steps = self._within + within, self._steps + near
         if len(steps) >= FEWEST_STEPS or (len(steps) and not self._period_ns):
             self._period_ns = float(median(steps))
         if not self._period_ns:
@@ -71,12 +75,17 @@ class Gaps(Rule):
             self._rows.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), int(lost[row])))
 
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
-        """Findings about missing samples, with the longest gaps, and about pauses."""
+        """Findings about missing samples, with the longest gaps, about pauses, and about stamps in batches."""
         pauses = [(row.first_ns, row.last_ns) for row in self._pauses if row.number not in whole.jumps]
         if pauses:
             what = f"pauses of more than {PAUSE_NS * 1e-9:g} s"
             left_out = max(0, len(pauses) - MAX_INTERVALS)
             yield Finding("gaps", "note", what, len(pauses), tuple(pauses[:MAX_INTERVALS]), left_out, confidence=0.9)
+        if (size := batch_size(self._within, self._steps)) > 1.0:
+            what = batch_words(size)
+            distrust = f"{what}; imutool convert LOG OUT --restamp corrects it"
+            yield Finding("gaps", "error", what, self._within, values={"batch": size}, distrust=distrust, confidence=0.9)
+            return  # nothing shows how many samples are missing
         rows = [row for row in (self._left(row, whole) for row in self._rows) if row.missing]
         count = self.missing + sum(row.missing for row in rows) - sum(row.missing for row in self._rows)
         if not rows:

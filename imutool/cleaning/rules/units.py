@@ -86,7 +86,7 @@ def _gyro_unit(whole: TopicSummary) -> tuple[str, bool, str, float | None]:
             return unit, SURE_BAND[0] <= share <= SURE_BAND[1], f"it is {ratio:.4g} times the true rate", ratio
     relative = whole.conventions.relative
     if relative is not None:
-        return relative.unit, True, "so gravity turns as it does", ratio
+        return relative.unit, True, "in this unit it turns as gravity does in the accelerometer", ratio
     _, mean = whole.motion.table()
     fastest = float(np.abs(mean[:, :3]).max(initial=0.0))
     return ("deg/s" if fastest > FULL_SCALE_RAD_S else "rad/s"), False, f"it reaches {fastest:.4g}", ratio

@@ -14,6 +14,7 @@ from imutool.array_types import Bool, Float64, Int64, Shaped, UInt8
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.codec.messages import Messages, Rows, columns
+from imutool.mcap_io.codec.schemas import VECTOR3
 
 SENSOR_WORDS = r"gyro(scope)?", r"accel(erometer)?"
 Cut = Iterator[tuple[Shaped[np.ndarray, " n"], UInt8[np.ndarray, "n L"]]]  # heads and payloads of equal size
@@ -73,3 +74,17 @@ def pairs_by_name(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
     gyro, accel = ({re.sub(rf"(?i)(?<=/){word}(?=(_\w+)?(/|$))", "{}", t): t for t in topics} for word in SENSOR_WORDS)
     both = [(gyro[pattern], accel[pattern]) for pattern in gyro if "{}" in pattern and pattern in accel]
     return {whole: parts for parts in both if (whole := whole_of(parts)) not in topics}
+
+
+def choice_of(topics: Iterable[str]) -> str:
+    """Hint for several IMU topics: choose one, or join two that are one IMU."""
+    joined = [f"gyro={gyro},accel={accel}" for gyro, accel in pairs_by_name(topics).values()]
+    return f"Choose one with `imu`{''.join(f', or join two: {names}' for names in joined)}"
+
+
+def no_imu_fix(topics: Iterable[tuple[str, str]]) -> str:
+    """Hint for a log without an IMU, by the types and encodings of its topics; may be empty."""
+    types, encodings = zip(*topics, strict=True) if (topics := list(topics)) else ((), ())
+    if types.count(VECTOR3) > 1:
+        return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"
+    return "An IMU in protobuf is read with: pip install 'imutool[protobuf]'" if "protobuf" in encodings else ""
