@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -39,7 +40,8 @@ def find_stamps(log: Log, notes: Mapping[str, list[str]]) -> dict[str, Int64[np.
             clock = {"size_ns": WRAPS[found.wraps.most_common(1)[0][0]], "late_ns": int(log_ns[0] - found.stamp_ns[0])}
     for described in log.with_schema((*MESSAGE_POSES, schemas.VECTOR3)):
         if described.message_encoding in ENCODINGS and described.reflected is None:
-            decode = described.decode_poses if described.schema_name in MESSAGE_POSES else described.decode_scalars
+            every = partial(described.decode_poses, lost=True)
+            decode = every if described.schema_name in MESSAGE_POSES else described.decode_scalars
             log_ns, before = _times(batch for _, rows in log.rows([described.name]) for batch in decode(rows))
             found = read_stamps(before)
             whole_ns = log_ns if found.unset else _unwrapped(log_ns, before, **clock)

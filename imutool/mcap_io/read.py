@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -47,9 +49,9 @@ def read(
 
     Of a log whose clock was set back it is the longest stretch, and a warning says so (`stretches.read_stretches`: all).
     Poses of every pose topic are truths (/tf, by child frame, where there are no others), but not those that are an estimate or
-    odometry, unless `truth` names them. Of a log that imutool did not write, the name is that of the file, and Float64 and
-    Vector3Stamped topics are scalars; one of these that a recording cannot hold (time going back, NaN) is left out and
-    logged as a warning. `start_ns` and `end_ns` select by log time.
+    odometry, unless `truth` names them; lost poses (NaN, zero quaternions) are left out with a warning. Of a log that imutool
+    did not write, the name is that of the file, and Float64 and Vector3Stamped topics are scalars; one that a recording cannot
+    hold (time going back, NaN) is left out with a warning. `start_ns` and `end_ns` select by log time.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -97,6 +99,7 @@ def read_recordings(
         if t.name not in velocities and t.message_encoding in ENCODINGS and (derived or DERIVED_KEY not in t.metadata)
     ]
     used = {name: of for name, of in velocities.items() if of in truths}
+    others = {t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths}
     columns = _Columns(log, imu_topic, truths, used, scalars, refused)
     with log.named():
         for topic, rows in log.rows(columns.topics[0 if samples is None else 1 :], start_ns, end_ns):
@@ -112,9 +115,7 @@ def read_recordings(
             metadata=metadata,
             imu_topic=imu_topic,
             source=own.get("source", ""),
-            other_poses={
-                t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths
-            },
+            other_poses=others,
         )
         found.append(recording if run.alone else recording.between(run.first_ns, run.last_ns))
     return found
@@ -145,6 +146,7 @@ class _Columns:
     refused: Callable[[str, LogError], None] | None
     kept: dict[str, list[tuple[np.ndarray, ...]]] = field(default_factory=dict)  # columns, by topic
     left_out: set[str] = field(default_factory=set)
+    lost: Counter[str] = field(default_factory=Counter)  # poses that are none, by topic
     run: ClockRun = field(init=False)  # the current one of `runs`
 
     @property
@@ -175,8 +177,9 @@ class _Columns:
 
     def _take_poses(self, topic: str, rows: messages.Rows) -> None:
         tree = self.log.topics[topic].schema_name == schemas.TF
-        for pose in self.log.topics[topic].decode_poses(rows):
-            name = f"{topic}/{pose.child_frame_id.lstrip('/')}" if tree else topic
+        for every in self.log.topics[topic].decode_poses(rows, lost=True):
+            name, pose = f"{topic}/{every.child_frame_id.lstrip('/')}" if tree else topic, every.tracked()
+            self.lost[name] += len(every.stamp_ns) - len(pose.stamp_ns)
             self._keep(name, pose.sequence, pose.stamp_ns, pose.p_wb, pose.q_wb_wxyz)
 
     @contextmanager
@@ -210,8 +213,7 @@ class _Columns:
             yield run
 
     def columns(self, name: str, *widths: int) -> tuple[Int64[np.ndarray, " n"], list[Float64[np.ndarray, "n _"]]]:
-        parts = self.kept.get(name, [])
-        if not parts:
+        if not (parts := self.kept.get(name, [])):
             return np.zeros(0, np.int64), [np.zeros((0, width)) for width in widths]
         stamp_ns, sequence, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
         rows = self.run.rows if name == self.imu_topic else self.run.rows_of(stamp_ns)
@@ -230,24 +232,26 @@ class _Columns:
             names += [name for name in self.kept if name.startswith(f"{topic}/")] if tree else [topic]
         if wanted is not None and wanted not in self.log.topics:
             if wanted not in names:
-                raise LogError(
-                    f"there are no poses on {wanted}", where=self.log.path, expected=", ".join(names) or "a transform"
-                )
+                expected = ", ".join(names) or "a transform"
+                raise LogError(f"there are no poses on {wanted}", where=self.log.path, expected=expected)
             names = [wanted]
         elif wanted is not None and len(names) > 1:
-            raise LogError(
-                f"{wanted} has {len(names)} child frames", where=self.log.path, fix=f"Choose one of {', '.join(names)}"
-            )
+            fix = f"Choose one of {', '.join(names)}"
+            raise LogError(f"{wanted} has {len(names)} child frames", where=self.log.path, fix=fix)
         found = {}
-        for name in names:
-            if name not in self.left_out:
-                with self._leave_out_on_error(name):
-                    found[name] = self._poses(name)
+        for name in (name for name in names if name not in self.left_out):
+            with self._leave_out_on_error(name):
+                found[name] = self._poses(name)
         return found
 
     def _poses(self, name: str) -> Poses:
         with self.log.named(name):
             stamp_ns, (p_wb, q_wb_wxyz) = self.columns(name, 3, 4)
+            if self.lost[name]:
+                what = f"{self.lost[name]} of {self.lost[name] + len(stamp_ns)} poses are lost (NaN, or a quaternion of zero)"
+                if not len(stamp_ns):
+                    raise LogError(what, expected="poses of a tracked body")
+                logger.warning("%s %s: %s and left out", self.log.path, name, what)
             away = np.abs(np.linalg.norm(q_wb_wxyz, axis=1) - 1.0) > UNIT_QUATERNION_TOLERANCE
             if away.any():  # rows that a recording takes as they are keep every bit
                 q_wb_wxyz = np.where(away[:, None], unit_quaternions(q_wb_wxyz), q_wb_wxyz)
@@ -260,15 +264,14 @@ class _Columns:
 
     def scalars(self) -> dict[str, Scalars]:
         found = {}
-        for name in self.scalar_topics:
-            if name not in self.left_out:
-                described = self.log.topics[name]
-                try:
-                    stamp_ns, (values,) = self.columns(name, SCALARS[described.schema_name])
-                except LogError as error:
-                    logger.warning("%s %s is left out: %s", self.log.path, name, error.what)
-                    continue
-                found[name] = Scalars(stamp_ns, values, described.metadata.get(UNIT_KEY, ""))
+        for name in (name for name in self.scalar_topics if name not in self.left_out):
+            described = self.log.topics[name]
+            try:
+                stamp_ns, (values,) = self.columns(name, SCALARS[described.schema_name])
+            except LogError as error:
+                logger.warning("%s %s is left out: %s", self.log.path, name, error.what)
+                continue
+            found[name] = Scalars(stamp_ns, values, described.metadata.get(UNIT_KEY, ""))
         return found
 
 
@@ -278,7 +281,7 @@ def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Fra
     for topic in (t.name for t in log.with_schema((schemas.IMAGE,)) if t.message_encoding in ENCODINGS):
         if (form := _format(log, topic)) is not None:
             count = sum(int(((t >= first) & (t <= last)).sum()) for t in log.stamps(topic))
-            found[topic] = Frames(form, count, _opener(log.path, topic, start_ns, end_ns))
+            found[topic] = Frames(form, count, partial(_images, log.path, topic, start_ns, end_ns))
     return found
 
 
@@ -292,9 +295,6 @@ def _format(log: Log, topic: str) -> str | None:
         return None
 
 
-def _opener(path: Location, topic: str, start_ns: int | None, end_ns: int | None) -> Callable[[], Iterator[tuple[int, bytes]]]:
-    def each() -> Iterator[tuple[int, bytes]]:
-        with Log(path) as log:
-            yield from log.images(topic, start_ns, end_ns)
-
-    return each
+def _images(path: Location, topic: str, start_ns: int | None, end_ns: int | None) -> Iterator[tuple[int, bytes]]:
+    with Log(path) as log:
+        yield from log.images(topic, start_ns, end_ns)

@@ -113,16 +113,16 @@ class Topic:
         else:
             yield from (Vectors(part.stamp_ns, getattr(part, sensor), part.frame_id) for part in self.decode_imu(rows))
 
-    def decode_poses(self, rows: Rows) -> Iterator[PoseBatch]:
-        """Poses from their bytes, one batch per stretch with one frame and per transform.
+    def decode_poses(self, rows: Rows, *, lost: bool = False) -> Iterator[PoseBatch]:
+        """Poses from their bytes, one batch per stretch with one frame and per transform; with `lost` also those not tracked.
 
         Raises:
-            LogError: a payload that is no such message, NaN or infinite values.
+            LogError: a payload that is no such message.
         """
         for cut, layout in _runs(rows, self.schema_name, self._encoding):
             for columns in decode_poses(cut.payload, self.schema_name, self._encoding, layout):
-                check_finite(cut.sequence, position=columns.p_wb, orientation=columns.q_wb_wxyz)
-                yield PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+                every = PoseBatch(cut.log_time, cut.publish_time, cut.sequence, *columns)
+                yield every if lost else every.tracked()
 
     def decode_scalars(self, rows: Rows) -> Iterator[ScalarBatch]:
         """Numbers from their bytes, one batch per stretch with one frame.

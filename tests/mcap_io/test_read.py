@@ -150,9 +150,22 @@ def test_quaternions_off_by_more_than_a_recording_takes_are_made_unit(foreign: F
     truth = read(foreign(imu_messages(make) + messages)).truths["/p"]
     assert truth.q_wb_wxyz[:2].tobytes() == np.array(q[:2]).tobytes()
     assert np.linalg.norm(truth.q_wb_wxyz[2]) == pytest.approx(1.0, abs=1e-15)
-    zero = ("/p", schemas.POSE, START_NS + 9, 0, 9, make(schemas.POSE, START_NS + 9, np.zeros(3), np.zeros(4)))
-    with pytest.raises(LogError, match=r"/p: quaternion \[0.0, 0.0, 0.0, 0.0\] in row 3"):
-        read(foreign([*imu_messages(make), *messages, zero], name="zero"))
+
+
+@pytest.mark.parametrize("lost", [np.zeros(4), np.full(4, np.nan)])
+def test_poses_that_tracking_lost_are_left_out(
+    foreign: Foreign, make: Make, lost: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    q = [np.array([0.5, 0.5, 0.5, 0.5])] * 3 + [lost] * 2
+    messages = [
+        ("/p", schemas.POSE, START_NS + i, START_NS + i, i, make(schemas.POSE, START_NS + i, np.zeros(3), q[i]))
+        for i in range(5)
+    ]
+    truth = read(foreign(imu_messages(make) + messages)).truths["/p"]
+    assert truth.t_ns.tolist() == [START_NS + i for i in range(3)]
+    assert "/p: 2 of 5 poses are lost (NaN, or a quaternion of zero) and left out" in caplog.text
+    with pytest.raises(LogError, match=r"/p: 2 of 2 poses are lost .*; expected poses of a tracked body"):
+        read(foreign(imu_messages(make) + messages[3:], name="none"))
 
 
 def test_our_own_derived_channels_are_no_imus_but_can_be_named(recording: Recording, tmp_path: Path) -> None:
@@ -427,7 +440,7 @@ def test_nan_and_infinity_in_imu_or_truth_are_refused(foreign: Foreign, make: Ma
     with pytest.raises(LogError, match=r"/imu: message 7 has linear_acceleration \[0.0, (nan|inf), 0.0\].*--clean"):
         read(foreign(messages))
     pose = ("/mocap", schemas.POSE, t, t, 0, make(schemas.POSE, t, np.array([bad, 0, 0]), np.ones(4) / 2))
-    with pytest.raises(LogError, match=r"/mocap: message 0 has position \[(nan|inf), 0.0, 0.0\]"):
+    with pytest.raises(LogError, match=r"/mocap: 1 of 1 poses are lost"):
         read(foreign([*imu_messages(make), pose], name="pose"))
 
 

@@ -96,7 +96,7 @@ def _static_transforms(log: Log) -> dict[str, tuple[str, Mount]]:
     out = {}
     topics = [topic.name for topic in log.with_schema((schemas.TF,)) if topic.name.endswith("tf_static") and topic.is_read]
     for name, rows in log.rows(topics) if topics else ():
-        for part in log.topics[name].decode_poses(rows):
+        for part in (part for part in log.topics[name].decode_poses(rows) if len(part.stamp_ns)):
             R = Rotation.from_quat(part.q_wb_wxyz[0], scalar_first=True)
             out[_plain(part.child_frame_id)] = (_plain(part.frame_id), Mount(part.p_wb[0], R))
     return out

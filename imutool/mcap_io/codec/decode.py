@@ -28,6 +28,7 @@ from imutool.mcap_io.codec.schemas import (
 )
 
 _WXYZ_FROM_XYZW = [3, 0, 1, 2]
+LOST_NORM = 0.5  # of a quaternion; below, it is none
 
 
 class ImuColumns(NamedTuple):
@@ -93,6 +94,11 @@ class PoseBatch(NamedTuple):
     q_wb_wxyz: Float64[np.ndarray, "n 4"]
     frame_id: str
     child_frame_id: str
+
+    def tracked(self) -> PoseBatch:
+        """Poses that are one: tracking that lost the body writes NaN, or a quaternion of zero."""
+        good = np.isfinite(self.p_wb).all(axis=1) & (np.linalg.norm(self.q_wb_wxyz, axis=1) > LOST_NORM)
+        return self if good.all() else self._replace(**{name: getattr(self, name)[good] for name in self._fields[:6]})
 
 
 class ScalarBatch(NamedTuple):
