@@ -22,7 +22,7 @@ from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
-    "gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis",
+    "gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_bias_step", "accel_bias_step",
     "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
     "clock_offset", "clock_skew", "clock_jump", "clock_wander", "gyro_delay", "gyro_dead_band", "low_pass", "saturation",
     "quantization", "gravity", "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples",
@@ -309,6 +309,14 @@ def test_a_jump_says_when_and_how_far() -> None:
     jump = {"t_jump": Estimate(31.02, 0.05, "s"), "step": Estimate(0.02, 0.0004, "s")}
     assert named_sentence(diagnoses.ARM, finding("clock_jump", jump)) == (
         "the clock of the recording jumps by 20.0 ± 0.4 ms at 31.02 ± 0.05 s (clock_jump)"
+    )
+
+
+def test_a_step_says_how_far_and_when() -> None:
+    step = {axis: Estimate(value, 4e-4, "rad/s") for axis, value in zip("xyz", (0.0123, -0.0045, 0.0081), strict=True)}
+    told = finding("gyro_bias_step", step | {"t_step": Estimate(31.02, 0.05, "s")}, "gyro")
+    assert named_sentence(diagnoses.ARM, told) == (
+        "its bias steps by (12.3, -4.5, 8.1) ± 0.4 mrad/s at 31.02 ± 0.05 s (gyro_bias_step)"
     )
 
 

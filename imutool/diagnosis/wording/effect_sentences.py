@@ -55,6 +55,12 @@ def _clock_jump(w: Words) -> str:
     return f"the clock of the recording jumps{how_far} at {w.main}"
 
 
+def _bias_step(w: Words) -> str:
+    """By how much, and when."""
+    when = f" at {w.rest[0]}" if w.rest else ""
+    return f"its bias steps by {w.main}{when}"
+
+
 def _driven(w: Words) -> str:
     return f"{w.it} follows {w.finding.driver or 'another channel of the log'} with {w.main.labelled}"
 
@@ -95,6 +101,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "accel_quadratic": "{w.it} bends with the square of the specific force, by {w.main}",
     "gyro_bias_drift": "its bias drifts by {w.main} in all",
     "accel_bias_drift": "its bias drifts by {w.main} in all",
+    "gyro_bias_step": _bias_step,
+    "accel_bias_step": _bias_step,
     "rate_curve": "{w.it} errs by a curve of the rate, with {w.main}",
     "vibration_rectification": "{w.it} turns vibration into a constant, with {w.main}",
     "lever_arm": "{w.it} sits {w.main} from the tracked point",
