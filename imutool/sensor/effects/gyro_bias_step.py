@@ -1,8 +1,8 @@
 """Step of the gyro's bias: + A from one moment on.
 
-A shock, a jump of the temperature or a new initialisation shifts a bias (IEEE 528: zero offset, and its shifts). Every bias also
-walks, and a walk has its steepest moment, too: a step is the answer only where a jump at one time is likelier than the
-likeliest walk (`imutool.noise.bias_walk`), for as many times as there are samples.
+A shock, a jump of the temperature or a new initialisation shifts a bias: a change point (Page, Biometrika 42, 1955). Every
+bias also walks, and a walk has its steepest moment, too: a step is the answer only where a jump at one time is likelier than
+the likeliest walk (`imutool.noise.bias_walk`), for as many times as there are samples.
 """
 
 from __future__ import annotations
