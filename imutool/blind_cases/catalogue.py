@@ -107,6 +107,7 @@ _LINE = (
     *(_fixed(f"phase_{k}", "rad", 1.0) for k in range(6)),
 )
 _TAU = _fixed("tau", "s", 30.0)
+_AT = _fixed("t_step", "s", 30.0)
 _LIMITS = (Parameter("gyro", "rad/s", 2.0), Parameter("accel", "m/s^2", 12.0))
 _LSB = (Parameter("gyro", "rad/s", 0.02), Parameter("accel", "m/s^2", 0.2))
 _JUMP = (_fixed("t_j", "s", 30.0), Parameter("step", "s", 0.05))
@@ -125,11 +126,13 @@ CATALOGUE: Mapping[str, Model] = {
         Model("gyro_g_sensitivity", Stage.SENSOR, "gyro", _G, forward.g_sensitivity),
         Model("gyro_quadratic", Stage.SENSOR, "gyro", _axes("s/rad", 0.1), on(GYRO, quadratic)),
         Model("gyro_bias_drift", Stage.SENSOR, "gyro", (*_axes("rad/s", 0.02), _TAU), on(GYRO, forward.warm_up)),
+        Model("gyro_bias_step", Stage.SENSOR, "gyro", (*_axes("rad/s", 0.02), _AT), on(GYRO, forward.bias_step)),
         Model("accel_scale", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, forward.scale)),
         Model("accel_scale_asymmetry", Stage.SENSOR, "accel", _axes("-", 0.05), on(ACCEL, two_gains)),
         Model("accel_misalignment", Stage.SENSOR, "accel", _SQUARE, on(ACCEL, forward.misalignment)),
         Model("accel_quadratic", Stage.SENSOR, "accel", _axes("s^2/m", 6e-3), on(ACCEL, quadratic)),
         Model("accel_bias_drift", Stage.SENSOR, "accel", (*_axes("m/s^2", 0.5), _TAU), on(ACCEL, forward.warm_up)),
+        Model("accel_bias_step", Stage.SENSOR, "accel", (*_axes("m/s^2", 0.5), _AT), on(ACCEL, forward.bias_step)),
         Model("lever_arm", Stage.IDEAL, "accel", _axes("m", 0.3), forward.lever_arm),
         Model("mount_rotation", Stage.MOUNT, "both", _axes("rad", 0.2), forward.mount_rotation),
         Model("size_effect", Stage.IDEAL, "accel", _matrix("m", 0.02, diagonal=True), forward.size_effect),

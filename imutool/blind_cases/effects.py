@@ -261,6 +261,11 @@ def warm_up(values: Three, theta: Theta, t_s: Times) -> Three:
     return np.asarray(values + rise * theta[:3])
 
 
+def bias_step(values: Three, theta: Theta, t_s: Times) -> Three:
+    """v + b from t_step on."""
+    return np.where(t_s[:, None] < theta[3], values, values + theta[:3])
+
+
 def g_sensitivity(reading: Reading, theta: Theta) -> Six:
     """Gyro + G f."""
     out = reading.signal.copy()

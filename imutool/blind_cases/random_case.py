@@ -56,6 +56,7 @@ ALIKE = (
     {"lever_arm", "size_effect"},
     {"dropped_samples", "timestamp_jitter"},
 )
+ONCE = {"gyro_bias_step", "accel_bias_step"}
 ALONE = {"reference_error", "earth_rotation"}  # never one of a pair
 
 _FOG_GYRO, _FOG_ACCEL = 5.8e-7, 1e-4
@@ -209,7 +210,8 @@ def draw_parameters(model: Model, rng: Generator, signal: Six, noise: Sigma, dur
     if model.name == "size_effect":  # what is common to all three axes would be a lever arm
         theta -= np.tile(theta.reshape(3, 3).mean(axis=0), 3)
     if not amounts.all():
-        theta[~amounts] = rng.uniform(0.1, 0.4) * duration_s  # time constants of the drifts
+        early, late = (0.2, 0.8) if model.name in ONCE else (0.1, 0.4)  # the time of a step, or constants of the drifts
+        theta[~amounts] = rng.uniform(early, late) * duration_s
     used = theta[amounts] / model.plausible[amounts]
     theta[amounts] /= np.sqrt(np.mean(used[used != 0.0] ** 2))
     return theta

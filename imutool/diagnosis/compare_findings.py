@@ -28,7 +28,7 @@ CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explai
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
 OF_READING = (  # or of its rest, where rounding errs by a constant
     *("gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_dead_band"),
-    *("gyro_bias_drift", "accel_bias_drift"),
+    *("gyro_bias_drift", "accel_bias_drift", "gyro_bias_step", "accel_bias_step"),
 )
 NAMED_SHARE = 0.05  # of the squares that rounding adds, which an effect with a name has to remove
 OF_UNIT = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "mount_rotation")  # its own, or its mount's

@@ -104,6 +104,7 @@ class Effect:
     basis: the terms of a trained effect, where `forward` for one parameter at a time would be slow; the same numbers.
     fast: a trained effect for given parameters, where `forward` would be slow; the same numbers.
     lagless: `forward` with its gain and without its lag.
+    of_time: what it adds depends on time alone, as the walk of a bias does.
     """
 
     name: str
@@ -127,6 +128,7 @@ class Effect:
     basis: Callable[[Signals], Float64[np.ndarray, "n q"]] | None = None
     fast: Callable[[Theta], CompiledEffect] | None = None
     lagless: Callable[[Any, Theta], Any] | None = None
+    of_time: bool = False
 
     @property
     def key(self) -> str:

@@ -221,6 +221,14 @@ def test_drift_and_temperature_in_closed_form() -> None:
     assert np.abs(warm - np.outer([0.0, 5.0, 15.0], np.arange(6.0))).max() < 1e-10
 
 
+def test_a_bias_steps_once() -> None:
+    step = CATALOGUE["gyro_bias_step"].act(READING, np.array([1.0, 0.0, -2.0, 10.0])) - BOTH
+    assert np.abs(step[:, GYRO] - np.outer([0.0, 1.0, 1.0], [1.0, 0.0, -2.0])).max() < EXACT
+    assert np.abs(step[:, ACCEL]).max() == 0.0
+    late = CATALOGUE["accel_bias_step"].act(READING, np.array([0.0, 3.0, 0.0, 15.0])) - BOTH
+    assert np.abs(late[:, 4] - [0.0, 0.0, 3.0]).max() < EXACT
+
+
 def test_play_drags_a_reading_behind_its_motion() -> None:
     rate = np.repeat(np.array([0.0, 0.3, 1.0, 0.8, -0.5, 0.1])[:, None], 6, axis=1)
     held = CATALOGUE["gyro_hysteresis"].act(Reading(np.arange(6.0), rate, {}), np.array([0.25]))
@@ -338,7 +346,7 @@ def test_what_a_motion_cannot_show_has_no_bound(circle: Poses) -> None:
     assert std.min() > 1.0  # a constant turn tells a scale from a bias no more than rest does
 
 
-@pytest.mark.parametrize("name", ["gyro_scale", "lever_arm", "clock_jump"])
+@pytest.mark.parametrize("name", ["gyro_scale", "lever_arm", "clock_jump", "gyro_bias_step"])
 def test_sizes_are_what_they_say(scene: Scene, name: str) -> None:
     seen, model = detectability(scene), CATALOGUE[name]
     ideal = scene.ideal(seen.t_s)

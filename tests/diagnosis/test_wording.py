@@ -22,7 +22,7 @@ from imutool.diagnosis.wording.quantity import grouped, percent, value, vector
 
 CATALOGUE = [  # of physics: what an ideal simulation leaves out, and what any signal can have
     "gyro_bias", "accel_bias", "gyro_scale", "gyro_misalignment", "gyro_g_sensitivity", "gyro_quadratic", "gyro_bias_drift",
-    "gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis",
+    "gyro_scale_asymmetry", "accel_scale_asymmetry", "gyro_hysteresis", "accel_hysteresis", "gyro_bias_step", "accel_bias_step",
     "accel_scale", "accel_misalignment", "accel_quadratic", "accel_bias_drift", "lever_arm", "mount_rotation", "size_effect",
     "clock_offset", "clock_skew", "clock_jump", "clock_wander", "gyro_delay", "gyro_dead_band", "low_pass", "saturation",
     "quantization", "gravity", "earth_rotation", "vibration", "mount_resonance", "temperature", "dropped_samples",
@@ -309,6 +309,35 @@ def test_a_jump_says_when_and_how_far() -> None:
     jump = {"t_jump": Estimate(31.02, 0.05, "s"), "step": Estimate(0.02, 0.0004, "s")}
     assert named_sentence(diagnoses.ARM, finding("clock_jump", jump)) == (
         "the clock of the recording jumps by 20.0 ± 0.4 ms at 31.02 ± 0.05 s (clock_jump)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("signal", "c", "words"),
+    [
+        ("gyro", -2.01, "its sign is reversed"),
+        ("accel", -1.98, "its sign is reversed"),
+        ("gyro", 56.3, "so it is in deg/s instead of rad/s"),
+        ("accel", 1.0 / 9.81 - 1.0, "so it is in g instead of m/s²"),
+        ("gyro", -0.898, "this has no name among the known effects"),
+        ("accel", -1.0, "this has no name among the known effects"),
+    ],
+)
+def test_a_gain_that_is_a_convention_is_told_as_one(signal: str, c: float, words: str) -> None:
+    own = {"gyro": "omega", "accel": "f"}[signal]
+    term = {"c": Estimate(c, 1e-4, f"- per unit of {own}_x")}
+    equation = f"{signal}.x += c {own}_x"
+    told = named_sentence(diagnoses.ARM, finding("unknown", term, signal, equation=equation, kind="unknown", axis="x"))
+    assert told.endswith(f"; {words} (unknown)")
+    other = finding("unknown", term, signal, equation=equation.replace("_x", "_y"), kind="unknown", axis="x")
+    assert "no name" in named_sentence(diagnoses.ARM, other)
+
+
+def test_a_step_says_how_far_and_when() -> None:
+    step = {axis: Estimate(value, 4e-4, "rad/s") for axis, value in zip("xyz", (0.0123, -0.0045, 0.0081), strict=True)}
+    told = finding("gyro_bias_step", step | {"t_step": Estimate(31.02, 0.05, "s")}, "gyro")
+    assert named_sentence(diagnoses.ARM, told) == (
+        "its bias steps by (12.3, -4.5, 8.1) ± 0.4 mrad/s at 31.02 ± 0.05 s (gyro_bias_step)"
     )
 
 

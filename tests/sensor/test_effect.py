@@ -164,7 +164,7 @@ def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect
 
 
 def test_the_catalogue_of_left_out_physics_is_there() -> None:
-    sensor = ("scale", "scale_asymmetry", "misalignment", "quadratic", "hysteresis", "bias_drift")
+    sensor = ("scale", "scale_asymmetry", "misalignment", "quadratic", "hysteresis", "bias_drift", "bias_step")
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}
     expected |= {"gyro_g_sensitivity", "lever_arm", "size_effect", "mount_rotation", "mount_resonance", "low_pass", "gravity"}
     expected |= {
@@ -516,6 +516,23 @@ def test_a_warm_up_starts_with_its_amplitude_at_the_right_time_constant(sensor: 
     real = real.with_readings(real.gyro + 0.1, real.accel - 0.2)
     assert one.starts is not None
     close(one.starts(felt, real)[1], np.array([A, -A, 0.0, 30.0]), 1e-9)
+
+
+@pytest.mark.parametrize(("sensor", "A"), [("gyro", 0.01), ("accel", 0.2)])
+def test_a_bias_steps_at_its_time_and_is_sought_there_beside_larger_errors(sensor: str, A: float) -> None:
+    felt, one, t_step = lively(60.0), only(f"{sensor}_bias_step"), 41.0
+    truth = np.array([A, 0.0, -A, t_step - 1e-9])
+    read = act(one.name, ideal(one, felt), *truth)
+    more = getattr(read, sensor) - getattr(felt, sensor)
+    close(more, np.where((felt.t_s < t_step)[:, None], 0.0, truth[:3]))
+    others = [("gyro_scale", [0.1, -0.05, 0.02]), ("accel_scale", [0.02, 0.03, -0.02]), ("clock_offset", [0.005])]
+    others += [("lever_arm", [0.2, 0.1, -0.1]), ("gyro_bias_drift", [0.05, -0.03, 0.02, 25.0])]
+    real = simulate_samples(felt, felt.t_s, [(one, truth), *((only(name), np.array(theta)) for name, theta in others)])
+    noise = np.random.default_rng(5).normal(size=(len(felt.t_s), 3))
+    assert one.starts is not None
+    start = one.starts(felt, real.with_readings(real.gyro + 2e-3 * noise + 0.1, real.accel + 0.03 * noise - 0.2))[1]
+    assert abs(start[3] - t_step) < 0.2
+    assert np.abs(start[:3] - truth[:3]).max() < 0.7 * A, "a fit from here moves the step in its own direction"
 
 
 def test_biases_follow_the_temperature() -> None:

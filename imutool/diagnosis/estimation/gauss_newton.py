@@ -109,6 +109,7 @@ def fit(
     iterations: int | None = None,
     near: Fit | None = None,
     give_up_above: float = np.inf,
+    hold_onsets: bool = False,
 ) -> Fit:
     """Fit effects together from where they begin, and a bias for each log.
 
@@ -116,7 +117,7 @@ def fit(
     step. A fit whose objective is not below `give_up_above` after a few steps goes no further, nor does one that only leaves
     effects out of `near` and whose first step predicts no less: the others hardly move.
     """
-    problem = _Problem(logs, begun, part)
+    problem = _Problem(logs, begun, part, hold_onsets)
     iterations = problem.settings.iterations if iterations is None else iterations
     now = _descended(problem, problem.state(begun, near), iterations, near, give_up_above)
     if iterations and any(effect.jumps for effect, _ in begun):
@@ -144,8 +145,8 @@ class _State(NamedTuple):
 class _Problem:
     """Least squares of white residuals on some rows, with a prior about the start."""
 
-    def __init__(self, logs: Sequence[WhitenedLog], begun: Chosen, part: str) -> None:
-        self.logs, self.masks = logs, [log.rows(part) for log in logs]
+    def __init__(self, logs: Sequence[WhitenedLog], begun: Chosen, part: str, hold_onsets: bool = False) -> None:
+        self.logs, self.masks, self.hold_onsets = logs, [log.rows(part) for log in logs], hold_onsets
         self.constants = [np.stack([x[mask] for x in log.constants.T]) for log, mask in zip(logs, self.masks, strict=True)]
         self.settings = logs[0].pair.settings.fit
         self.mean, self.std = priors(begun, self.settings)
@@ -259,7 +260,7 @@ def direction(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
 
 def _onsets(problem: _Problem, now: _State) -> Iterator[Chosen]:
     """Onset times that minimise the cost: no effect before it, the effect after."""
-    for k, (effect, _) in enumerate(now.chosen):
+    for k, (effect, _) in enumerate(() if problem.hold_onsets else now.chosen):
         for j, parameter in enumerate(effect.parameters):
             if not parameter.begins:
                 continue

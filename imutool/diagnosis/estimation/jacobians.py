@@ -182,6 +182,11 @@ def step_of(parameter: Parameter) -> float:
     return LOG_STEP if parameter.positive else STEP * parameter.plausible
 
 
+def sets_in(effect: Effect) -> Bool[np.ndarray, " p"]:
+    """Which parameters of an effect are onsets."""
+    return np.array([parameter.begins for parameter in effect.parameters], dtype=bool)
+
+
 def parameters_of(chosen: Chosen) -> list[Parameter]:
     """All parameters in order."""
     return [parameter for effect, _ in chosen for parameter in effect.parameters]

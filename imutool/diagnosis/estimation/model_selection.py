@@ -16,7 +16,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
-from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise, with_bias_walk
+from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise
 from imutool.diagnosis.estimation.observability import (
     FOLLOWING,
     WANDER,
@@ -34,13 +34,15 @@ from imutool.diagnosis.estimation.significance import (
     Scatter,
     bic,
     estimate_onsets,
-    first_refuted,
     gain_for,
     gain_of,
     scatter,
     unnamed_count,
     with_onsets_of,
+    with_onsets_of_all_rows,
 )
+from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
+from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, smoothing, takes_noise, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
@@ -220,7 +222,7 @@ class _Search:
     def tested(self, now: Fit) -> Selection:
         """Selection of the effects that pass on all rows and on held-out blocks."""
         while len(now.chosen) > (first := len(self.always)):
-            _ = (now := with_bias_walk(now)).jacobians  # which both processes need
+            _ = (now := with_bias_walk(with_onsets_of_all_rows(now))).jacobians  # which both processes need
             self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
             unseen = Forked(partial(first_refuted, now, first))
             whole = fit(now.logs, now.chosen, part="all", near=now)

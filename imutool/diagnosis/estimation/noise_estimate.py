@@ -7,9 +7,8 @@ fit of them would start. An effect left out here would be taken for noise, and n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -17,12 +16,11 @@ from scipy.signal import csd, welch
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, Jacobians, expected
-from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, WhitenedLog, Whitener, level, settled, whitener
+from imutool.diagnosis.estimation.gauss_newton import Fit
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, expected
+from imutool.diagnosis.estimation.whitening import Band, WhitenedImu, Whitener, level, settled, whitener
 from imutool.diagnosis.settings import BandSettings
 from imutool.errors import DataError
-from imutool.noise.bias_walk import WalkLikelihood, walk_likelihood
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects import vibration
@@ -131,23 +129,6 @@ def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"
     return residual
 
 
-def with_bias_walk(found: Fit) -> Fit:
-    """Fit with the random walk of the biases that its residual shows; itself without one."""
-    plain = [replace(log, whiten=replace(log.whiten, walk=None)) for log in found.logs]
-    walks = [np.zeros(log.pair.columns) for log in plain]
-    for k, (log, forward) in enumerate(zip(plain, found.passes, strict=True)):
-        jacobians = Jacobians([log.whiten], [forward], found.chosen)
-        for axes, steps, each in _walks(log, log.residual(forward.blocks), partial(jacobians.on_axis, 0)):
-            likely = sum((one.of_any_noise() for one in each), start=np.zeros(len(steps)))
-            best = _likeliest(likely)
-            if 2.0 * (likely[best] - likely[0]) > log.pair.settings.search.clearly_better:
-                walks[k][axes] = steps[best] * np.array([one.white()[best] for one in each])
-    if not any(walk.any() for walk in walks) and all(log.whiten.walk is None for log in found.logs):
-        return found
-    logs = [replace(log, whiten=replace(log.whiten, walk=walk)) for log, walk in zip(plain, walks, strict=True)]
-    return fit(logs, found.chosen, part=found.part)
-
-
 def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
     """Whether a line beside a simulation is coloured noise, which an autoregression smooths."""
     exact, chance = [log for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
@@ -162,57 +143,6 @@ def axis_squares(found: Fit) -> Axes:
     """Squares of white residuals by axis."""
     each = zip(found.logs, found.residuals, found.bias, strict=True)
     return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
-
-
-def squares_of_walk(found: Fit, like: Fit) -> float:
-    """Squares that random walks of the biases explain of a fit's residual.
-
-    They are twice the gain in log-likelihood; none where the noise of the logs has the walk already. `like` is the fit whose
-    derivatives serve, with the same effects and perhaps more.
-    """
-    gained, noise = 0.0, max(1.0, like.reduced_chi_square)
-    kept = [j for key in found.keys for j in range(*like.place(key).indices(len(like.prior)))]
-    for k, log in enumerate(found.logs if all(log.whiten.walk is None for log in found.logs) else ()):
-
-        def on_axis(axis: int, rows: Bool[np.ndarray, " n"], k: int = k) -> OnAxis:
-            where, J = like.jacobians.on_axis(k, axis, rows)
-            return where[np.isin(where, kept)], J[np.isin(where, kept)]
-
-        for _, steps, each in _walks(log, found.residuals[k], on_axis):
-            likely = sum((one.of_noise(noise) for one in each), start=np.zeros(len(steps)))
-            gained += 2.0 * noise * float(likely[_likeliest(likely)] - likely[0])
-    return gained
-
-
-def _likeliest(likely: Axes) -> int:
-    """Index of the likeliest walk; none where that is the fastest, for what is faster is a motion's misfit."""
-    best = int(np.argmax(likely))
-    return best if best < len(likely) - 1 else 0
-
-
-def _walks(
-    log: WhitenedLog,
-    residual: Float64[np.ndarray, "n k"],
-    on_axis: Callable[[int, Bool[np.ndarray, " n"]], OnAxis],
-) -> Iterator[tuple[Int64[np.ndarray, " a"], Float64[np.ndarray, " w"], list[WalkLikelihood]]]:
-    """Axes of each sensor of an IMU, which walk alike, steps of a walk from row to row, and their likelihood by axis."""
-    if not isinstance(log, WhitenedImu):
-        return
-    pair, own, every = log.pair, log.pair.settings.noise, log.whiten.every
-    t_s, row_s = pair.stamp_s[::every] - pair.stamp_s[0], pair.period_s * every
-    block_s = max(own.walk_mean_s, float(t_s[-1]) / own.walk_means)
-    corners_hz = np.geomspace(min(own.walk_cycles / t_s[-1], own.walk_hz), own.walk_hz, own.walk_corners)
-    steps = np.append(0.0, (2.0 * np.pi * corners_hz * row_s) ** 2)  # at the corner both noises have one density
-    known = pair.axes if pair.known is None else np.asarray(pair.known.all(axis=0))
-    for part in pair.signals.values():
-        found = dict[int, WalkLikelihood]()
-        for axis in [k for k in range(*part.indices(len(known))) if known[k]]:
-            rows = settled(pair.usable[::every, axis], log.whiten.order)
-            derivatives = np.concatenate([log.constants[rows, axis][None], on_axis(axis, rows)[1]])
-            block = (t_s[rows] / block_s).astype(int)
-            likely = walk_likelihood(residual[rows, axis], derivatives, block, steps * block_s / row_s)
-            found |= {} if likely is None else {axis: likely}
-        yield np.array(list(found), np.int64), steps, list(found.values())
 
 
 def ridge_fit(

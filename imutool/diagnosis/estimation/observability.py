@@ -28,7 +28,8 @@ NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", *LOW
 STEADY, WANDER = ("clock_offset", "clock_skew", "clock_jump"), "clock_wander"
 UNLISTED = (WANDER, "reference_smoothing")  # errors of poses: that a log cannot show them says nothing of the sensor
 PLAINER = {  # of one that is no better: another effect, and its parameters, by index
-    **{"gyro_bias_drift": ("temperature", range(3)), "accel_bias_drift": ("temperature", range(3, 6))},
+    **{f"gyro_bias_{course}": ("temperature", range(3)) for course in ("drift", "step")},
+    **{f"accel_bias_{course}": ("temperature", range(3, 6)) for course in ("drift", "step")},
     **{"gyro_scale_asymmetry": ("gyro_scale", range(3)), "accel_scale_asymmetry": ("accel_scale", range(3))},
     "gyro_hysteresis": ("gyro_delay", range(1)),
 }
@@ -155,8 +156,8 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[
 def _plainer(name: str, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
     """Effects that may stand for one: their free parameters, by index, and a start.
 
-    A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift beside a temperature of the
-    log, two gains of axes that hardly change their sign, three scales as one gravity within what the Earth has.
+    A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift or step of a bias beside a
+    temperature of the log, two gains of axes that hardly change their sign, three scales as one gravity within what Earth has.
     """
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}

@@ -17,13 +17,11 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaincc, gammainccinv, gammaln
 from scipy.stats import f as fisher
-from scipy.stats import norm, wilcoxon
-from scipy.stats import t as student
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
-from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, parameters_of, priors, with_value
-from imutool.diagnosis.estimation.noise_estimate import squares_of_walk
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen, parameters_of, priors, sets_in, with_value
+from imutool.diagnosis.estimation.trial.walking_bias import squares_of_walk
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.units import AXES
 
@@ -67,68 +65,10 @@ def gain_of(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, f
     without = fit(whole.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part=whole.part, iterations=iterations, near=whole)
     jumps = any(effect.jumps for effect, _ in without.chosen)  # what moves a signal a little wins single samples at an edge
     gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
-    walk = squares_of_walk(without, whole) - squares_of_walk(whole, whole) if iterations is None else 0.0
-    return gain, gain - max(0.0, walk)
-
-
-def first_refuted(fitted: Fit, first: int) -> int:
-    """Index of the first effect that unseen blocks refute; the number of effects if none is.
-
-    Blocks that this fit has not seen, and those that a fit of the others has not. Beside poses effects without a name have to
-    stand together, too: two that cancel gain much beside each other.
-    """
-    other, exact = fit(fitted.logs, fitted.chosen, part="held_out", near=fitted), all(log.pair.exact for log in fitted.logs)
-    nameless = [k for k, (effect, _) in enumerate(fitted.chosen) if effect.kind != "catalogue" and not exact]
-
-    def p_value(left_out: Sequence[int]) -> float:
-        both = [(one, without_effects(one, left_out, first), unseen) for one, unseen in ((fitted, other), (other, fitted))]
-        blocks = np.concatenate([held_out_gains(one, others, unseen.part) for one, others, unseen in both])
-        return min(held_out_p_value(blocks[:, 0]), prediction_p_value(blocks) if exact else 1.0)
-
-    for k in range(first, len(fitted.chosen)):
-        tested = [[k], nameless] if k in nameless and len(nameless) > 1 else [[k]]
-        if max(map(p_value, tested)) > fitted.logs[0].pair.settings.search.held_out_p_value:
-            return k
-    return len(fitted.chosen)
-
-
-def held_out_p_value(gained: Float64[np.ndarray, " b"]) -> float:
-    """p-value of the held-out improvement under H0, by Student's t or by robust ranks."""
-    if len(gained) < 3 or not gained.std():
-        return 1.0
-    z = gained.mean() / (gained.std(ddof=1) / np.sqrt(len(gained)))
-    ranks = float(wilcoxon(gained, alternative="greater").pvalue)  # also where one block asks a curve what it has never seen
-    return min(float(student.sf(z, len(gained) - 1)), ranks)
-
-
-def prediction_p_value(blocks: Float64[np.ndarray, "b 2"]) -> float:
-    """p-value of held-out noise following a prediction u under H0.
-
-    Then 2 u.n - |u|² has mean -|u|² and variance 4 |u|².
-    """
-    gain, size = blocks.sum(axis=0)
-    return float(norm.sf((gain + size) / (2.0 * np.sqrt(size)))) if size > 0 else 1.0
-
-
-def held_out_gains(fitted: Fit, others: Chosen, part: str) -> Float64[np.ndarray, "b 2"]:
-    """Squares that a fit gains over fewer effects, and those of its prediction, by block."""
-    out, block_s = [], fitted.logs[0].pair.settings.search.held_out_block_s
-    for log, forward, residual in zip(fitted.logs, fitted.passes, fitted.residuals, strict=True):
-        other = log.residual(ForwardPass(log.pair, others, forward).blocks, (forward.blocks, residual))
-        with_, without = (_white(log, one, part) for one in (residual, other))
-        block = np.floor(log.pair.stamp_s[:: log.whiten.every][log.rows(part)] / block_s).astype(int)
-        each = np.stack([(without**2).sum(1) - (with_**2).sum(1), ((without - with_) ** 2).sum(1)], axis=1)
-        names, inverse = np.unique(block, return_inverse=True)
-        out.append(np.stack([np.bincount(inverse, weights=column, minlength=len(names)) for column in each.T], axis=1))
-    return np.concatenate(out)
-
-
-def _white(log: WhitenedLog, residual: Float64[np.ndarray, "m k"], part: str) -> Float64[np.ndarray, "n k"]:
-    """White residuals of a part, with the best constant for that part."""
-    rows = log.rows(part)
-    residual = residual[rows]
-    constant = log.constants[rows]
-    return np.asarray(residual - constant * ((constant * residual).sum(0) / np.maximum((constant * constant).sum(0), 1e-300)))
+    if iterations is not None:
+        return gain, gain
+    explained, left = (squares_of_walk(one, whole, of_any_speed=whole.chosen[k][0].of_time) for one in (without, whole))
+    return gain, gain - max(0.0, explained - left)
 
 
 # ── robust covariance ──
@@ -203,7 +143,7 @@ def _dilution(
 
 def _begins(found: Fit) -> Bool[np.ndarray, " p"]:
     """Parameters that are onsets: nothing is smooth in them, so they are taken as they are."""
-    return np.array([parameter.begins for parameter in parameters_of(found.chosen)], dtype=bool)
+    return np.concatenate([np.zeros(0, bool), *(sets_in(effect) for effect, _ in found.chosen)])
 
 
 def _by_effect(found: Fit, by_blocks: Matrix, by_information: Matrix, shares: Sequence[Matrix], prior_blocks: float) -> Scatter:
@@ -291,10 +231,17 @@ def estimate_onsets(
     return found, spread
 
 
+def with_onsets_of_all_rows(fitted: Fit) -> Fit:
+    """Fit with onsets where all rows show them: fitted rows do not show one between them."""
+    if not any(sets_in(effect).any() for effect, _ in fitted.chosen):
+        return fitted
+    whole = fit(fitted.logs, fitted.chosen, part="all", near=fitted)
+    return fit(fitted.logs, with_onsets_of(fitted.chosen, whole.chosen), fitted.part, near=fitted, hold_onsets=True)
+
+
 def with_onsets_of(fitted: Chosen, whole: Chosen) -> Chosen:
-    """Fitted effects with the onsets of all rows: fitted rows do not show one between them."""
+    """Fitted effects with the onsets of all rows."""
     out = []
     for (effect, theta), (_, onsets) in zip(fitted, whole, strict=True):
-        begins = np.array([parameter.begins for parameter in effect.parameters])
-        out.append((effect, np.where(begins, onsets, theta)))
+        out.append((effect, np.where(sets_in(effect), onsets, theta)))
     return tuple(out)

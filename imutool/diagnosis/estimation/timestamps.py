@@ -14,6 +14,7 @@ from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation.aligned_log import DEFAULT, Pair
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.diagnosis.settings import TimestampSettings
+from imutool.inertial.stationary import white_noise
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
 from imutool.sensor.samples import SensorSamples
 from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
@@ -21,6 +22,7 @@ from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
 LEAST_VALUES = 3  # of a grid
 LEAST_ROWS = 100
+READ, NOISY = 0.999, 6.0  # of the readings are no glitch; deviations of a sample by which noise goes beyond a limit
 UNEVEN = "stamps jitter, samples do not"
 
 
@@ -39,9 +41,8 @@ def even(
         return _by_level(stamp_s, k, settings)
     counted = np.rint((since - phase) / period) - k
     steady = median_filter(counted, settings.median_samples, mode="nearest")
-    clear = (
-        np.abs((since - phase) / period - k - counted) < settings.clear_share
-    )  # a stamp well within its own period is taken at its word
+    # a stamp well within its own period is taken at its word
+    clear = np.abs((since - phase) / period - k - counted) < settings.clear_share
     missing = np.where(clear, counted, steady)
     missing = np.where(np.abs(missing - steady) > 0.5, steady, missing) if not clear.all() else counted
     slope, start = np.polyfit(k + missing, stamp_s, 1)
@@ -161,15 +162,16 @@ def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAU
 
 
 def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
-    """Saturation whose readings still carry noise: one candidate a sensor, bias included."""
+    """Saturation with noise on top, bias included: a sensor reads beyond it by noise alone."""
     candidates = []
     for k, signal in enumerate(SENSORS):
         if any(signal in limits(pair.real, pair.settings.timestamps) for pair in pairs):
             continue
         part = slice(3 * k, 3 * k + 3)
-        clip = _Clip(k, np.mean([b[part] for b in biases], axis=0))
-        most = float(max(np.abs(pair.real[:, part]).max() for pair in pairs))
-        limit = Parameter(f"{signal}_limit", UNITS[signal], most, positive=True, null_value=np.inf, step=1e-4)
+        clip, real = _Clip(k, np.mean([b[part] for b in biases], axis=0)), [pair.real[:, part] for pair in pairs]
+        most = float(max(np.abs(x).max() for x in real))
+        least = max(float(np.max(np.quantile(np.abs(x), READ) - NOISY * white_noise(x))) for x in real)
+        limit = Parameter(f"{signal}_limit", UNITS[signal], most, positive=True, null_value=np.inf, step=1e-4, least=least)
         text, starts = f"{signal} = clip({signal}, -L, L)", starts_at(*([share * most] for share in SHARES))
         effect = Effect("saturation", Stage.CONVERTER, (signal,), text, (limit,), "the limit is reached", clip, False, starts)
         candidates.append(replace(effect, variant=("", "accel")[k]))

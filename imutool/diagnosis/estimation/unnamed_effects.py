@@ -129,6 +129,7 @@ def _curve(variable: str, sensor: int, axis: int, splines: SplineBasis) -> Effec
         variable=variable,
         axis=axis,
         variant=f"{signal}.{AXES[axis]}({variable})",
+        of_time=variable == "t",
     )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from imutool.diagnosis.result import Diagnosis, Finding
 from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped
+from imutool.recording import GRAVITY_M_S2
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,12 @@ def _clock_jump(w: Words) -> str:
     return f"the clock of the recording jumps{how_far} at {w.main}"
 
 
+def _bias_step(w: Words) -> str:
+    """By how much, and when."""
+    when = f" at {w.rest[0]}" if w.rest else ""
+    return f"its bias steps by {w.main}{when}"
+
+
 def _driven(w: Words) -> str:
     return f"{w.it} follows {w.finding.driver or 'another channel of the log'} with {w.main.labelled}"
 
@@ -64,7 +72,33 @@ def _unknown(w: Words) -> str:
     curve = w.finding.curve
     if curve is not None:
         return f"{w.it} follows a smooth curve of {curve.variable} that has no name among the known effects"
-    return f"{w.finding.equation}, with {w.main.labelled}; this has no name among the known effects"
+    return (
+        f"{w.finding.equation}, with {w.main.labelled}; {_convention(w.finding) or 'this has no name among the known effects'}"
+    )
+
+
+CONVENTIONS = {  # gain of an axis that is off by nothing but a convention, by signal
+    **{("gyro", -1.0): "its sign is reversed", ("accel", -1.0): "its sign is reversed"},
+    ("gyro", 180.0 / math.pi): "so it is in deg/s instead of rad/s",
+    ("gyro", math.pi / 180.0): "so the other is in deg/s instead of rad/s",
+    ("accel", 1.0 / GRAVITY_M_S2): "so it is in g instead of m/s²",
+    ("accel", GRAVITY_M_S2): "so the other is in g instead of m/s²",
+}
+OF_CONVENTION = 0.03  # of such a gain: the scale of an uncalibrated sensor
+
+
+def _convention(finding: Finding) -> str:
+    """Convention that explains a term of an axis' own reading, empty without one."""
+    own = {"gyro": "omega", "accel": "f"}.get(finding.signal)
+    c = finding.parameters.get("c")
+    if c is None or finding.equation != f"{finding.signal}.{finding.axis} += c {own}_{finding.axis}":
+        return ""
+    told = (text for (signal, gain), text in CONVENTIONS.items() if signal == finding.signal and _near(1.0 + c.value, gain))
+    return next(told, "")
+
+
+def _near(gain: float, other: float) -> bool:
+    return abs(gain - other) < OF_CONVENTION * abs(other)
 
 
 def _mount_resonance(w: Words) -> str:
@@ -95,6 +129,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "accel_quadratic": "{w.it} bends with the square of the specific force, by {w.main}",
     "gyro_bias_drift": "its bias drifts by {w.main} in all",
     "accel_bias_drift": "its bias drifts by {w.main} in all",
+    "gyro_bias_step": _bias_step,
+    "accel_bias_step": _bias_step,
     "rate_curve": "{w.it} errs by a curve of the rate, with {w.main}",
     "vibration_rectification": "{w.it} turns vibration into a constant, with {w.main}",
     "lever_arm": "{w.it} sits {w.main} from the tracked point",

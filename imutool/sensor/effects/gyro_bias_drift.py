@@ -44,6 +44,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
         linear=False,
         starts=starts,
         trained=True,
+        of_time=True,
     )
 
 

@@ -19,9 +19,10 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.noise_estimate import whitened, with_bias_walk
+from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
+from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
 from imutool.sensor import catalogue
@@ -93,6 +94,33 @@ def walking(effects: dict[str, list[float]], seed: int) -> Pair:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_bias_that_walks_is_no_drift(seed: int) -> None:
     assert names(asked(walking({}, seed), beyond=False)) == []
+
+
+@pytest.mark.parametrize(
+    ("sensor", "corner_hz", "seed"), [("gyro", 0.1, 5), ("accel", 0.05, 1), ("both", 0.1, 5), ("both", 1.2, 3)]
+)
+def test_a_bias_that_walks_is_no_step_however_fast_and_whatever_the_other_sensor_does(
+    sensor: str, corner_hz: float, seed: int
+) -> None:
+    felt = planted.rich(seed + 1, WALK_S)
+    steps = 2.0 * np.pi * corner_hz / planted.RATE_HZ * planted.noise(len(felt.t_s), seed + 1000)
+    steps *= np.repeat([sensor != "accel", sensor != "gyro"], 3)
+    assert names(asked(planted.pair(felt, {}, seed, added=np.cumsum(steps, axis=0)), beyond=False)) == []
+
+
+STEPS = {
+    "in the middle": {"gyro_bias_step": [0.01, -0.005, 0.0, 13.3]},
+    "before all held-out time": {"accel_bias_step": [0.0, 0.1, 0.0, 7.7]},
+    "within held-out time, beside an arm": {"accel_bias_step": [0.03, 0.0, 0.0, 9.0], "lever_arm": [0.1, 0.0, 0.2]},
+    "beside a drift": {"gyro_bias_step": [0.005, 0.0, 0.0, 13.3], "gyro_bias_drift": [0.02, 0.02, -0.03, 8.0]},
+}
+
+
+@pytest.mark.parametrize("case", STEPS)
+def test_a_step_of_a_bias_is_found_wherever_it_lies(case: str) -> None:
+    found = asked(planted.pair(planted.rich(), STEPS[case], 3), beyond=False)
+    assert sorted(names(found)) == sorted(STEPS[case])
+    assert all(sure(found, name, theta) for name, theta in STEPS[case].items())
 
 
 def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> None:

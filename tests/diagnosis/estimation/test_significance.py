@@ -9,10 +9,11 @@ import pytest
 from scipy.signal import lfilter
 from support import planted
 
-from imutool.diagnosis.estimation import significance
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.estimation.significance import Scatter, first_refuted, log_p_value, scatter
+from imutool.diagnosis.estimation.significance import Scatter, log_p_value, scatter
+from imutool.diagnosis.estimation.trial import unseen_time
+from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 
 FELT = planted.shaken(duration_s=45.0)
@@ -86,12 +87,12 @@ def test_beside_poses_effects_without_a_name_must_not_cancel_each_other(monkeypa
     )
     exact = replace(beside, chosen=chosen, logs=(planted.weighed(pair),))
 
-    def gains(now: Fit, others: Chosen, part: str) -> np.ndarray:
+    def gains(now: Fit, others: Chosen, part: str, constant_of: str) -> np.ndarray:
         sign = -1.0 if len(now.chosen) - len(others) > 1 else 1.0
         return np.stack([sign * np.arange(9.0, 13.0), np.ones(4)], axis=1)
 
-    monkeypatch.setattr(significance, "held_out_gains", gains)
-    monkeypatch.setattr(significance, "fit", lambda logs, *rest, **options: beside)
+    monkeypatch.setattr(unseen_time, "held_out_gains", gains)
+    monkeypatch.setattr(unseen_time, "fit", lambda logs, *rest, **options: beside)
     assert first_refuted(replace(beside, chosen=chosen), 0) == 1
     assert first_refuted(replace(beside, chosen=chosen[:2]), 0) == 2, "one alone cancels nothing"
     assert first_refuted(exact, 0) == 3

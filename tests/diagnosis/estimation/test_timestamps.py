@@ -10,6 +10,8 @@ from support import planted
 
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.observability import beyond_the_band
+from imutool.diagnosis.settings import SearchSettings
 
 N = 2400
 SURE = 4.0
@@ -194,6 +196,17 @@ def test_the_same_reading_again_and_again_is_no_limit_where_no_more_was_expected
     one = replace(planted.pair(planted.rich()), real=real, stamp_s=t)
     rng = np.random.default_rng(3)
     assert timestamps.saturated([one], [real + 1e-3 * rng.normal(size=real.shape)], 50) == []
+
+
+def test_a_soft_limit_is_one_that_readings_pass_by_no_more_than_noise() -> None:
+    """Readings in another unit are small, and clipping what was expected at their size would explain most of them."""
+    limit = 0.8
+    one, there = clipped_pair(limit)
+    noisy = replace(one, real=one.real + planted.noise(len(one.real), 8))
+    in_g = replace(one, real=there / 9.81)
+    for pair, gyro_limit, is_answer in ((noisy, limit, True), (in_g, 0.3 * np.abs(in_g.real[:, :3]).max(), False)):
+        gyro, _ = timestamps.soft_limits([pair], [np.zeros(6)])
+        assert beyond_the_band(gyro, np.array([gyro_limit]), [planted.weighed(pair)], SearchSettings()) is not is_answer
 
 
 # ── nothing of it ──

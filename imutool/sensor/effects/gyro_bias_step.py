@@ -1,0 +1,76 @@
+"""Step of the gyro's bias: + A from one moment on.
+
+A shock, a jump of the temperature or a new initialisation shifts a bias: a change point (Page, Biometrika 42, 1955). Every
+bias also walks, and a walk has its steepest moment, too: a step is the answer only where a jump at one time is likelier than
+the likeliest walk (`imutool.noise.bias_walk`), for as many times as there are samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.units import Sensor
+
+TREND_DEGREES = (0, 2)  # of time, beside which a step is looked for: a bias that also drifts hides when it steps
+EDGE_S = 1.0  # of the log at both ends, where a few wrong samples look like a step
+INDEPENDENT = 1e-9  # relative to the largest: smaller singular values are combinations of others
+
+
+def bias_step(sensor: Sensor, unit: str, plausible: float) -> Effect:
+    """Step of either sensor: A, then the time of the step (s from the log's start)."""
+
+    def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
+        return samples.with_added(sensor, np.outer(samples.stamp_s >= theta[3], theta[:3]))
+
+    def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+        error = residual(motion, samples)[0 if sensor == "gyro" else 1]
+        ideal, t_s = motion.sample(samples.stamp_s, samples.stamp_s), samples.stamp_s
+        followed = _followed(ideal)
+        trends = (np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1) for degree in TREND_DEGREES)
+        return [_likeliest(t_s, error, np.concatenate([trend, followed], axis=1)) for trend in trends]
+
+    return Effect(
+        f"{sensor}_bias_step",
+        Stage.SENSOR,
+        (sensor,),
+        f"{sensor} += A from t_step on",
+        (*each_axis(unit, plausible), Parameter("t_step", "s", 30.0, begins=True)),
+        "the log goes on for some seconds before and after",
+        forward,
+        linear=False,
+        starts=starts,
+        alternatives=lambda samples: len(samples.stamp_s),
+        of_time=True,
+    )
+
+
+def _followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
+    """What most other errors follow: both signals (scale, mount), changes of both (clock), products of rates (an arm)."""
+    products = np.stack([ideal.gyro[:, i] * ideal.gyro[:, j] for i in range(3) for j in range(i + 1)], axis=1)
+    return np.concatenate(
+        [ideal.gyro, ideal.accel, ideal.alpha, np.gradient(ideal.accel, ideal.stamp_s, axis=0), products], axis=1
+    )
+
+
+def _likeliest(t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"], beside: Float64[np.ndarray, "n q"]) -> Theta:
+    """The step, between two samples, that explains most of an error beside some columns, each axis by what is left there.
+
+    In least squares a further column gains (left' x)² / x' x, both less their projection on the others (Frisch and Waugh,
+    Econometrica 1933); for all columns that set in at one time these are sums from that time on.
+    """
+    left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
+    basis = left[:, singular > INDEPENDENT * singular[0]]
+    rest = error - basis @ (basis.T @ error)
+    after = np.cumsum(basis[::-1], axis=0)[::-1][1:]
+    own = np.arange(len(t_s) - 1, 0, -1) - (after**2).sum(axis=1)
+    sums = np.cumsum(rest[::-1], axis=0)[::-1][1:]
+    size = sums / np.maximum(own, 1.0)[:, None]
+    gain = (sums * size / np.maximum((rest**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=1)
+    row = int(np.argmax(np.where((t_s[1:] > t_s[0] + EDGE_S) & (t_s[:-1] < t_s[-1] - EDGE_S), gain, 0.0)))
+    return np.append(size[row], (t_s[row] + t_s[row + 1]) / 2.0)
+
+
+EFFECT = bias_step("gyro", "rad/s", 0.02)
