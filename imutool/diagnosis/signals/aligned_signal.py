@@ -22,6 +22,7 @@ from imutool.diagnosis.signals.ideal_signal import (
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.inertial.stationary import white_noise
+from imutool.inertial.wiener import NoiseLeft
 from imutool.mcap_io.fields import Fields
 from imutool.recording import nanoseconds, seconds
 from imutool.sensor.effect import SignalState
@@ -212,6 +213,7 @@ def _aligned(
         kind=pair.kind,
         lag_s=lag_s,
         sim_density=density,
+        noise_left=NoiseLeft(np.array([0.0, 0.5 / float(np.median(np.diff(t_real)))]), np.stack([density] * 2)),
         shares_epoch=shares_epoch,
         clock_std_s=pair.clock_std_s,
         settings=settings,

@@ -176,7 +176,7 @@ def _selected(now: _Prepared) -> Selection:
     log, candidates, always = now.log, now.candidates, now.always
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
-    driven = [effect for k in columns for effect in common.driven(signal, k)]
+    driven = [*common.driven(signal)]
     named = _refined(log, select_effects([log], candidates, [driven], always=always), signal.settings)
     if (resting := _beside_stiction(now, named, driven)) is not None:
         named, candidates = resting
