@@ -114,8 +114,7 @@ def _of_topic(
             sides = (metres(mine, other), metres(other, other)) if kind == "gnss" else (mine, other)
             yield SignalPair.of_columns(topic, done, kind, (unit,) * 3, *sides, _attitude(real))
     else:
-        vectors = field_vectors(topic, {path: values for path, values in mine.items() if path in other})
-        for names in vectors:
+        for names in field_vectors(topic, mine, other):
             done = (*done, *names)
             yield SignalPair.of_columns(topic, names, "magnetic", ("",) * 3, mine, other, _attitude(real))
     for path in mine:

@@ -10,10 +10,11 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion
+from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion, stacked
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
+from imutool.sensor.channels import is_quantity
 from imutool.sensor.robot_effects.joint_dynamics import identified
 
 FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
@@ -27,7 +28,7 @@ USUAL = {"magnetic": 5e-5, "pressure": 1e5}
 """Size in the message's own unit (T, Pa), which tells what log is in another."""
 
 
-MAGNETIC = re.compile(r"magn|(?<![a-z])mag(?![a-z])|compass")  # in the name of a field, or of its topic
+MAGNETIC = re.compile(r"magnet|(?<![a-z])mag(?![a-z])|compass")  # in the name of a field, or of its topic
 PRESSURE = re.compile(r"press[^.]*(\.(data|value))?$")  # in its own, or in that of a topic with one number
 UNITS = {
     "magnetic": {"T": 1.0, "G": 1e-4, "µT": 1e-6, "mG": 1e-7, "nT": 1e-9},
@@ -37,15 +38,17 @@ SIZES = {"magnetic": (1.5e-5, 1.3e-4), "pressure": (3e4, 1.15e5)}
 """Of the Earth's field with some hard iron (T), of its air up to 9 km (Pa)."""
 
 
-def field_vectors(topic: str, paths: Mapping[str, Fields]) -> Iterator[tuple[str, ...]]:
-    """Three components of a magnetic field in a message of any type: an array of three, or x, y and z."""
-    for path in paths:
+def field_vectors(topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fields]) -> Iterator[tuple[str, ...]]:
+    """Paths of magnetic fields in messages of any type: an array of three, or x, y and z, as large as the Earth's field."""
+    for path in real:
         for first, others in (("[0]", ("[1]", "[2]")), (".x", (".y", ".z"))):
             stem = path.removesuffix(first)
             triple = (path, *(f"{stem}{other}" for other in others))
-            named = MAGNETIC.search(f"{topic}.{stem}".lower()) is not None
-            if stem != path and named and all(name in paths for name in triple) and f"{stem}[3]" not in paths:
-                yield triple
+            named = stem != path and MAGNETIC.search(f"{topic}.{stem}".lower()) is not None and f"{stem}[3]" not in real
+            if named and all(path in side and is_quantity(side[path]) for path in triple for side in (real, sim)):
+                columns = (stacked([side[path] for path in triple])[1] for side in (real, sim))
+                if None not in [_unit("magnetic", values) for values in columns]:
+                    yield triple
 
 
 def is_air(name: str, values: Fields) -> bool:
