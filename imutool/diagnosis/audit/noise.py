@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dct
 from scipy.optimize import minimize_scalar
-from scipy.signal import spectrogram, welch
+from scipy.signal import spectrogram
 
 from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
@@ -189,8 +189,12 @@ def _bandwidth(
 
 
 def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
-    """Power that is left from band to band, towards a Nyquist frequency."""
-    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
+    """Power that is left from band to band, towards a Nyquist frequency, in the calm quarter of a log."""
+    f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=min(SEGMENT, len(x)), axis=0)
+    loud = parts[f_hz > BANDS[0][0] * nyquist_hz].sum(axis=0)
+    power = np.stack(
+        [p[:, q <= np.quantile(q, 0.25)].mean(axis=1) for p, q in zip(parts.swapaxes(0, 1), loud, strict=True)], axis=1
+    )
     low, middle, near = (float(np.median(power[(f_hz > a * nyquist_hz) & (f_hz < b * nyquist_hz)])) for a, b in BANDS)
     return middle / max(low, 1e-300), near / max(middle, 1e-300)
 
