@@ -254,6 +254,15 @@ def test_a_lag_and_a_delay_beside_a_simulation_without_noise_are_both_named() ->
     within(found, "delay", {"delay": 0.03})
 
 
+@pytest.mark.parametrize("seed", seeds(3))
+def test_the_start_of_a_lag_is_unknown_and_makes_no_drift(seed: int) -> None:
+    """Both logs begin together: the lag came in from a motion that nobody logged."""
+    x, rng, t = Motion(seed), np.random.default_rng(seed), np.arange(3000) / 50.0
+    found = compared(fields(t, x.low(t, 0.8) + 0.002 * rng.normal(size=len(t))), fields(t, x(t)), {})
+    assert names(found) == {"low_pass"}
+    within(found, "low_pass", {"f_c": 0.8})
+
+
 def test_what_drives_a_field_has_a_direction() -> None:
     """The current of a motor beside a magnetometer: one lag, a gain for each axis."""
     t, rng, gains = 3.0 + np.arange(3000) / 50.0, np.random.default_rng(1), np.array([2e-7, -1e-7, 3e-7])
