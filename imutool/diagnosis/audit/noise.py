@@ -69,7 +69,7 @@ class Expected:
 
 
 def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndarray, " k"]:
-    """White noise of a sample (deviation) from spectra where no body moves, in the calm quarter of a log.
+    """White noise of a sample (deviation) at high frequency, in the calm quarter of a log.
 
     The median of n exponential powers is ln 2 of their mean, and scatters by 1 / sqrt(n) of that. Steps and impacts are louder.
     """

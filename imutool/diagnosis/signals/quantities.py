@@ -39,7 +39,10 @@ SIZES = {"magnetic": (1.5e-5, 1.3e-4), "pressure": (3e4, 1.15e5)}
 
 
 def field_vectors(topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fields]) -> Iterator[tuple[str, ...]]:
-    """Paths of magnetic fields in messages of any type: an array of three, or x, y and z, as large as the Earth's field."""
+    """Paths of magnetic fields in messages of any type.
+
+    Each is an array of three, or x, y and z, is named a field or compass, and is as large as the Earth's field.
+    """
     for path in real:
         for first, others in (("[0]", ("[1]", "[2]")), (".x", (".y", ".z"))):
             stem = path.removesuffix(first)
@@ -64,7 +67,7 @@ def _unit(kind: str, values: Float64[np.ndarray, "n k"]) -> str | None:
 
 
 def in_si(pair: SignalPair) -> tuple[SignalPair, str]:
-    """A field or pressure of unknown unit in tesla or pascal, by the size that it has on the Earth."""
+    """Field or pressure of unknown unit in tesla or pascal, by the size that it has on Earth."""
     if any(pair.units) or pair.kind not in UNITS:
         return pair, ""
     units = [_unit(pair.kind, values) for values in (pair.real, pair.sim)]

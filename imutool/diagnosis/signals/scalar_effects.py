@@ -265,7 +265,10 @@ class _Driven:
 
 
 def driven(signal: AlignedSignal) -> Iterator[Effect]:
-    """Effects driven by each other channel, but for copies of a column: on one column, or on a vector as a whole."""
+    """Effects driven by each other channel, on one column or on a vector as a whole.
+
+    A copy of a column drives nothing.
+    """
     parts = [range(signal.columns)] if signal.kind in VECTORS else [range(k, k + 1) for k in range(signal.columns)]
     for name, (t_s, values) in sorted(signal.ideal.channels.items()):
         channel = np.interp(signal.stamp_s, t_s, values)
