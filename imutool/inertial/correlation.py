@@ -67,3 +67,9 @@ def _over(x: Column, first: Int64[np.ndarray, " l"], last: Int64[np.ndarray, " l
     """Sums of x from first to last."""
     total = np.concatenate([[0.0], np.cumsum(x)])
     return np.asarray(total[last] - total[first])
+
+
+def time_ahead_s(x: Float64[np.ndarray, "n ..."], y: Float64[np.ndarray, "n ..."], t_s: Float64[np.ndarray, " n"]) -> float:
+    """Time (s) by which columns y come before columns x that are alike."""
+    slope = np.gradient(x, t_s, axis=0) / y.std(axis=0)
+    return float(((y - x) / y.std(axis=0) * slope).sum() / max(float((slope**2).sum()), 1e-300))

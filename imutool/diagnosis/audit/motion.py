@@ -7,7 +7,8 @@ being 1, 1 and 0 in a right simulation::
     accel = P (m R^T a_w - k R^T g_w - c omega x v + alpha x r + omega x (omega x r) - tau_a R^T j_w + tau_f omega x f) + b
     gyro = P (omega - tau_g alpha) + b
 
-tau_a delays the acceleration alone (a difference of velocities), tau_f the attitude in which it is given.
+tau_a delays the acceleration alone (a difference of velocities), tau_f the attitude in which it is given. Samples and parts are
+compared in the band that the smoothed poses show: what contacts shake above it would be taken for a part that is like it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
@@ -32,6 +34,8 @@ Vectors = Float64[np.ndarray, "n 3"]
 Matrix = Float64[np.ndarray, "3 3"]
 JERK_S = 1e-3  # half of the step of a central difference
 BLOCK_S = 2.0  # of the robust covariance
+SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
+LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
 MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
 BIAS_RIDGE = 1e-6  # of a bias: a body that stays level shows it and gravity alike, and gravity is the larger
 CLEARLY = 0.5  # of the squares of the body frame and its axes, up to which others are chosen
@@ -40,9 +44,9 @@ CERTAIN = 6.0  # standard deviations
 NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
 LEAST_DELAY = 0.05  # of a sample period: less is rounding
 LEAST_GYRO_DELAY = 0.3  # of a sample period: half of a finer step is that of a semi-implicit integrator
+HALF = 0.6  # of a delay by one step: half of it, and errors
 PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
-LEAST_ARM_M = 5e-3
-LEAST_S = 5.0
+LEAST_ARM_M, LEAST_S = 5e-3, 5.0
 NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
 
 
@@ -60,10 +64,16 @@ class Kinematics:
     a_w: Vectors
     j_w: Vectors
     period_s: float
+    band_hz: float
 
     def to_body(self, x_w: Vectors) -> Vectors:
         """World vectors in the body frame."""
         return np.asarray(np.einsum("nji,nj->ni", self.R_wb, x_w))
+
+    def shown(self, x: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ..."]:
+        """Columns in the band of the motion that the poses show, without delay."""
+        share = 2.0 * self.band_hz * self.period_s  # of Nyquist
+        return x if share >= 1.0 else np.asarray(sosfiltfilt(butter(ORDER, share, output="sos"), x, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,27 +87,33 @@ class KinematicFit:
 
 
 def kinematics(log: Recording) -> Kinematics:
-    """Samples within the longest stretch of a log's poses.
+    """Samples within all stretches of a log's poses.
 
     Raises:
         DataError: less than five seconds of poses that can be differentiated.
     """
-    motion, imu = smooth_motion(log.truth), log.imu
-    stretch = max(motion.stretches, key=lambda part: part.duration_s)
+    motion, imu, step_ns = smooth_motion(log.truth), log.imu, round(JERK_S * 1e9)
     since_s = (imu.t_ns - motion.start_ns) * 1e-9
-    rows = (since_s > stretch.start_s + JERK_S) & (since_s < stretch.end_s - JERK_S)
-    t_ns = imu.t_ns[rows]
-    if stretch.duration_s < LEAST_S or rows.sum() < LEAST_S / imu.period_s:
+    used, parts = np.zeros(len(imu), bool), list[list[Vectors]]()
+    for stretch in motion.stretches:
+        rows = (since_s > stretch.start_s + JERK_S) & (since_s < stretch.end_s - JERK_S)
+        if rows.any():
+            at, before, after = (stretch.trajectory.at(imu.t_ns[rows] + shift) for shift in (0, -step_ns, step_ns))
+            R_wb = Rotation.from_quat(at.q_wb_wxyz, scalar_first=True).as_matrix()
+            j_w = (after.a_w - before.a_w) / (2.0 * JERK_S)
+            parts.append([R_wb, at.omega_b, at.alpha_b, at.v_w, at.a_w, j_w])
+            used |= rows
+    if used.sum() < LEAST_S / imu.period_s:
         raise DataError(
             "its poses cover too little", where=log.name, expected=f"{LEAST_S:g} s of poses without a hole or an impact"
         )
-    step_ns = round(JERK_S * 1e9)
-    at, before, after = (stretch.trajectory.at(t_ns + shift) for shift in (0, -step_ns, step_ns))
-    R_wb = Rotation.from_quat(at.q_wb_wxyz, scalar_first=True).as_matrix()
-    j_w = (after.a_w - before.a_w) / (2.0 * JERK_S)
-    t_s = np.asarray((t_ns - t_ns[0]) * 1e-9, dtype=np.float64)
-    gyro, accel = imu.gyro[rows], imu.accel[rows]
-    return Kinematics(t_s, gyro, accel, R_wb, at.omega_b, at.alpha_b, at.v_w, at.a_w, j_w, imu.period_s)
+    t_s = np.asarray((imu.t_ns[used] - imu.t_ns[used][0]) * 1e-9, dtype=np.float64)
+    R_wb, omega, alpha, v_w, a_w, j_w = (np.concatenate(each) for each in zip(*parts, strict=True))
+    longest = max(motion.stretches, key=lambda stretch: stretch.duration_s)
+    band_hz = max(SHOWN * min(longest.cutoff_hz), LEAST_BLOCK / BLOCK_S)
+    return Kinematics(
+        t_s, imu.gyro[used], imu.accel[used], R_wb, omega, alpha, v_w, a_w, j_w, period_s=imu.period_s, band_hz=band_hz
+    )
 
 
 def kinematic_fit(k: Kinematics) -> KinematicFit:
@@ -160,12 +176,17 @@ def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[Faul
     """Delays of the gyro, of the acceleration and of its attitude, in sample periods.
 
     A semi-implicit integrator makes all velocities late alike, by half of its step. So the acceleration counts from the gyro
-    where the gyro is late by a part of a step, unless both are differences of explicit states.
+    where the gyro is late by a part of a step, unless both are differences of explicit states. No difference and no integrator
+    makes the attitude late: where it is, a step of the physics lies between reading and stamp, however short.
     """
     gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
     steps = {"gyro": _delay(gyro, period_s, LEAST_GYRO_DELAY), "accel": _delay(accel, period_s, LEAST_DELAY)}
     together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
     whole = together and steps["accel"] in ("step_delay", "early_stamps")
+    if abs(attitude.value) >= LEAST_DELAY * period_s and _clear(attitude) and _is_late_alike(accel, attitude):
+        whole = together = True
+        name = "step_delay" if attitude.value > 0.0 else "early_stamps"
+        steps |= {signal: name for signal, tau in (("gyro", gyro), ("accel", accel)) if _is_late_alike(tau, attitude)}
     if abs(gyro.value) < PART * period_s and steps["gyro"] != steps["accel"] and not whole:
         accel = Estimate(accel.value - gyro.value, float(np.hypot(accel.std, gyro.std)), "-")
         steps["accel"] = _delay(accel, period_s, LEAST_DELAY)
@@ -181,6 +202,11 @@ def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[Faul
             tau = late[signal]
             out.append(found(kind, signal, delay=_with_unit(tau, "s"), step=Estimate(2.0 * tau.value, 2.0 * tau.std, "s")))
     return out
+
+
+def _is_late_alike(tau: Estimate, attitude: Estimate) -> bool:
+    """Whether a signal is late as its attitude is, but for half a step of an integrator."""
+    return abs(tau.value - attitude.value) < HALF * abs(attitude.value) + 3.0 * float(np.hypot(tau.std, attitude.std))
 
 
 def _delay(tau: Estimate, period_s: float, least: float) -> str:
@@ -249,10 +275,10 @@ def _squares(y: Vectors, x: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) ->
 def _solved(
     k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"], ideal: Float64[np.ndarray, " p"]
 ) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"], Vectors]:
-    """Coefficients with deviations by blocks of two seconds, and the residual; Huber weights against shocks."""
+    """Coefficients with deviations by blocks of two seconds, and the whole residual; Huber weights against shocks."""
     p = x.shape[2]
-    A = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2)
-    target = y - x @ ideal
+    whole = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2)
+    A, target = k.shown(whole), k.shown(y - x @ ideal)
     size = np.sqrt((A**2).sum(axis=(0, 1)))
     size[size < 1e-9 * size.max()] = np.inf
     A = A / size
@@ -271,4 +297,4 @@ def _solved(
     std = np.sqrt((half**2).sum(axis=1) * len(scores) / max(len(scores) - 2, 1)) / size
     unseen = ~np.isfinite(size)
     std[unseen] = np.inf
-    return ideal + (theta / size)[:p], std[:p], np.asarray(left)
+    return ideal + (theta / size)[:p], std[:p], np.asarray(y - x @ ideal - whole @ (theta / size))

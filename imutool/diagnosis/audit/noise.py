@@ -6,12 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import welch
-from scipy.stats import chi2
+from scipy.fft import dct
+from scipy.optimize import minimize_scalar
+from scipy.signal import spectrogram
 
 from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
-from imutool.diagnosis.audit.spectral_lines import SpectralLine
+from imutool.diagnosis.audit.spectral_lines import HANN, SpectralLine
 from imutool.diagnosis.estimation.timestamps import grid, limits
 from imutool.diagnosis.result import Estimate
 from imutool.noise.datasheet import Noise
@@ -34,9 +35,11 @@ CONSEQUENCES = {
 }
 LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
 SEGMENT = 1024
+QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
 REST = 20  # equal samples in a row
-WALK_BLOCKS, WALK_P_VALUE, WALK_FACTOR = 8, 1e-4, 4.0  # blocks of a log; the walk has to be so many times the white noise
+WALK_PARTS, WALK_P_VALUE = 512, 1e-4  # cosines over a log
+WALK_SHARES, WALKS = np.geomspace(0.03, 1.0, 8), 2.0  # of the expected walk; log likelihood from which one is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +69,15 @@ class Expected:
 
 
 def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndarray, " k"]:
-    """White noise of a sample (deviation) from the spectrum's median where no body moves."""
-    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
-    return np.asarray(np.sqrt(np.median(power[(f_hz > 0.25 * rate_hz) & (f_hz < 0.48 * rate_hz)], axis=0) * rate_hz / 2.0))
+    """White noise of a sample (deviation) at high frequency, in the calm quarter of a log.
+
+    The median of n exponential powers is ln 2 of their mean, and scatters by 1 / sqrt(n) of that. Steps and impacts are louder.
+    """
+    f_hz, _, power = spectrogram(x, rate_hz, window="hann", nperseg=min(SEGMENT, len(x)), axis=0)
+    band = (f_hz > 0.25 * rate_hz) & (f_hz < 0.48 * rate_hz)
+    levels = np.median(power[band], axis=0)
+    quarter = np.log(2.0) - QUARTILE * np.sqrt(HANN / band.sum()) * (levels.shape[-1] > 1)
+    return np.asarray(np.sqrt(np.quantile(levels, 0.25, axis=-1) / quarter * rate_hz / 2.0))
 
 
 def noise_faults(
@@ -92,7 +101,8 @@ def noise_faults(
             if reference.samples is not None and reference.rate_hz is not None:
                 out += _clipping(sensor, samples[:, part], reference.samples[:, part])
                 out += _digits(sensor, samples[:, part], reference.samples[:, part])
-                out += _bandwidth(sensor, residual[:, part], rate_hz, reference.samples[:, part], reference.rate_hz)
+                sims = (residual[:, part], samples[:, part])
+                out += _bandwidth(sensor, sims, rate_hz, reference.samples[:, part], reference.rate_hz)
     untold = [line for line in lines if line.cause == "unknown" and not _follows("step_lines", line.sensor, out)]
     return [fault for fault in out if not _follows(fault.fault, fault.signal, out)], untold
 
@@ -122,20 +132,24 @@ def _density(sensor: Sensor, own: float, rate_hz: float, density: float, real_hz
 def _walk(
     sensor: Sensor, residual: Float64[np.ndarray, "n 3"], rate_hz: float, own: float, walk: Float64[np.ndarray, "3"]
 ) -> Iterator[FaultFound]:
-    """A bias that never walks, where the expected walk would stand out of the white noise.
+    """A bias that never walks: the slow parts of the residual are too small for the expected walk.
 
-    Neighbouring means over T differ by 2 N² / T + 2/3 K² T in variance, of a density N and a walk K.
+    Cosine transforms of white noise of a density N and a walk K have independent parts, of variances N² and K² / (2 pi f)² a
+    unit of frequency. By the likelihood ratio of both, each part's square counts by their ratio. p is Chernoff's bound of that
+    sum, min over s of exp(s S) prod (1 + 2 s ratio)^(-1/2). A walk that is only smaller is likelier than none, and no fault.
     """
-    count = len(residual) // WALK_BLOCKS
-    T = count / rate_hz
-    white = 2.0 * own**2 / count
-    drift = 2.0 / 3.0 * walk**2 * T
-    if not np.isfinite(walk).all() or not (drift > WALK_FACTOR * white).all():
+    n = len(residual)
+    k = np.arange(1, min(WALK_PARTS, n))
+    drift = (walk**2 / rate_hz) / (2.0 * np.sin(0.5 * np.pi * k / n))[:, None] ** 2
+    ratio = drift / max(own, 1e-300) ** 2
+    if not np.isfinite(ratio).all() or not (walk > 0.0).all():
         return
-    means = residual[: WALK_BLOCKS * count].reshape(WALK_BLOCKS, count, 3).mean(axis=1)
-    squares = (np.diff(means, axis=0)[::2] ** 2 / (white + drift)).sum()  # every other, which are independent
-    freedom = 3 * len(np.diff(means, axis=0)[::2])
-    if chi2.cdf(squares, freedom) < WALK_P_VALUE:
+    squares = dct(residual, axis=0, norm="ortho")[k] ** 2 / max(own, 1e-300) ** 2
+    weighed = float((squares / (1.0 + ratio) * ratio).sum())
+    least = minimize_scalar(lambda s: np.exp(s) * weighed - 0.5 * np.log1p(2.0 * np.exp(s) * ratio).sum(), bracket=(-10.0, 0.0))
+    smaller = ratio * WALK_SHARES[:, None, None] ** 2
+    walks = 0.5 * (squares * smaller / (1.0 + smaller) - np.log1p(smaller)).sum(axis=(1, 2)).max()  # log likelihood over none
+    if float(least.fun) < np.log(WALK_P_VALUE) and walks < WALKS:
         density = float(np.median(walk))
         yield found("bias_never_walks", sensor, expected_walk=Estimate(density, 0.0, f"{UNITS[sensor]}/s/√Hz"))
 
@@ -156,18 +170,31 @@ def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.nd
 
 
 def _bandwidth(
-    sensor: Sensor, sim: Float64[np.ndarray, "n 3"], sim_hz: float, real: Float64[np.ndarray, "m 3"], real_hz: float
+    sensor: Sensor,
+    sims: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]],
+    sim_hz: float,
+    real: Float64[np.ndarray, "k 3"],
+    real_hz: float,
 ) -> Iterator[FaultFound]:
-    """White noise near the recording's Nyquist frequency, where the recording's has fallen."""
+    """White noise near the recording's Nyquist frequency, where the recording's has fallen.
+
+    `sims` are what the motion leaves of the simulation, and all of it: where a body moves in these bands, a fall is that of
+    its motion.
+    """
     nyquist_hz = min(sim_hz, real_hz) / 2.0
-    (sim_middle, sim_near), (middle, near) = (_left(x, hz, nyquist_hz) for x, hz in ((sim, sim_hz), (real, real_hz)))
-    if sim_middle * sim_near > WHITE and middle * near < FALLS and max(middle, near) < STEP:
+    white = all(middle * near > WHITE for middle, near in (_left(x, sim_hz, nyquist_hz) for x in sims))
+    middle, near = _left(real, real_hz, nyquist_hz)
+    if white and middle * near < FALLS and max(middle, near) < STEP:
         yield found("bandwidth_absent", sensor, left=Estimate(middle * near, 0.1 * middle * near, "-"))
 
 
 def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
-    """Power that is left from band to band, towards a Nyquist frequency."""
-    f_hz, power = welch(x, rate_hz, nperseg=min(SEGMENT, len(x)), axis=0)
+    """Power that is left from band to band, towards a Nyquist frequency, in the calm quarter of a log."""
+    f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=min(SEGMENT, len(x)), axis=0)
+    loud = parts[f_hz > BANDS[0][0] * nyquist_hz].sum(axis=0)
+    power = np.stack(
+        [p[:, q <= np.quantile(q, 0.25)].mean(axis=1) for p, q in zip(parts.swapaxes(0, 1), loud, strict=True)], axis=1
+    )
     low, middle, near = (float(np.median(power[(f_hz > a * nyquist_hz) & (f_hz < b * nyquist_hz)])) for a, b in BANDS)
     return middle / max(low, 1e-300), near / max(middle, 1e-300)
 

@@ -48,6 +48,7 @@ class AlignedLog(ABC):
     band_hz: float | None = field(default=None, kw_only=True)
     aligned_s: float = field(default=0.0, kw_only=True)
     start_ns: int = field(default=0, kw_only=True)
+    noise_left: NoiseLeft | None = field(default=None, kw_only=True)
     settings: DiagnoseSettings = field(default=DEFAULT, kw_only=True, repr=False)
 
     @property
@@ -141,7 +142,6 @@ class Pair(AlignedLog):
     ideal: IdealMotion = field(kw_only=True)
     truth: Poses | None = field(default=None, kw_only=True)
     sim_noise: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6), kw_only=True)
-    noise_left: NoiseLeft | None = field(default=None, kw_only=True)
     channels: Mapping[str, Float64[np.ndarray, " n"]] = field(default_factory=lambda: NOTHING, kw_only=True)
 
     @property

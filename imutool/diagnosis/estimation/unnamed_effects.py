@@ -284,17 +284,17 @@ def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
     gain, of_lag = without.objective - found.objective, alike.objective - found.objective
     if of_lag >= LAG_SHARE * gain:
         return False
-    return gain < SMOOTHED_SHARE * sum(_smoothed_squares(log, theta, found.part) for log in found.logs)
+    return gain < sum(_smoothed_squares(log, theta, found.part) for log in found.logs)
 
 
 def _smoothed_squares(log: WhitenedLog, theta: Theta, part: str) -> float:
     """White squares that a low-pass takes from the noise that is left of a simulation; infinite if that is unknown."""
-    left = log.pair.noise_left if isinstance(log.pair, Pair) else None
+    left, share = log.pair.noise_left, SMOOTHED_SHARE if isinstance(log.pair, Pair) else 1.0  # of a signal it is all noise
     if left is None:
         return np.inf
     n, rate_hz = len(log.pair.real), 1.0 / log.pair.period_s
     density = make_interp_spline(left.f_hz, left.density, k=1)(np.fft.rfftfreq(n, 1.0 / rate_hz).clip(max=left.f_hz[-1]))
-    white = np.fft.rfft(np.random.default_rng(0).normal(scale=np.sqrt(rate_hz / 2.0), size=(n, 6)), axis=0)
+    white = np.fft.rfft(np.random.default_rng(0).normal(scale=np.sqrt(rate_hz / 2.0), size=(n, log.pair.columns)), axis=0)
     noise = np.fft.irfft(np.sqrt(density) * white, n, axis=0)
     before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, theta)))
-    return float((before**2).sum() - (after**2).sum())
+    return share * float((before**2).sum() - (after**2).sum())

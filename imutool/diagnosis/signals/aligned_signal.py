@@ -10,6 +10,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Blocks, Variables, split
+from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.diagnosis.signals.ideal_signal import (
     ENDS_S,
@@ -22,6 +23,7 @@ from imutool.diagnosis.signals.ideal_signal import (
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.inertial.stationary import white_noise
+from imutool.inertial.wiener import NoiseLeft
 from imutool.mcap_io.fields import Fields
 from imutool.recording import nanoseconds, seconds
 from imutool.sensor.effect import SignalState
@@ -29,6 +31,7 @@ from imutool.sensor.robot_effects.joint_dynamics import Dynamics
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, SignalSamples
 from imutool.sensor.robot_effects.signal_sizes import Scale, moved
 
+TIME_CONSTANTS, MOST_SETTLING = 8.0, 0.25  # to 0.03 % of a step; of the log's time
 MOVES = 1e-9  # of its largest value, below which a signal is constant
 Column = Float64[np.ndarray, "_"]
 STATE_WORDS = {"dq": "speed of joint {}", "ddq": "acceleration of joint {}", "speed": "speed"}
@@ -107,6 +110,15 @@ class AlignedSignal(AlignedLog):
     def sampled(self) -> SignalSamples:
         """The ideal signal at the stamps."""
         return self.ideal.sample(self.stamp_s, self.stamp_s)
+
+    def settled(self, chosen: Chosen) -> AlignedSignal:
+        """The signal without the time in which low-passes that were found forget their unknown start."""
+        cutoffs = [float(theta[0]) for effect, theta in chosen if effect.name == "low_pass"]
+        if not cutoffs:
+            return self
+        length_s = min(TIME_CONSTANTS / (2.0 * np.pi * min(cutoffs)), MOST_SETTLING * float(np.ptp(self.stamp_s)))
+        known = self.stamp_s - self.ideal.start_s > length_s
+        return replace(self, fitted=self.fitted & known, held_out=self.held_out & known)
 
     def scale(self) -> Scale:
         """Sizes from which effects take their plausible parameters."""
@@ -212,6 +224,7 @@ def _aligned(
         kind=pair.kind,
         lag_s=lag_s,
         sim_density=density,
+        noise_left=NoiseLeft(np.array([0.0, 0.5 / float(np.median(np.diff(t_real)))]), np.stack([density] * 2)),
         shares_epoch=shares_epoch,
         clock_std_s=pair.clock_std_s,
         settings=settings,

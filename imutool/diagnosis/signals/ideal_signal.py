@@ -16,6 +16,7 @@ from imutool.array_types import Float64, Int64
 from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.settings import DiagnoseSettings, SignalSettings
 from imutool.errors import DataError
+from imutool.inertial.correlation import time_ahead_s
 from imutool.inertial.wiener import wiener_filter
 from imutool.mcap_io.fields import Fields
 from imutool.recording import seconds
@@ -110,7 +111,7 @@ def at_recorded_motion(
                 expected="efforts of an arm, or speeds of wheels, by the simulation's own motion",
                 fix="Record positions and velocities of all joints",
             )
-        ahead_s += _ahead_s(relation(simulated), pair.sim[inside], own_s[inside])
+        ahead_s += time_ahead_s(relation(simulated), pair.sim[inside], own_s[inside])
     assert relation is not None
     left = pair.sim[inside] - relation(simulated)
     t_s, rate_hz, state = motion(pair.state, settings)
@@ -143,12 +144,6 @@ def without_others(pair: SignalPair, settings: DiagnoseSettings) -> SignalPair |
     names, units = (tuple(of[k] for k in kept) for of in (pair.names, pair.units))
     real, sim = pair.real[:, kept], pair.sim[:, kept]
     return replace(pair, names=names, units=units, real=real, sim=sim, state=states[0], sim_state=states[1])
-
-
-def _ahead_s(x: Float64[np.ndarray, "n k"], y: Float64[np.ndarray, "n k"], t_s: Float64[np.ndarray, " n"]) -> float:
-    """Time (s) by which columns come before what follows from a motion."""
-    slope = np.gradient(x, t_s, axis=0) / y.std(axis=0)
-    return float(((y - x) / y.std(axis=0) * slope).sum() / max(float((slope**2).sum()), 1e-300))
 
 
 def _refuse_contradictory(state: Mapping[str, Fields], pair: SignalPair, log: str) -> None:
@@ -199,9 +194,13 @@ def motion(fields: Mapping[str, Fields], settings: DiagnoseSettings) -> tuple[Co
     line = even[0] + np.outer(at_s / at_s[-1], even[-1] - even[0])  # beyond its ends a filter sees zeros
     out = dict(zip(fields, (line + slow(even - line)).T, strict=True))
     unfiltered = {f"v{name[2:]}": column for name, column in zip(fields, even.T, strict=True) if name.startswith("dq")}
-    for name in list(out):
-        if name.startswith("q") and f"d{name}" not in out:
-            out[f"d{name}"] = _slope(at_s, out[name])
+    for name in [name for name in out if name.startswith("q")]:
+        rate, inner = _slope(at_s, out[name]), (at_s > ENDS_S) & (at_s < at_s[-1] - ENDS_S)
+        if f"d{name}" in out:  # of a semi-implicit integrator half a step late, of a filter as late as it is
+            late_s = -time_ahead_s(rate[inner], out[f"d{name}"][inner], at_s[inner])
+            for side, velocity in ((out, f"d{name}"), (unfiltered, f"v{name[1:]}")):
+                side[velocity] = np.interp(at_s + late_s, at_s, side[velocity])
+        out.setdefault(f"d{name}", rate)
     for name in [name for name in out if name.startswith("dq")]:
         out[f"d{name}"] = _slope(at_s, out[name])
         out[f"v{name[2:]}"] = unfiltered.get(f"v{name[2:]}", out[name])  # a filter moves the time at which friction turns

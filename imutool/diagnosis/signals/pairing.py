@@ -7,7 +7,7 @@ covariances, and what is the same in both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from imutool.diagnosis.signals.ideal_signal import SignalPair, stacked
 from imutool.diagnosis.signals.joints import JOINTS, SPEEDS, by_joint, joint_pairs, joint_remarks, wheel_pair
 from imutool.diagnosis.signals.lag import is_copy, on_recorded_clock
 from imutool.diagnosis.signals.log_fields import ELSEWHERE, GNSS, MAGNETIC, RANGE, TEMPERATURE, LogFields, read_both
-from imutool.diagnosis.signals.quantities import in_one_unit, in_radians, metres, unwrapped
+from imutool.diagnosis.signals.quantities import field_vectors, in_one_unit, in_radians, in_si, is_air, metres, unwrapped
 from imutool.file_location import Location
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import ODOMETRY, PRESSURE
@@ -63,16 +63,15 @@ def paired(real: Location, sim: Location, clock: ClockDifference | None = None) 
         if is_copy(given, DiagnoseSettings()):
             same.extend(given.names)
         else:
-            for to_usual in (in_radians, in_one_unit):
+            for to_usual in (in_radians, in_si, in_one_unit):
                 given, remark = to_usual(given)  # noqa: PLW2901
                 remarks += [remark] if remark else []
             pairs.append(given)
     pairs.sort(key=lambda pair: pair.kind == "number")  # a sort keeps the log's order otherwise
     untried = [name for pair in pairs[MOST_COMPARED:] for name in pair.names]
     pairs = pairs[:MOST_COMPARED]
-    compared = {name for pair in pairs for name in pair.names}
     remarks += _listed("The same in both logs", same) + _listed(f"Not compared, for at most {MOST_COMPARED} are", untried)
-    return Pairing(tuple(pairs), _drivers(own, compared), tuple(remarks))
+    return Pairing(tuple(pairs), _drivers(own, pairs), tuple(remarks))
 
 
 def _listed(what: str, names: list[str]) -> list[str]:
@@ -114,10 +113,16 @@ def _of_topic(
         if all(path in side for path in done for side in (mine, other)):
             sides = (metres(mine, other), metres(other, other)) if kind == "gnss" else (mine, other)
             yield SignalPair.of_columns(topic, done, kind, (unit,) * 3, *sides, _attitude(real))
+    else:
+        for names in field_vectors(topic, mine, other):
+            done = (*done, *names)
+            yield SignalPair.of_columns(topic, names, "magnetic", ("",) * 3, mine, other, _attitude(real))
     for path in mine:
         if path in other and path not in done and not (schema == ODOMETRY and path.startswith("pose.")):
             value, kind, unit = VALUES.get(schema, ("", "", ""))
             kind, unit = (kind, unit) if path == value else ("number", _unit(path))
+            if all(is_air(f"{topic}.{path}", side[path]) for side in (mine, other)):
+                kind = "pressure"
             state = _speed(real) if kind == "pressure" else {}
             pair = replace(SignalPair.of_fields(mine[path], other[path], f"{topic}.{path}"), kind=kind, state=state)
             if is_quantity(mine[path]):
@@ -171,16 +176,17 @@ def _speed(side: LogFields) -> dict[str, Fields]:
     return {}
 
 
-def _drivers(side: LogFields, compared: set[str]) -> dict[str, Fields]:
-    """Numbers of the recording that may drive a misfit: temperatures, no motion, nothing else that is compared itself."""
+def _drivers(side: LogFields, pairs: Sequence[SignalPair]) -> dict[str, Fields]:
+    """Numbers of the recording that may drive a misfit: temperatures, no motion, what is compared itself last."""
+    compared = {name: pair.kind for pair in pairs for name in pair.names}
     found = {
         f"{topic}.{path}": values
         for topic, fields in side.fields.items()
         if side.schemas[topic] not in ELSEWHERE | {JOINTS, ODOMETRY, *TRIPLES}
         for path, values in fields.items()
-        if (side.schemas[topic] == TEMPERATURE or f"{topic}.{path}" not in compared)
+        if compared.get(f"{topic}.{path}", "number") == "number"
         and is_quantity(values)
         and (path == VALUES.get(side.schemas[topic], (path,))[0])
     }
-    temperatures_first = sorted(found, key=lambda name: "temperature" not in name.lower())
+    temperatures_first = sorted(found, key=lambda name: ("temperature" not in name.lower(), name in compared))
     return {name: found[name] for name in temperatures_first[:MOST_DRIVERS]}

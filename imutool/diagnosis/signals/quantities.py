@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from imutool.array_types import Float64
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion
+from imutool.diagnosis.signals.ideal_signal import SignalPair, simulated_motion, stacked
 from imutool.diagnosis.signals.lag import lag_at_first_sight
 from imutool.errors import DataError
 from imutool.mcap_io.fields import Fields
+from imutool.sensor.channels import is_quantity
 from imutool.sensor.robot_effects.joint_dynamics import identified
 
 FACTOR_ERROR = 0.25  # of the logarithm: a sensor's own gain departs less, and no two factors are as near
@@ -24,6 +26,57 @@ FACTORS = {180.0 / np.pi: "degrees", 100.0: "hundreds", 1e3: "thousands", 1e4: "
 """Factors between units of one quantity, either way round."""
 USUAL = {"magnetic": 5e-5, "pressure": 1e5}
 """Size in the message's own unit (T, Pa), which tells what log is in another."""
+
+
+MAGNETIC = re.compile(r"magnet|(?<![a-z])mag(?![a-z])|compass")  # in the name of a field, or of its topic
+PRESSURE = re.compile(r"press[^.]*(\.(data|value))?$")  # in its own, or in that of a topic with one number
+UNITS = {
+    "magnetic": {"T": 1.0, "G": 1e-4, "µT": 1e-6, "mG": 1e-7, "nT": 1e-9},
+    "pressure": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "bar": 1e5},
+}
+SIZES = {"magnetic": (1.5e-5, 1.3e-4), "pressure": (3e4, 1.15e5)}
+"""Of the Earth's field with some hard iron (T), of its air up to 9 km (Pa)."""
+
+
+def field_vectors(topic: str, real: Mapping[str, Fields], sim: Mapping[str, Fields]) -> Iterator[tuple[str, ...]]:
+    """Paths of magnetic fields in messages of any type.
+
+    Each is an array of three, or x, y and z, is named a field or compass, and is as large as the Earth's field.
+    """
+    for path in real:
+        for first, others in (("[0]", ("[1]", "[2]")), (".x", (".y", ".z"))):
+            stem = path.removesuffix(first)
+            triple = (path, *(f"{stem}{other}" for other in others))
+            named = stem != path and MAGNETIC.search(f"{topic}.{stem}".lower()) is not None and f"{stem}[3]" not in real
+            if named and all(path in side and is_quantity(side[path]) for path in triple for side in (real, sim)):
+                columns = (stacked([side[path] for path in triple])[1] for side in (real, sim))
+                if None not in [_unit("magnetic", values) for values in columns]:
+                    yield triple
+
+
+def is_air(name: str, values: Fields) -> bool:
+    """Whether a number is named a pressure, and is of the size of the air's."""
+    return PRESSURE.search(name.lower()) is not None and _unit("pressure", values.values[:, None]) is not None
+
+
+def _unit(kind: str, values: Float64[np.ndarray, "n k"]) -> str | None:
+    """Unit in which values have the size that there is on the Earth; None where they have it in no unit."""
+    size, (least, most) = float(np.median(np.linalg.norm(values, axis=1))), SIZES[kind]
+    within = {unit: size * factor for unit, factor in UNITS[kind].items() if least < size * factor < most}
+    return min(within, key=lambda unit: abs(np.log(within[unit] ** 2 / (least * most))), default=None)
+
+
+def in_si(pair: SignalPair) -> tuple[SignalPair, str]:
+    """Field or pressure of unknown unit in tesla or pascal, by the size that it has on Earth."""
+    if any(pair.units) or pair.kind not in UNITS:
+        return pair, ""
+    units = [_unit(pair.kind, values) for values in (pair.real, pair.sim)]
+    if None in units:
+        return pair, ""
+    (si, *_), (real, sim) = UNITS[pair.kind], (UNITS[pair.kind][str(unit)] for unit in units)
+    changed = replace(pair, real=real * pair.real, sim=sim * pair.sim, units=(si,) * len(pair.units))
+    said = " and ".join(dict.fromkeys(str(unit) for unit in units))
+    return changed, "" if said == si else f"{pair.name} was converted to {si}: its size shows that it is in {said}"
 
 
 def unwrapped(pair: SignalPair) -> SignalPair:

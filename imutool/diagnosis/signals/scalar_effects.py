@@ -21,6 +21,7 @@ from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
 from imutool.sensor.effects.low_pass import smoothed
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
+from imutool.units import AXES
 
 CUTOFFS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3)  # to start from, over the signal's own mean frequency
 WIDTHS = (0.05, 0.15, 0.4, 0.8)  # of a dead band, over the signal's standard deviation
@@ -28,6 +29,8 @@ REACHED = (0.001, 0.02, 0.1)  # of the samples beyond a limit to start from
 STEEP = 0.002  # of the signal's size, over which a jump is smeared
 MOVED = 0.005  # of the signal's size, by which derivatives move it: more than a jump's width, or they see none or all of it
 LOG_MOVED = 0.02  # of the logarithm of a positive parameter, likewise
+LEAST_LAG_S = 0.02  # at first sight, which is two samples of the clock on which it is seen
+VECTORS = {"magnetic"}  # kinds whose columns are a vector: what drives it has a field of its own
 KNOTS, KNOTS_OF_TIME = 7, 15
 BEND = 0.3  # of the signal's size: a second difference between a curve's knots
 
@@ -88,7 +91,10 @@ def named(signal: AlignedSignal) -> Iterator[Effect]:
         "dy/dt = 2 pi f_c (x - y)",
         (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf, step=LOG_MOVED),),
         _low_pass,
-        [np.array([times * slope / size / (2.0 * np.pi)]) for times in CUTOFFS],
+        [
+            np.array([cutoff / (2.0 * np.pi)])
+            for cutoff in (*(times * slope / size for times in CUTOFFS), *_of_lag(signal.lag_s))
+        ],
         lagless=_lagless,
     )
     gain = (Parameter("gain", "-", 0.5, null_value=1.0),)
@@ -99,6 +105,11 @@ def named(signal: AlignedSignal) -> Iterator[Effect]:
         level, text = (Parameter("level", unit, size),), f"y += level sign({of})"
         yield _effect("friction", Stage.SENSOR, text, level, _Sign(variable, steep), variant=f"of {variable}")
     yield from _limits(signal.real[:, 0], size, unit)
+
+
+def _of_lag(lag_s: float) -> list[float]:
+    """Cut-off (rad/s) of a first-order lag that delays what is slow so much."""
+    return [1.0 / lag_s] if lag_s > LEAST_LAG_S else []
 
 
 def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
@@ -240,37 +251,49 @@ def on_column(effect: Effect, signal: AlignedSignal, k: int) -> Effect:
 
 
 class _Driven:
-    """+ gain times a channel, some time earlier."""
+    """+ gain times a channel, some time earlier, in each of some columns."""
 
-    def __init__(self, channel: str, mean: float, column: int) -> None:
-        self.channel, self.mean, self.column = channel, mean, column
+    def __init__(self, channel: str, mean: float, columns: Sequence[int]) -> None:
+        self.channel, self.mean, self.columns = channel, mean, columns
 
     def __call__(self, s: SignalSamples, theta: Theta) -> SignalSamples:
         t_s, values = s.channels[self.channel]
-        return s.with_added(self.column, theta[0] * (np.interp(s.stamp_s - theta[1], t_s, values) - self.mean))
+        moved = np.interp(s.stamp_s - theta[-1], t_s, values) - self.mean
+        for k, gain in zip(self.columns, theta[:-1].tolist(), strict=True):
+            s = s.with_added(k, gain * moved)
+        return s
 
 
-def driven(signal: AlignedSignal, k: int) -> Iterator[Effect]:
-    """Effects on a column driven by each other channel, but for copies of a column."""
-    size, real = float(signal.sampled.x[:, k].std()), signal.real
+def driven(signal: AlignedSignal) -> Iterator[Effect]:
+    """Effects driven by each other channel, on one column or on a vector as a whole.
+
+    A copy of a column drives nothing.
+    """
+    parts = [range(signal.columns)] if signal.kind in VECTORS else [range(k, k + 1) for k in range(signal.columns)]
     for name, (t_s, values) in sorted(signal.ideal.channels.items()):
         channel = np.interp(signal.stamp_s, t_s, values)
         spread = float(channel.std())
         if name in signal.names or not spread > 1e-12 * max(1.0, float(np.abs(channel).max())):
             continue
-        if any(abs(float(np.corrcoef(channel, own)[0, 1])) > signal.settings.signal.copy_correlation for own in real.T):
+        if any(abs(float(np.corrcoef(channel, own)[0, 1])) > signal.settings.signal.copy_correlation for own in signal.real.T):
             continue
-        unit = signal.units[k] or "1"
-        numbers = (Parameter("gain", f"{unit} per unit of {name}", size / spread), Parameter("lag", "s", 0.2))
-        effect = _effect(
-            "driven",
-            Stage.SENSOR,
-            f"y += gain ({name}(t - lag) - mean)",
-            numbers,
-            _Driven(name, float(channel.mean()), k),
-            [np.array([0.0, lag]) for lag in LAGS_S],
-            kind="driven",
-            variable=name,
-            variant=name,
-        )
-        yield on_column(effect, signal, k)
+        yield from (_driven(signal, part, name, float(channel.mean()), spread) for part in parts)
+
+
+def _driven(signal: AlignedSignal, part: Sequence[int], name: str, mean: float, spread: float) -> Effect:
+    """Effect of one channel on some columns, which follow it at one time."""
+    vector, unit = len(part) > 1, signal.units[part[0]] or "1"
+    gain = Parameter("gain", f"{unit} per unit of {name}", float(signal.sampled.x[:, part].std(axis=0).max()) / spread)
+    gains = tuple(replace(gain, name=axis) for axis in AXES) if vector else (gain,)
+    effect = _effect(
+        "driven",
+        Stage.SENSOR,
+        f"y += gain ({name}(t - lag) - mean)",
+        (*gains, Parameter("lag", "s", 0.2)),
+        _Driven(name, mean, part),
+        [np.array([*(0.0 for _ in gains), lag]) for lag in LAGS_S],
+        kind="driven",
+        variable=name,
+        variant=name,
+    )
+    return effect if vector else on_column(effect, signal, part[0])

@@ -111,6 +111,9 @@ def diagnose_signal(
         selection = _selected(now)
         constants = gains_of(selection)
     selection = selection or _selected(now)
+    if (settled := signal.settled(selection.whole.chosen)) is not signal:
+        signal, now = settled, _Prepared.of(settled, pair)
+        selection = _selected(now)
     rewhitened = whitened(signal, signal.real - expected(signal, selection.whole.chosen), now.lsb)
     if (noise_std(rewhitened.whiten) < signal.settings.signal.better_noise * noise_std(now.log.whiten)).any():
         now = now._replace(log=rewhitened)  # the effects' own high frequencies were taken for noise
@@ -176,7 +179,7 @@ def _selected(now: _Prepared) -> Selection:
     log, candidates, always = now.log, now.candidates, now.always
     signal: AlignedSignal = log.pair  # type: ignore[assignment]  # it was made of one
     columns = range(signal.columns)
-    driven = [effect for k in columns for effect in common.driven(signal, k)]
+    driven = [*common.driven(signal)]
     named = _refined(log, select_effects([log], candidates, [driven], always=always), signal.settings)
     if (resting := _beside_stiction(now, named, driven)) is not None:
         named, candidates = resting

@@ -100,8 +100,9 @@ def _is_copy(signal: AlignedSignal, name: str, values: Samples) -> bool:
 def _of_one(signal: AlignedSignal, k: int, name: str, values: Samples) -> Iterator[Effect]:
     by_name = {name: values}
     for text, (form, _) in FORMS.items():
-        if text == "{v}" and name in ("x", "dx/dt"):
-            continue  # a gain, and a delay
+        same = ("{v}", "|{v}|") if (values >= 0.0).all() or (values <= 0.0).all() else ("{v}",)
+        if text in same and (name in ("x", "dx/dt") or name in signal.ideal.channels):
+            continue  # a gain, a delay, and what another channel drives
         yield _effect(signal, k, Term(k, (name,), form), text.format(v=name), by_name)
     for text, (form, _) in SCALED.items():
         yield _effect(signal, k, Term(k, (name,), form), text.format(v=name), by_name, scale=float(values.std()))

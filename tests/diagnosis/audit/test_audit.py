@@ -21,7 +21,7 @@ from support.seeds import seeds
 from imutool.diagnosis.audit import audit, lines, simulator_faults, simulator_remarks
 from imutool.diagnosis.audit.faults import FAULTS
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics, motion_faults
-from imutool.diagnosis.audit.noise import noise_faults
+from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.spectral_lines import spectral_lines
 from imutool.diagnosis.diagnose import diagnose
 from imutool.mcap_io.codec import schemas
@@ -68,6 +68,60 @@ def test_a_semi_implicit_integrator_makes_all_velocities_late_alike(step: float,
     accused = {fault.signal: fault.parameters["delay"].value for fault in faults if fault.fault == "backward_difference"}
     assert len(accused) == len(faults)
     assert accused.get("accel", 0.0) == pytest.approx(0.5 * period_s * differences, rel=0.03)
+
+
+@pytest.mark.parametrize("late", [0.2, -0.2, 0.1])
+def test_a_delay_of_a_part_of_a_sample_period_is_a_step_of_the_physics(late: float) -> None:
+    """It makes the attitude late, which no difference of rates or velocities does."""
+    rng, period_s = np.random.default_rng(3), 1.0 / 200.0
+    motion, t = bench.Motion.drawn(rng), np.arange(round(DURATION_S / period_s)) * period_s
+    then = t - late * period_s
+    samples = np.concatenate([motion.rate(then), motion.force(then)], axis=1)
+    samples += np.repeat([1e-3, 1e-2], 3) * rng.normal(size=samples.shape)
+    (fault,) = simulator_faults(bench._log(motion, t, samples), None, Noise())
+    assert (fault.fault, fault.signal) == ("step_delay" if late > 0.0 else "early_stamps", "both")
+    assert fault.parameters["delay"].value == pytest.approx(late * period_s, rel=0.03)
+
+
+def test_what_poses_do_not_follow_is_no_lever_arm() -> None:
+    """A foot that strikes the ground shakes the body about another point, faster than smoothed poses show."""
+    sim, _, _ = bench.made("null", 5, DURATION_S)
+    k = kinematics(sim)
+    t_s = np.arange(len(k.t_s)) * k.period_s
+    shaken = 30.0 * np.sin(2.0 * np.pi * 0.4 / k.period_s * t_s)[:, None] * np.array([1.0, -0.5, 0.7])
+    fit = kinematic_fit(replace(k, alpha=k.alpha + shaken, accel=k.accel + np.cross(shaken, [0.05, 0.1, 0.0])))
+    assert motion_faults(k, fit) == []
+
+
+def test_a_body_that_lies_still_for_most_of_a_log_is_judged_by_its_motion() -> None:
+    """An impact cuts the log: the longer part is rest."""
+    rng, period_s = np.random.default_rng(8), 1.0 / 200.0
+    motion = bench.Motion.drawn(rng)
+    moving, rest = (np.arange(round(length_s / period_s)) * period_s for length_s in (12.0, 20.0))
+    samples = np.concatenate([motion.attitude(moving).apply(motion.rate(moving)), motion.force(moving)], axis=1)
+    end = motion.attitude(moving[-1:])
+    still = np.tile(np.concatenate([np.zeros((1, 3)), end.inv().apply(-bench.G_W[None])], axis=1), (len(rest), 1))
+    t_ns = (np.concatenate([moving, rest + moving[-1] + 0.5]) * 1e9).astype(np.int64)
+    q = np.concatenate(
+        [motion.attitude(moving).as_quat(scalar_first=True), np.tile(end.as_quat(scalar_first=True), (len(rest), 1))]
+    )
+    p = np.concatenate([motion.position(moving), np.tile(motion.position(moving[-1:]), (len(rest), 1))])
+    values = np.concatenate([samples, still])
+    values += np.repeat([1e-3, 1e-2], 3) * rng.normal(size=values.shape)
+    imu = Imu(t_ns, np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3:]))
+    faults = simulator_faults(Recording("fallen", imu, truths={"/pose": Poses(t_ns, p, q)}), None, Noise())
+    assert {fault.fault for fault in faults} == {"world_frame"}
+
+
+@pytest.mark.parametrize(("share", "accused"), [(0.0, True), (0.5, False), (1.0, False)])
+def test_a_bias_that_walks_less_than_the_data_sheet_says_does_walk(share: float, accused: bool) -> None:
+    rng, rate_hz, density = np.random.default_rng(4), 100.0, 2e-3
+    own, walk = density * np.sqrt(rate_hz), 8.0 * np.pi * density / 60.0
+    white = own * rng.normal(size=(6000, 6))
+    drift = share * walk / np.sqrt(rate_hz) * np.cumsum(rng.normal(size=white.shape), axis=0)
+    imu = Imu((np.arange(6000) * 1e7).astype(np.int64), white[:, :3] + drift[:, :3], white[:, 3:] + drift[:, 3:])
+    faults, _ = noise_faults(imu, white + drift, [Expected(np.full(6, density), np.full(6, walk))])
+    assert {fault.fault for fault in faults} == ({"bias_never_walks"} if accused else set())
 
 
 def test_a_diagnosis_says_what_the_simulation_does_wrong() -> None:

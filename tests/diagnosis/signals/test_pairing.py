@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from support.robot_cases.log import write
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals.ideal_signal import SignalPair
+from imutool.diagnosis.signals.ideal_signal import SignalPair, motion
 from imutool.diagnosis.signals.lag import is_copy, lag_at_first_sight
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.quantities import in_one_unit
 from imutool.diagnosis.signals.signal_constants import current_remark
 from imutool.errors import DataError
+from imutool.inertial.correlation import time_ahead_s
 from imutool.mcap_io.fields import Fields
 
 JOINTS, NUMBER, ODOMETRY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64", "nav_msgs/msg/Odometry"
@@ -266,3 +268,67 @@ def test_efforts_that_are_motor_currents_are_told() -> None:
     assert "/j.effort[0]: 9" in remark
     assert "/j.effort[1]" not in remark
     assert current_remark({"/j.effort[0]": 0.8}) == []
+
+
+def json_log(path: Path, messages: Sequence[dict[str, object]], topic: str = "/drone0/sensors") -> None:
+    """A log of one topic in JSON, stamped by its log times."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "a fleet's own logger")
+        schema = writer.register_schema("acme.Sensors", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel(topic, "json", schema)
+        for t_s, message in zip(T, messages, strict=False):
+            writer.add_message(channel, round(t_s * 1e9), json.dumps(message).encode(), round(t_s * 1e9))
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap has no annotation for it
+
+
+def test_a_field_and_an_air_pressure_are_known_in_any_message_by_their_names_and_sizes(tmp_path: Path) -> None:
+    """Gauss and hectopascal; a pump, a thermometer beside the barometer and a spectrum are none."""
+    turned = np.stack([wave(1), wave(2), 2.0 + wave(3)], axis=1)
+    field = 0.5 * turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    for name, gain in (("real", 1.1), ("sim", 1.0)):
+        columns = {
+            "pressure_hpa": 1000.0 + gain * wave(4),
+            "pump_pressure_bar": 6.0 + 0.2 * gain * wave(5),
+            "baro_temperature": 35.0 + gain * wave(6),
+        }
+        messages = [
+            {
+                "magnetometer_ga": (gain * field[k]).tolist(),
+                "magnitude": (1.0 + gain * turned[k]).tolist(),
+                **{path: float(values[k]) for path, values in columns.items()},
+            }
+            for k in range(len(T))
+        ]
+        json_log(tmp_path / f"{name}.mcap", messages)
+    pairs = {pair.name: pair for pair in paired(tmp_path / "real.mcap", tmp_path / "sim.mcap").pairs}
+    magnetic, air = pairs["/drone0/sensors"], pairs["/drone0/sensors.pressure_hpa"]
+    assert (magnetic.kind, magnetic.units, air.kind, air.units) == ("magnetic", ("T",) * 3, "pressure", ("Pa",))
+    assert np.allclose(magnetic.sim, 1e-4 * field, rtol=1e-9)
+    assert np.allclose(air.sim[:, 0], 1e5 + 100.0 * wave(4), rtol=1e-9)
+    assert {pair.kind for name, pair in pairs.items() if name not in (magnetic.name, air.name)} == {"number"}
+    assert sum("magnitude" in name for name in pairs) == 3
+
+
+def test_a_current_that_both_logs_hold_may_drive_a_misfit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    for name, noise in (("real", 0.01), ("sim", 0.0)):
+        current = 5.0 + wave(1) + noise * rng.normal(size=len(T))
+        json_log(tmp_path / f"{name}.mcap", [{"current_a": c, "level": v} for c, v in zip(current, wave(2), strict=True)])
+    assert "/drone0/sensors.current_a" in paired(tmp_path / "real.mcap", tmp_path / "sim.mcap").drivers
+
+
+@pytest.mark.parametrize("late_s", [0.004, -0.0005, 0.0])
+def test_velocities_are_brought_to_the_clock_of_their_positions(late_s: float) -> None:
+    """Half a step late in a semi-implicit integrator, later behind a filter: an effort would lead them."""
+    t_s = np.arange(4000) / 200.0
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    w, phase = 2.0 * np.pi * np.array([0.2, 0.7, 1.3]), np.array([0.0, 1.0, 2.0])
+    rng = np.random.default_rng(5)
+    q = np.sin(np.outer(t_s, w) + phase).sum(axis=1) + 3e-5 * rng.normal(size=len(t_s))
+    dq = (w * np.cos(np.outer(t_s - late_s, w) + phase)).sum(axis=1) + 1e-3 * rng.normal(size=len(t_s))
+    at_s, _, state = motion({"q0": Fields(t_ns, q), "dq0": Fields(t_ns, dq)}, DiagnoseSettings())
+    inner = (at_s > 1.0) & (at_s < at_s[-1] - 1.0)
+    exact = (w * np.cos(np.outer(at_s, w) + phase)).sum(axis=1)
+    for velocity in ("dq0", "v0"):
+        assert abs(time_ahead_s(exact[inner], state[velocity][inner], at_s[inner])) < 5e-5

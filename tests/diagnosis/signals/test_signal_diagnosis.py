@@ -240,6 +240,45 @@ def test_what_is_left_of_a_slow_simulations_noise_is_no_lag_of_the_recording(see
     assert diagnose_signal(SignalPair.of_fields(real, sim, NAME), {}).findings == ()
 
 
+def test_a_lag_and_a_delay_beside_a_simulation_without_noise_are_both_named() -> None:
+    """Slow signals see one as the other, but for their amplitude: no noise is there to be smoothed."""
+    t, fine = 3.0 + np.arange(5000) / 100.0, np.arange(70_000) / 1000.0
+    rng, w = np.random.default_rng(0), 2.0 * np.pi * np.linspace(0.05, 0.5, 6)
+    phase, tau = rng.uniform(0.0, 6.0, 6), 1.0 / (2.0 * np.pi * 1.5)
+    lag = np.arctan(w * tau)
+    slow = (np.cos(np.outer(t - 0.03, w) + phase - lag) * np.cos(lag)).sum(axis=1)
+    real = fields(t, slow + 1e-3 * rng.normal(size=len(t)))
+    found = compared(real, fields(fine[::10], np.cos(np.outer(fine, w) + phase).sum(axis=1)[::10]), {})
+    assert names(found) == {"low_pass", "delay"}
+    within(found, "low_pass", {"f_c": 1.5})
+    within(found, "delay", {"delay": 0.03})
+
+
+@pytest.mark.parametrize("seed", seeds(3))
+def test_the_start_of_a_lag_is_unknown_and_makes_no_drift(seed: int) -> None:
+    """Both logs begin together: the lag came in from a motion that nobody logged."""
+    x, rng, t = Motion(seed), np.random.default_rng(seed), np.arange(3000) / 50.0
+    found = compared(fields(t, x.low(t, 0.8) + 0.002 * rng.normal(size=len(t))), fields(t, x(t)), {})
+    assert names(found) == {"low_pass"}
+    within(found, "low_pass", {"f_c": 0.8})
+
+
+def test_what_drives_a_field_has_a_direction() -> None:
+    """The current of a motor beside a magnetometer: one lag, a gain for each axis."""
+    t, rng, gains = 3.0 + np.arange(3000) / 50.0, np.random.default_rng(1), np.array([2e-7, -1e-7, 3e-7])
+    field = 4e-5 * np.stack([Motion(k)(t) for k in range(3)], axis=1)
+    current = 5.0 + Motion(9)(t)
+    real_field = field + np.outer(current - current.mean(), gains) + 1e-7 * rng.normal(size=field.shape)
+    ns, units = fields(t, t).t_ns, ("T",) * 3
+    sides = (dict(zip("xyz", (Fields(ns, column) for column in side.T), strict=True)) for side in (real_field, field))
+    pair_of_fields = SignalPair.of_columns("/mag", ("x", "y", "z"), "magnetic", units, *sides, {})
+    (finding,) = diagnose_signal(pair_of_fields, {"/esc.current": Fields(ns, current)}).findings
+    assert (finding.effect, finding.variable, finding.signal) == ("driven", "/esc.current", "/mag")
+    for axis, gain in zip("xyz", gains.tolist(), strict=True):
+        estimate = finding.parameters[axis]
+        assert abs(estimate.value - gain) < SURE * estimate.std
+
+
 def test_what_interpolation_leaves_between_two_logs_without_noise_is_nothing() -> None:
     """Two simulators interpolate one motion on straight lines."""
     fine = np.arange(0.0, 70.0, 2e-3)
