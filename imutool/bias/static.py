@@ -53,9 +53,9 @@ class Model(BiasModel):
         return constant
 
     def calibration_covariance(self) -> CovarianceModel | None:
-        """Covariance of an unknown scale and misalignment, which the model leaves in the samples of a motion.
+        """Covariance of an unknown scale and misalignment, which the model does not correct.
 
-        The accelerometer's bias at rest contains that of the gravity there: only the change from the first sample counts.
+        At rest they act on gravity, and the bias measured there contains that: the accelerometer counts from its first sample.
         """
         spread = CALIBRATION_STD * np.eye(3)
         first: list[Float64[np.ndarray, "3"]] = []

@@ -176,7 +176,7 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
     least = None if start.least_std is None else np.maximum(start.least_std, LEAST_STD)
-    settings = FilterSettings(**model.card.get("speed", {} if model.card else UNKNOWN_BODY))
+    settings = FilterSettings(**model.card.get("speed", {} if "logs" in model.card else UNKNOWN_BODY))
     return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least, settings)
 
 

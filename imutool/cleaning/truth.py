@@ -57,12 +57,9 @@ def read_truth(
             if refused is not None:
                 refused(topic, error)
             continue
-        q_wxyz = np.concatenate([np.zeros((0, 4)), *turns])
-        norm = np.linalg.norm(q_wxyz, axis=1)
-        good = norm > 0.5
-        if good.sum() >= FEWEST:
-            columns = np.concatenate(times)[good], np.concatenate(places)[good], q_wxyz[good] / norm[good, None]
-            return Truth(topic, *columns, log.topics[named].pose_kind)
+        if sum(map(len, times)) >= FEWEST:
+            q_wxyz = quaternion.unit(np.concatenate(turns))
+            return Truth(topic, np.concatenate(times), np.concatenate(places), q_wxyz, log.topics[named].pose_kind)
     return None
 
 

@@ -215,8 +215,8 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 notes[topic].append(_imu_note(survey) + others)
             if frame_id or not survey.pose_topic:
                 continue
-            hidden = topic in imus or survey.pose_delay_ns  # a body is turned by the right rates at the right times
-            turned = None if hidden else turned_body(log, sound_samples(log, topic), survey.pose_topic)
+            comes_later = topic in imus or survey.pose_delay_ns  # a body's rotation shows by right rates at right times
+            turned = None if comes_later else turned_body(log, sound_samples(log, topic), survey.pose_topic)
             if changes := _pose_notes(survey, turned):
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
                 frame_id = next(log.pose_batches(pose_topic)).frame_id

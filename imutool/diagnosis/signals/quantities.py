@@ -24,10 +24,6 @@ TURNS = (2.0 * np.pi, 360.0)
 EARTH_M, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS 84
 FACTORS = {180.0 / np.pi: "degrees", 100.0: "hundreds", 1e3: "thousands", 1e4: "gauss", 1e6: "millions"}
 """Factors between units of one quantity, either way round."""
-USUAL = {"magnetic": 5e-5, "pressure": 1e5}
-"""Size in the message's own unit (T, Pa), which tells what log is in another."""
-
-
 MAGNETIC = re.compile(r"magnet|(?<![a-z])mag(?![a-z])|compass")  # in the name of a field, or of its topic
 PRESSURE = re.compile(r"press[^.]*(\.(data|value))?$")  # in its own, or in that of a topic with one number
 UNITS = {
@@ -63,7 +59,13 @@ def _unit(kind: str, values: Float64[np.ndarray, "n k"]) -> str | None:
     """Unit in which values have the size that there is on the Earth; None where they have it in no unit."""
     size, (least, most) = float(np.median(np.linalg.norm(values, axis=1))), SIZES[kind]
     within = {unit: size * factor for unit, factor in UNITS[kind].items() if least < size * factor < most}
-    return min(within, key=lambda unit: abs(np.log(within[unit] ** 2 / (least * most))), default=None)
+    return min(within, key=lambda unit: _departure(kind, within[unit]), default=None)
+
+
+def _departure(kind: str, size: float) -> float:
+    """Departure (logarithm) of a size in T or Pa from the middle of those on Earth."""
+    least, most = SIZES[kind]
+    return abs(float(np.log(size / np.sqrt(least * most))))
 
 
 def in_si(pair: SignalPair) -> tuple[SignalPair, str]:
@@ -163,11 +165,11 @@ def _is_one_motion(pair: SignalPair) -> bool:
 
 def _is_usual(pair: SignalPair) -> bool:
     """Whether the recording, and not the simulation, has the size that its message's unit gives."""
-    usual = USUAL.get(pair.kind)
-    if usual is None:
+    if pair.kind not in SIZES:
         return False
-    real, sim = (abs(np.log(max(float(np.sqrt((v**2).sum(axis=1).mean())), 1e-300) / usual)) for v in (pair.real, pair.sim))
-    return bool(real < sim)
+    sizes = (float(np.sqrt((values**2).sum(axis=1).mean())) for values in (pair.real, pair.sim))
+    real, sim = (_departure(pair.kind, max(size, 1e-300)) for size in sizes)
+    return real < sim
 
 
 def metres(side: Mapping[str, Fields], origin: Mapping[str, Fields]) -> dict[str, Fields]:

@@ -91,10 +91,7 @@ def named(signal: AlignedSignal) -> Iterator[Effect]:
         "dy/dt = 2 pi f_c (x - y)",
         (Parameter("f_c", "Hz", 10.0, positive=True, null_value=np.inf, step=LOG_MOVED),),
         _low_pass,
-        [
-            np.array([cutoff / (2.0 * np.pi)])
-            for cutoff in (*(times * slope / size for times in CUTOFFS), *_of_lag(signal.lag_s))
-        ],
+        [np.array([rate / (2.0 * np.pi)]) for rate in (*np.multiply(CUTOFFS, slope / size), *_of_lag(signal.lag_s))],
         lagless=_lagless,
     )
     gain = (Parameter("gain", "-", 0.5, null_value=1.0),)
