@@ -49,6 +49,7 @@ MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays 
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
+MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 
 
@@ -103,6 +104,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     doubts = [
         *(sentence for sentence in contradictions if not confirmed or sentence not in other_bias),
         *_changed_at_rest(corrected, found.stops, prior),
+        *_not_shown(start, found),
         *model.remarks,
         *_other_conditions(model, samples),
         *_other_unit(model, about),
@@ -198,6 +200,19 @@ def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], pri
                 f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
             )
             return
+
+
+def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
+    """Sentence on a bias of the gyro that is less known, after the start and the log, than it is large."""
+    precision = 1.0 / np.maximum(start.std, LEAST_STD) ** 2 + 1.0 / (DEPENDENT**2 * found.variance)
+    std = 1.0 / np.sqrt(precision[:3])
+    unknown = np.where(std > np.abs(start.rest[:3]), std, 0.0)
+    axis = int(np.argmax(unknown))
+    if unknown[axis] > MOST_UNKNOWN:
+        yield (
+            f"neither stops nor gravity shows the gyro's bias about {'xyz'[axis]}: the {start.rest[axis]:+.2g} ± {std[axis]:.2g}"
+            f" rad/s from the start may do more harm than good"
+        )
 
 
 def innovations(blocks: Sequence[FilteredBlock]) -> Innovations:
