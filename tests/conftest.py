@@ -47,6 +47,7 @@ gc.set_threshold(100_000, 20)
 
 sys.path.insert(0, str(Path(__file__).parent))  # for tests/support
 
+from support.made_once import made_once  # noqa: E402
 from support.shapes import check_shapes  # noqa: E402  (before anything imports the package)
 
 check_shapes("imutool")
@@ -150,21 +151,6 @@ def imutool(command: str) -> Callable[..., subprocess.CompletedProcess[str]]:
         )  # type: ignore[call-overload]
 
     return run
-
-
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
-    """A folder that `make` fills once for all workers: who comes second waits and takes it as it is."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        folder = factory.mktemp(name)
-        make(folder)
-        return folder
-    folder = factory.getbasetemp().parent / name
-    with FileLock(f"{folder}.lock"):
-        if not (folder / ".made").exists():
-            folder.mkdir(exist_ok=True)
-            make(folder)
-            (folder / ".made").touch()
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,9 @@ Samples, minus the model's motion-dependent bias, go through `imutool.inertial.i
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
+from imutool.inertial.innovations import Innovations
 from imutool.inertial.preintegration import integrate
 from imutool.inertial.stationary import GAP_PERIODS, OnlineRestDetector
 from imutool.recording.columns import quantile
@@ -158,6 +160,19 @@ class BiasFilter:
             step = step._replace(after=self._aiding.measure(step.after, float(t[-1])))
         self.state = step.after
         return FilteredBlock(float(t[0]), float(t[-1]), rests, step)
+
+
+def innovations(blocks: Sequence[FilteredBlock]) -> Innovations:
+    """Innovations of each block's velocity, in body axes; none of a block with a gap."""
+    measured = [(block.step.expected.R_wb.T, *block.step.innovation) for block in blocks if block.step.innovation is not None]
+    R_bw, v, S = (np.array([row[k] for row in measured]).reshape(-1, *shape) for k, shape in enumerate(((3, 3), (3,), (3, 3))))
+    return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
+
+
+def stops(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
+    """Beginning and end of each row of blocks at rest."""
+    rows = [list(row) for resting, row in itertools.groupby(blocks, lambda block: block.resting) if resting]
+    return tuple((row[0].start_s, row[-1].end_s) for row in rows)
 
 
 class TrackedBiasStream:

@@ -17,8 +17,8 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples
-from imutool.bias_start.fitness import head, innovations
+from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples, innovations
+from imutool.bias_start.fitness import head
 from imutool.bias_start.initial_bias import bias_prior
 from imutool.errors import ConfigError
 from imutool.inertial.inertial_filter import STILL, FilterSettings

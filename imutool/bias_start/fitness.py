@@ -28,7 +28,7 @@ from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples
+from imutool.bias_start.bias_tracking import BiasFilter, Samples, innovations, stops
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
@@ -175,13 +175,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((found.chi_square > SURPRISING).mean())
-    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, _stops(blocks), found)
-
-
-def _stops(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
-    """Beginning and end of each row of blocks at rest."""
-    rows = [list(row) for resting, row in itertools.groupby(blocks, lambda block: block.resting) if resting]
-    return tuple((row[0].start_s, row[-1].end_s) for row in rows)
+    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops(blocks), found)
 
 
 def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
@@ -203,23 +197,14 @@ def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], pri
 
 
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
-    """Sentence on a bias of the gyro that is less known, after the start and the log, than it is large."""
-    precision = 1.0 / np.maximum(start.std, LEAST_STD) ** 2 + 1.0 / (DEPENDENT**2 * found.variance)
-    std = 1.0 / np.sqrt(precision[:3])
-    unknown = np.where(std > np.abs(start.rest[:3]), std, 0.0)
+    """Sentence on a bias of the gyro that the log shows less than the start did, and that is less known than it is large."""
+    before, shown = start.std[:3], DEPENDENT * np.sqrt(found.variance[:3])
+    std = 1.0 / np.sqrt(1.0 / np.maximum(before, LEAST_STD[:3]) ** 2 + 1.0 / shown**2)
+    unknown = np.where((shown > before) & (std > np.abs(start.rest[:3])), std, 0.0)
     axis = int(np.argmax(unknown))
     if unknown[axis] > MOST_UNKNOWN:
-        yield (
-            f"neither stops nor gravity shows the gyro's bias about {'xyz'[axis]}: the {start.rest[axis]:+.2g} ± {std[axis]:.2g}"
-            f" rad/s from the start may do more harm than good"
-        )
-
-
-def innovations(blocks: Sequence[FilteredBlock]) -> Innovations:
-    """Innovations of each block's velocity, in body axes; none of a block with a gap."""
-    measured = [(block.step.expected.R_wb.T, *block.step.innovation) for block in blocks if block.step.innovation is not None]
-    R_bw, v, S = (np.array([row[k] for row in measured]).reshape(-1, *shape) for k, shape in enumerate(((3, 3), (3,), (3, 3))))
-    return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
+        bias = f"{start.rest[axis]:+.2g} ± {std[axis]:.2g} rad/s, from the start,"
+        yield f"neither stops nor gravity shows the gyro's bias about {'xyz'[axis]}: {bias} may do more harm than good"
 
 
 def _deviations(found: _Evidence, prior: BiasPrior) -> Vector6:

@@ -10,6 +10,8 @@ import heapq
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import tee
 from pathlib import Path
 
 import numpy as np
@@ -87,8 +89,8 @@ class Corrections:
 
     def _where(self, content: MessageLog, is_moved: bool) -> Iterator[Message]:
         """Corrected messages whose log time has moved, or the others."""
-        both = zip(content.messages(), self._each(content.messages()), strict=True)
-        return (after for before, after in both if (after.log_time != before.log_time) is is_moved)
+        before, after = tee(message for message in content.messages() if _is_pose(message.topic) or not is_moved)
+        return (new for old, new in zip(before, self._each(after), strict=True) if (new.log_time != old.log_time) is is_moved)
 
     def _each(self, messages: Iterator[Message]) -> Iterator[Message]:
         seen = Counter[str]()
@@ -117,8 +119,7 @@ class Corrections:
             )
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
-        turned = bool((self.world != np.eye(3)).any())
-        if not _is_pose(topic) or not (turned or self.late_ns or self.body is not NOT_TURNED):
+        if not (self.pose_topic and _is_pose(topic)):
             return message
         patch = MessagePatch(topic, bytes(message.payload))
         before_ns = patch.stamp_ns()
@@ -128,10 +129,15 @@ class Corrections:
             message = message._replace(log_time=message.log_time + moved_ns, publish_time=message.publish_time + moved_ns)
         return message._replace(payload=bytes(patch.data))
 
+    @cached_property
+    def _turns(self) -> tuple[Float64[np.ndarray, "1 4"], Float64[np.ndarray, "1 4"]]:
+        """Rotations of the world, and from the IMU to the poses' body."""
+        return quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
+
     def _correct_poses(self, topic: MessageTopic, patch: MessagePatch) -> None:
         """Correct the poses or the velocity in the judged poses' frame."""
         named = 2 if "text" in schemas.SHAPES[patch.schema_name] else 1
-        turn, body = quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
+        turn, body = self._turns
         for which in range(len(patch.layout.stamps)):
             if patch.layout.texts[named * which] != self.frame_id:
                 continue
@@ -248,25 +254,39 @@ def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
 def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
     """Write a log with corrections of what its motion shows to be wrong; return notes on them.
 
-    Each round writes a file in a new folder next to `log`. The last one, or `log` itself, becomes the target.
+    After each round a log without images, in a new folder next to `log`, shows what the next has to correct.
 
     Raises:
         ImutoolError: damage, or the target cannot be written.
     """
     refuse_existing(target, overwrite=overwrite)
-    module, notes = registry.load("imutool.converters", "mcap_log"), list[str]()
-    kept: Sequence[str] = ()
-    for number in range(MOST_ROUNDS if CONVENTIONS in wanted else 1):
-        found = find_corrections(log, [CONVENTIONS] if number else wanted)
-        kept = found.kept
+    judged, rounds, kept = log, list[Corrections](), list[str]()
+    most = MOST_ROUNDS if CONVENTIONS in wanted else 1
+    for number in range(most):
+        found = find_corrections(judged, [CONVENTIONS] if number else wanted)
+        kept = list(found.kept)
         if not found:
             break
-        content: MessageLog = module.read_sequence(next(iter(module.sequences(log))))
-        with Log(log) as opened:
-            content = found.put_on(replace(content, metadata=opened.metadata()))
-        log = log.parent / f"round_{number}" / log.name
-        log.parent.mkdir()
-        write_log(content, log, compression=compression, overwrite=overwrite)
-        notes += content.remarks.notes
-    log.replace(target)
-    return (*notes, *kept) or ("the motion shows nothing to correct",)
+        rounds.append(found)
+        if number + 1 == most:
+            break
+        small = log.parent / f"round_{number}" / log.name
+        small.parent.mkdir()
+        write_log(found.put_on(_content(judged, images=False)), small, compression="none")
+        judged = small
+    if not rounds:
+        log.replace(target)
+        return (*kept,) or ("the motion shows nothing to correct",)
+    content = _content(log)
+    for found in rounds:
+        content = found.put_on(content)
+    write_log(content, target, compression=compression, overwrite=overwrite)
+    return (*content.remarks.notes, *kept)
+
+
+def _content(log: Path, *, images: bool = True) -> MessageLog:
+    """Content of a log with its records."""
+    module = registry.load("imutool.converters", "mcap_log")
+    content: MessageLog = module.read_sequence(next(iter(module.sequences(log))), images=images)
+    with Log(log) as opened:
+        return replace(content, metadata=opened.metadata())

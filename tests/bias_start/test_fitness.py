@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import imutool
 from imutool.bias import linear, static
@@ -18,7 +19,7 @@ from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import from_numbers, relative_samples
 from imutool.errors import ModelError
 from imutool.inertial.stationary import white_noise
-from imutool.recording import Imu, Recording
+from imutool.recording import GRAVITY_M_S2, Imu, Recording
 from imutool.sensor.made_up_flight import flight
 
 WRONG = np.array([[0.04, -0.02, 0.01], [0.02, -0.05, 0.03], [-0.03, 0.02, 0.04]])
@@ -179,3 +180,21 @@ def test_a_bias_that_moves_from_stop_to_stop_is_doubtful(model: BiasModel) -> No
     assert "from stop to stop" not in " ".join(still.reasons)
     assert drifts.verdict == "doubtful"
     assert "from stop to stop" in " ".join(drifts.reasons)
+
+
+@pytest.mark.parametrize(("usual", "is_doubtful"), [(0.001, True), (0.02, False)])
+def test_a_bias_that_a_log_does_not_show_is_doubtful_where_it_may_as_well_be_none(usual: float, is_doubtful: bool) -> None:
+    """A boat that rolls and pitches, and turns about the vertical: gravity shows all but the bias about that."""
+    rng, t = np.random.default_rng(4), np.arange(0.0, 60.0, 0.01)
+    roll, pitch, yaw = 0.05 * np.sin(0.9 * t), 0.04 * np.sin(0.7 * t + 1.0), 0.3 * np.sin(0.2 * t)
+    turn = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
+    rates = (turn[:-1].inv() * turn[1:]).as_rotvec() / 0.01
+    gyro = np.concatenate([rates, rates[-1:]]) + 1e-3 * rng.normal(size=(len(t), 3))
+    accel = turn.inv().apply([0.0, 0.0, GRAVITY_M_S2]) + 0.02 * rng.normal(size=(len(t), 3))
+    statistics = {"prior_mean": np.array([0.0, 0.0, usual, 0.0, 0.0, 0.0]), "prior_std": np.array([7e-3] * 3 + [0.05] * 3)}
+    boat = linear.Model(linear.Config(), 100.0, statistics)
+    boat.card = {"name": "boat", "logs": [{}] * 3}
+    found = judged(boat, Imu((1e9 * t).astype(np.int64), gyro + np.array([0.0, 0.0, usual]), accel))
+    told = " ".join(found.reasons)
+    assert ("neither stops nor gravity shows the gyro's bias about z" in told) == is_doubtful, told
+    assert found.verdict == ("doubtful" if is_doubtful else "fits"), told

@@ -18,6 +18,7 @@ import pytest
 from numpy.random import default_rng
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
+from support.made_once import made_once
 from support.report_schema import assert_valid
 
 from imutool.blind_cases import ENVELOPE, FINDINGS, KEY, OPENED, REAL, SIM, catalogue, conceal, open_case, random_case
@@ -437,9 +438,12 @@ CASES: list[dict[str, Any]] = [
 @pytest.fixture(scope="module")
 def cases(trajectory: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Twenty, one of a kind each."""
-    folder = tmp_path_factory.mktemp("cases")
-    for k, case in enumerate(CASES):
-        conceal(trajectory, folder / f"{k}", seed=SEED + k, noise="bmi160", **case)
+
+    def make(folder: Path) -> None:
+        for k, case in enumerate(CASES):
+            conceal(trajectory, folder / f"{k}", seed=SEED + k, noise="bmi160", **case)
+
+    folder = made_once(tmp_path_factory, "cases", make)
     return [folder / f"{k}" for k in range(len(CASES))]
 
 

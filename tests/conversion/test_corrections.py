@@ -83,7 +83,7 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("late_s", [1.2, -45.0, 3_600.0, -1_600_000_000.0])
+@pytest.mark.parametrize("late_s", [1.2, -1_600_000_000.0])
 def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_path: Path, late_s: float) -> None:
     """As a motion capture gives them: a clock of its own, markers mounted askew, y up. Each error hides the next."""
     made = flight(3, duration_s=60.0, rate_hz=100.0, truth_rate_hz=50.0)
