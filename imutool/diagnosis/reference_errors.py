@@ -122,10 +122,21 @@ def reference_caveat(recordings: Sequence[Recording]) -> str:
 
 
 def _sharpened(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    columns = np.concatenate([motion.gyro, motion.accel], axis=1)
-    second = np.zeros_like(columns)
-    second[1:-1] = (columns[2:] - 2.0 * columns[1:-1] + columns[:-2]) * motion.rate_hz**2
-    return replace(motion, gyro=motion.gyro - theta[0] * second[:, :3], accel=motion.accel - theta[1] * second[:, 3:])
+    gyro, accel = (
+        _less_curvature(x, weight, motion.rate_hz) for x, weight in ((motion.gyro, theta[0]), (motion.accel, theta[1]))
+    )
+    return replace(motion, gyro=gyro, accel=accel)
+
+
+def _less_curvature(x: Float64[np.ndarray, "n 3"], weight: float, rate_hz: float) -> Float64[np.ndarray, "n 3"]:
+    """Columns less their second derivative times a weight, each column one piece of memory as before."""
+    out = x.copy(order="K")
+    second = x[2:] - 2.0 * x[1:-1]
+    second += x[:-2]
+    second *= rate_hz**2
+    second *= weight
+    out[1:-1] -= second
+    return out
 
 
 SMOOTHED = Effect(
