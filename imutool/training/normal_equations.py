@@ -37,6 +37,8 @@ MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
 REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
+SETTLED, MOST_STEPS = 0.2, 40  # deviations that a step moves a parameter; steps with windows of all lengths
+WEAK = 0.01  # of a prior's precision
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -166,9 +168,10 @@ class WindowSet:
 
 
 def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
-    """Gauss-Newton on all effects at once, from the shortest windows to all lengths.
+    """Gauss-Newton on all effects at once, from the shortest windows to all lengths, until the parameters settle.
 
-    Without `own_prior` nuisances get a prior as wide as the logs scatter, once all lengths are in.
+    Without `own_prior` nuisances get a prior as wide as the logs scatter, once all lengths are in. Up to then the parameters
+    have a weak prior: what it left of a large effect would count as noise, which would keep the prior strong.
 
     Raises:
         DataError: a log without a window that is free of gaps.
@@ -177,10 +180,10 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     std = np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)])
     prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
-    theta, own = torch.zeros_like(prior), prior.new_zeros(logs, len(width))
+    theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
     terms = torch.from_numpy(_terms(seen.signals, effects)).to(seen.pool.t)
     pattern = torch.from_numpy(patterns(effects)).to(seen.pool.t)
-    for step in range(len(sets) + 2):
+    for step in range(len(sets) + MOST_STEPS):
         fit = judged = Equations.none(prior, logs, len(prior) + len(width))
         size = seen.pool.least(seen.sensor)
         error = terms @ torch.einsum("iqp,p->qi", pattern, theta)
@@ -190,19 +193,18 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
-        problem = Problem(theta, own, prior, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
-        if step < len(sets) + 1:
-            theta = problem.solve(range(len(prior))).theta
-            own = problem.own_at(theta)
+        at_first = prior if step >= len(sets) else WEAK * prior
+        problem = Problem(theta, own, at_first, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
+        if step > len(sets) and settled:
+            break
+        found = problem.solve(range(len(prior)))
+        settled = bool(((found.theta - theta).abs() < SETTLED * found.covariance.diagonal().sqrt()).all())
+        theta, own = found.theta, problem.own_at(found.theta)
     return problem
 
 
 def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
-    """Windows of all lengths that fit, half overlapping, evenly chosen where there are many.
-
-    Raises:
-        DataError: a log has none of the shortest.
-    """
+    """Windows of all lengths that fit, half overlapping, evenly chosen where there are many."""
     pool, sets = seen.pool, []
     for length_s in WINDOW_S[seen.sensor]:
         n = pool.samples(length_s)

@@ -52,11 +52,11 @@ def measured(recording: Recording, effects: Sequence[LinearForm], theta: np.ndar
     return Recording(recording.name, Imu(imu.t_ns, u["gyro"], u["accel"]), recording.truths)
 
 
-def planted_theta(effects: Sequence[LinearForm]) -> np.ndarray:
-    """A third of what is plausible, alternately up and down."""
+def planted_theta(effects: Sequence[LinearForm], of_plausible: float = 0.3) -> np.ndarray:
+    """A share of what is plausible, alternately up and down."""
     plausible = np.concatenate([SensorPrior().std_of(effect) for effect in effects])
     signs = np.where(np.arange(len(plausible)) % 2, -1.0, 1.0)
-    return 0.3 * plausible * signs
+    return of_plausible * plausible * signs
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +77,14 @@ def without_effects(three: Callable[[int], list[Recording]]) -> Callable[[int, S
 
 
 def found(
-    flights: Sequence[Recording], sensor: Sensor, effects: Sequence[LinearForm], names: Sequence[str] | None = None
+    flights: Sequence[Recording],
+    sensor: Sensor,
+    effects: Sequence[LinearForm],
+    names: Sequence[str] | None = None,
+    of_plausible: float = 0.3,
 ) -> Calibration:
     """The calibration of flights with effects planted on one sensor; the other's errors are its rest bias alone."""
-    theta = planted_theta(effects) if effects else np.zeros(0)
+    theta = planted_theta(effects, of_plausible) if effects else np.zeros(0)
     pool = Pool.of([measured(flight, effects, theta, seed) for seed, flight in enumerate(flights)])
     true_gyro = torch.cat([torch.tensor(flight.overlap().imu.gyro) for flight in flights])
     return calibrate(pool, sensor, pool.gyro if sensor == "gyro" else true_gyro, names)
@@ -107,6 +111,13 @@ def test_a_planted_effect_is_found_and_named_and_no_other(flights: list[Recordin
     z = z_scores(calibration, np.array([planted.get(key, 0.0) for key in of_effects(calibration.effects, sensor)]))
     assert np.abs(z).max() < SURE, z
     assert calibration.unseen == ()
+
+
+def test_an_effect_far_beyond_its_prior_is_not_held_back_by_it(flights: list[Recording]) -> None:
+    """What the first steps leave of it counts as noise, and the prior outweighs that: many more have to follow."""
+    effects = catalogue.trained("gyro", ["gyro_g_sensitivity"])
+    calibration = found(flights, "gyro", effects, ["gyro_g_sensitivity"], of_plausible=10.0)
+    np.testing.assert_allclose(calibration.theta.numpy(), planted_theta(effects, 10.0), rtol=0.05)
 
 
 @pytest.mark.parametrize("first", OTHERS[1:3])
