@@ -2,9 +2,9 @@
 
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
 (`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
-the same form as a nuisance is what the logs have in common. The unknowns of a log are eliminated log by log (Schur's
-complement), so that one solve of a matrix as small as theta predicts a log from all others. An effect's error is linear in its
-parameters: with a window's residual and Jacobian (`imutool.inertial.windows`), the rest is a product of matrices.
+the same form as a nuisance is what the logs have in common. The unknowns of a log are eliminated log by log (Schur's complement),
+so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the parameters: with a
+window's residual and Jacobian (`imutool.inertial.windows`), the rest is a product of matrices.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ MAX_SAMPLES = 150_000  # of one window length
 CHUNK = 20_000  # samples at a time
 REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
-SETTLED, MOST_STEPS = 0.2, 40  # deviations that a step moves a parameter; steps with windows of all lengths
-WEAK = 0.01  # of a prior's precision
+SETTLED, MOST_STEPS, WEAK = 0.2, 40, 0.01  # deviations a parameter moves; steps of all lengths; of a prior's precision
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -168,7 +167,7 @@ class WindowSet:
 
 
 def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
-    """Gauss-Newton on all effects at once, from the shortest windows to all lengths, until the parameters settle.
+    """Gauss-Newton on all effects at once, from the shortest windows to all lengths.
 
     Without `own_prior` nuisances get a prior as wide as the logs scatter, once all lengths are in. Up to then the parameters
     have a weak prior: what it left of a large effect would count as noise, which would keep the prior strong.
@@ -177,8 +176,7 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
         DataError: a log without a window that is free of gaps.
     """
     sets, logs = _window_sets(seen, part), len(seen.pool.names)
-    std = np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)])
-    prior = torch.from_numpy(std**-2.0).to(seen.pool.t)
+    prior = torch.from_numpy(np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)]) ** -2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
     terms = torch.from_numpy(_terms(seen.signals, effects)).to(seen.pool.t)
@@ -193,8 +191,8 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
-        at_first = prior if step >= len(sets) else WEAK * prior
-        problem = Problem(theta, own, at_first, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
+        now = prior * (1.0 if step >= len(sets) else WEAK)
+        problem = Problem(theta, own, now, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
         if step > len(sets) and settled:
             break
         found = problem.solve(range(len(prior)))
