@@ -6,12 +6,13 @@ log ─ kinematics ─> Kinematics ─ kinematic_fit ─> KinematicFit ─ motio
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
-from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
+from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults, units
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
@@ -94,9 +95,9 @@ def _faults(
     """Faults, and spectral lines whose cause the poses do not show."""
     if not sim.truths:
         raise sim.no_truth("a simulation without poses", "a simulation with the poses of its body")
-    moved = kinematics(sim)
+    sim, moved, by_motion = _in_si(sim)
     fit = kinematic_fit(moved)
-    by_motion = motion_faults(moved, fit)
+    by_motion += motion_faults(moved, fit)
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
     arm = np.array([fit.estimates[axis].value for axis in AXES])
@@ -109,6 +110,18 @@ def _faults(
     if real is not None and real.truths:
         faults += _body_centre(fit, real, mounts)
     return faults, untold
+
+
+def _in_si(sim: Recording) -> tuple[Recording, Kinematics, list[FaultFound]]:
+    """A simulation with its motion, in SI units, and the sensors that were in others."""
+    moved = kinematics(sim)
+    factor = units(moved)
+    if set(factor.values()) == {1.0}:
+        return sim, moved, []
+    wrong = [found("wrong_unit", sensor, scale=Estimate(1.0 / by, 0.0, "-")) for sensor, by in factor.items() if by != 1.0]
+    imu = replace(sim.imu, gyro=sim.imu.gyro * factor["gyro"], accel=sim.imu.accel * factor["accel"])
+    moved = replace(moved, gyro=moved.gyro * factor["gyro"], accel=moved.accel * factor["accel"])
+    return replace(sim, imu=imu), moved, wrong
 
 
 def simulator_remarks(sim: Recording) -> list[str]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.fft import dct
 from scipy.optimize import minimize_scalar
 from scipy.signal import spectrogram
+from scipy.stats import gamma
 
 from imutool.array_types import Float64
 from imutool.diagnosis.audit.faults import FaultFound, found
@@ -21,6 +22,7 @@ from imutool.recording.columns import true_ranges
 from imutool.units import SENSORS, UNITS, Sensor
 
 Six = Float64[np.ndarray, "n 6"]
+Column = Float64[np.ndarray, " k"]
 ABSENT = 0.02  # of the expected noise: less is none
 ALIKE = 1.35  # factor between two densities that are one: a data sheet is typical
 SAME_SAMPLE = 1.12  # factor between the noise of two samples that was meant to be one
@@ -34,7 +36,7 @@ CONSEQUENCES = {
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
 LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
-SEGMENT = 1024
+SEGMENT, SHORT = 1024, 32
 QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
 REST = 20  # equal samples in a row
@@ -44,12 +46,13 @@ WALK_SHARES, WALKS = np.geomspace(0.03, 1.0, 8), 2.0  # of the expected walk; lo
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Expected noise: density and walk by column, the recording's rate, its samples."""
+    """Expected noise: density and walk by column, the recording's rate, its samples and their digits."""
 
     density: Float64[np.ndarray, "6"]
     walk: Float64[np.ndarray, "6"]
     rate_hz: float | None = None
     samples: Six | None = None
+    lsb: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
 
     @classmethod
     def of_sheet(cls, noise: Noise) -> Expected:
@@ -63,13 +66,30 @@ class Expected:
     def of_recording(cls, imu: Imu) -> Expected:
         """Density of a recording's samples; how far its bias walks is not known."""
         samples = np.concatenate([imu.gyro, imu.accel], axis=1)
-        return cls(
-            fast_noise(samples, 1.0 / imu.period_s) * np.sqrt(imu.period_s), np.full(6, np.nan), 1.0 / imu.period_s, samples
-        )
+        lsb = np.array([grid(column) for column in samples.T])
+        density = fast_noise(samples, 1.0 / imu.period_s, lsb) * np.sqrt(imu.period_s)
+        return cls(density, np.full(6, np.nan), 1.0 / imu.period_s, samples, lsb)
+
+    def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
+        """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
+        part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
+        density, lsb = float(np.nanmedian(self.density[part])), float(np.median(self.lsb[part]))
+        least = _without_digits(density * np.sqrt(self.rate_hz or rate_hz), lsb) / np.sqrt(self.rate_hz or rate_hz)
+        return least * np.sqrt(rate_hz), density * np.sqrt(rate_hz)
 
 
-def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndarray, " k"]:
+def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float, lsb: Column | float = 0.0) -> Column:
     """White noise of a sample (deviation) at high frequency, in the calm quarter of a log.
+
+    A line is seen apart in long segments, and a body that never rests is calm for the short ones between two impacts. So the
+    noise is the least of both. `lsb` are the digits: where coarse, a reading that stays says nothing.
+    """
+    long = _between_lines(x, rate_hz)
+    return np.where(lsb > long, long, np.minimum(long, _between_impacts(x)))
+
+
+def _between_lines(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Column:
+    """Noise by the median of the frequencies.
 
     The median of n exponential powers is ln 2 of their mean, and scatters by 1 / sqrt(n) of that. Steps and impacts are louder.
     """
@@ -78,6 +98,18 @@ def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndar
     levels = np.median(power[band], axis=0)
     quarter = np.log(2.0) - QUARTILE * np.sqrt(HANN / band.sum()) * (levels.shape[-1] > 1)
     return np.asarray(np.sqrt(np.quantile(levels, 0.25, axis=-1) / quarter * rate_hz / 2.0))
+
+
+def _between_impacts(x: Float64[np.ndarray, "n k"]) -> Column:
+    """Noise by the mean of the frequencies, in segments that end before the next foot strikes.
+
+    Their powers are gamma distributed: neighbours of a Hann window share 4/9 of it, those next to them 1/36.
+    """
+    f, _, power = spectrogram(x, 1.0, window="hann", nperseg=min(SHORT, len(x)), axis=0)
+    levels = power[(f > 0.25) & (f < 0.48)]
+    n = len(levels)
+    shape = n**2 / (n + 2.0 * (n - 1) * 4.0 / 9.0 + 2.0 * (n - 2) / 36.0)
+    return np.asarray(np.sqrt(np.quantile(levels.mean(axis=0), 0.25, axis=-1) / gamma.ppf(0.25, shape) * shape / 2.0))
 
 
 def noise_faults(
@@ -94,9 +126,11 @@ def noise_faults(
     out += _repeated(samples)
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
-        own = float(np.median(fast_noise(residual[:, part], rate_hz)))
+        lsb = np.array([grid(column) for column in samples[:, part].T])
+        own = float(np.median(fast_noise(residual[:, part], rate_hz, lsb)))
+        noise = _without_digits(own, float(np.median(lsb))), own
         for reference in expected:
-            out += _density(sensor, own, rate_hz, float(np.nanmedian(reference.density[part])), reference.rate_hz)
+            out += _density(sensor, noise, rate_hz, reference)
             out += _walk(sensor, residual[:, part], rate_hz, own, reference.walk[part])
             if reference.samples is not None and reference.rate_hz is not None:
                 out += _clipping(sensor, samples[:, part], reference.samples[:, part])
@@ -112,21 +146,27 @@ def _follows(fault: str, signal: str, others: list[FaultFound]) -> bool:
     return any(fault in CONSEQUENCES.get(other.fault, ()) for other in others if other.signal in (signal, "both"))
 
 
-def _density(sensor: Sensor, own: float, rate_hz: float, density: float, real_hz: float | None) -> Iterator[FaultFound]:
+def _density(sensor: Sensor, noise: tuple[float, float], rate_hz: float, expected: Expected) -> Iterator[FaultFound]:
     """Noise absent, of a sample at another rate (or a density taken for a sample's), or of another density."""
-    if not density > 0.0:
+    (least, most), own = expected.sample(sensor, rate_hz), noise[1]
+    if not most > 0.0:
         return
-    expected = density * np.sqrt(rate_hz)
-    ratio = own / expected
-    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(expected, 0.0, UNITS[sensor])}
-    meant = density if real_hz is None else density * np.sqrt(real_hz)  # a sample's, as it was given
+    ratio = max(noise[0] / most, 1.0) * min(own / max(least, 1e-300), 1.0)
+    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(most, 0.0, UNITS[sensor])}
+    real_hz = expected.rate_hz
+    meant = most / np.sqrt(rate_hz) * (1.0 if real_hz is None else np.sqrt(real_hz))  # a sample's, as it was given
     other_rate = real_hz is None or max(real_hz / rate_hz, rate_hz / real_hz) > OTHER_RATE
-    if ratio < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
+    if own / most < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
         yield found("noise_absent", sensor, **numbers)
     elif other_rate and 1.0 / SAME_SAMPLE < own / meant < SAME_SAMPLE:
         yield found("noise_per_sample", sensor, **numbers)
     elif not 1.0 / ALIKE < ratio < ALIKE:
         yield found("noise_density", sensor, **numbers)
+
+
+def _without_digits(noise: float, lsb: float) -> float:
+    """Least noise of samples whose digits may add up to LSB / sqrt(12)."""
+    return float(np.sqrt(max(noise**2 - lsb**2 / 12.0, 0.0)))
 
 
 def _walk(

@@ -2,6 +2,7 @@
 
 A gait, a rotor and a control that is held for some steps move a body in lines, too. Poses that were neither smoothed nor
 averaged show them: differences of poses follow a rate as sinc(f T), an acceleration as sinc(f T)^2, T being their period.
+A simulator reads its IMU at instants, so a motion beyond half of its rate folds; the poses fold it at their own rate.
 """
 
 from __future__ import annotations
@@ -73,17 +74,21 @@ def spectral_lines(
         above &= np.sqrt(2.0 * HANN * left.power * width_hz) > LEAST[sensor]
         lines = np.flatnonzero(above & left.certain & left.steady & (np.minimum(left.ratio, whole.ratio) > ABOVE))
         strongest = lines[np.argsort(-left.ratio[lines])]
-        causes = [_cause(float(left.f_hz[line]), float(left.power[line]), by_poses, poses_hz, order) for line in strongest]
+        causes = [
+            _cause(float(left.f_hz[line]), rate_hz, float(left.power[line]), by_poses, poses_hz, order) for line in strongest
+        ]
         first = next((cause for cause in told if cause in causes), None)
         if first is not None:
             out.append(SpectralLine(sensor, float(left.f_hz[strongest[causes.index(first)]]), width_hz, first))
     return out
 
 
-def _cause(f_hz: float, power: float, shown: Spectrum, poses_hz: float, order: int) -> Cause:
+def _cause(f_hz: float, rate_hz: float, power: float, shown: Spectrum, poses_hz: float, order: int) -> Cause:
     """What a line comes from: the poses show it, or nothing as large, or cannot show it."""
     near = np.abs(shown.f_hz - f_hz) < 2.0 * shown.f_hz[1]
-    if (near & shown.certain & (shown.ratio > ABOVE)).any():
+    folded = np.array([abs(f - poses_hz * round(f / poses_hz)) for f in (rate_hz - f_hz, rate_hz + f_hz)])
+    lines = (near | (np.abs(shown.f_hz[:, None] - folded) < 2.0 * shown.f_hz[1]).any(axis=1)) & shown.certain
+    if (lines & (shown.ratio > ABOVE)).any():
         return "motion"
     expected = power * np.sinc(f_hz / poses_hz) ** order
     known = f_hz < KNOWN_SHARE * poses_hz and near.any()
