@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from imutool.diagnosis.audit.bandwidth import most_filter_delay
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
-from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults, units
+from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults, units
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
+from imutool.diagnosis.audit.timing import CERTAIN
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
@@ -97,11 +99,12 @@ def _faults(
         raise sim.no_truth("a simulation without poses", "a simulation with the poses of its body")
     sim, moved, by_motion = _in_si(sim)
     fit = kinematic_fit(moved)
-    by_motion += motion_faults(moved, fit)
+    samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
+    late = [most_filter_delay(fit.residual[:, part], samples[:, part]) for part in (slice(0, 3), slice(3, 6))]
+    by_motion += motion_faults(moved, fit, (late[0], late[1]))
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
     arm = np.array([fit.estimates[axis].value for axis in AXES])
-    samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
     lines_found = spectral_lines(samples, fit.residual, rate_hz, *by_differences(sim.truth, arm))
     faults, untold = noise_faults(sim.imu, fit.residual, expected, lines_found)
     if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step

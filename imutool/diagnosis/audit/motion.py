@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from imutool.array_types import Float64
 from imutool.diagnosis.audit.axes import Hypotheses
 from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
 from imutool.diagnosis.result import Estimate
 from imutool.errors import DataError
 from imutool.inertial.kinematics import G_W
@@ -37,14 +38,8 @@ BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
 LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
 BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
-AS_CERTAIN = 1.25  # times the deviation in the whole band, up to which a slower one is taken
+AGREE = 3.0  # standard deviations by which two bands may differ
 BIAS_RIDGE = 1e-6  # of a bias: a body that stays level shows it and gravity alike, and gravity is the larger
-CERTAIN = 6.0  # standard deviations
-NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
-LEAST_DELAY = 0.05  # of a sample period: less is rounding
-LEAST_GYRO_DELAY = 0.3  # of a sample period: half of a finer step is that of a semi-implicit integrator
-HALF = 0.6  # of a delay by one step: half of it, and errors
-PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
 LEAST_ARM_M, LEAST_S = 5e-3, 5.0
 OTHER_UNIT: Mapping[Sensor, float] = {"gyro": np.pi / 180.0, "accel": 9.80665}  # deg/s, standard gravity
 NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
@@ -157,16 +152,19 @@ def _hypotheses(k: Kinematics, parts: Float64[np.ndarray, "n 3 p"], *, free_bias
     return Hypotheses(k.shown(parts), k.shown(np.einsum("nij,njp->nip", k.R_wb, parts)), free_bias=free_bias)
 
 
-def motion_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
-    """Faults of gravity, frame, axes, transport term, point and timing."""
-    timing = _timing_faults(fit.estimates, k.period_s)
+def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float] = (0.0, 0.0)) -> list[FaultFound]:
+    """Faults of gravity, frame, axes, transport term, point and timing.
+
+    Delays (in sample periods) up to those of the sensors' own `filters` are no fault.
+    """
+    timing = timing_faults(fit.estimates, k.period_s, filters)
     return [*_frame_faults(fit), *_force_faults(fit), *timing, *_arm_faults(fit.estimates)]
 
 
 def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
-    arm = {axis: _with_unit(estimates[axis], "m") for axis in AXES}
+    arm = {axis: with_unit(estimates[axis], "m") for axis in AXES}
     far = np.linalg.norm([r.value for r in arm.values()]) > LEAST_ARM_M
-    return [found("lever_arm", "accel", **arm)] if far and any(_clear(r) for r in arm.values()) else []
+    return [found("lever_arm", "accel", **arm)] if far and any(clear(r) for r in arm.values()) else []
 
 
 def _frame_faults(fit: KinematicFit) -> list[FaultFound]:
@@ -181,59 +179,13 @@ def _force_faults(fit: KinematicFit) -> list[FaultFound]:
     out = []
     gravity = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
     for whole, name in gravity.items():
-        if abs(k.value - whole) < NEAR and _clear(k, 1.0):
+        if abs(k.value - whole) < NEAR and clear(k, 1.0):
             out.append(found(name, "accel", gravity=k))
-    if abs(m.value) < NEAR and _clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
+    if abs(m.value) < NEAR and clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
         out.append(found("gravity_only", "accel", acceleration=m))
-    elif abs(c.value - 1.0) < 2.0 * NEAR and _clear(c):
+    elif abs(c.value - 1.0) < 2.0 * NEAR and clear(c):
         out.append(found("transport_term", "accel", missing=c))
     return out
-
-
-def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[FaultFound]:
-    """Delays of the gyro, of the acceleration and of its attitude, in sample periods.
-
-    A semi-implicit integrator makes all velocities late alike, by half of its step. So the acceleration counts from the gyro
-    where the gyro is late by a part of a step, unless both are differences of explicit states. No difference and no integrator
-    makes the attitude late: where it is, a step of the physics lies between reading and stamp, however short.
-    """
-    gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
-    steps = {"gyro": _delay(gyro, period_s, LEAST_GYRO_DELAY), "accel": _delay(accel, period_s, LEAST_DELAY)}
-    together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
-    whole = together and steps["accel"] in ("step_delay", "early_stamps")
-    if abs(attitude.value) >= LEAST_DELAY * period_s and _clear(attitude) and _is_late_alike(accel, attitude):
-        whole = together = True
-        name = "step_delay" if attitude.value > 0.0 else "early_stamps"
-        steps |= {signal: name for signal, tau in (("gyro", gyro), ("accel", accel)) if _is_late_alike(tau, attitude)}
-    after_gyro = Estimate(accel.value - gyro.value, float(np.hypot(accel.std, gyro.std)), "-")
-    explained = abs(gyro.value) < PART * period_s and abs(after_gyro.value) < PART * period_s  # it makes no whole step
-    if explained and steps["gyro"] != steps["accel"] and not whole:
-        accel, steps["accel"] = after_gyro, _delay(after_gyro, period_s, LEAST_DELAY)
-    late = {"gyro": gyro, "accel": accel}
-    out = []
-    for name in ("step_delay", "early_stamps"):
-        signals = [signal for signal, kind in steps.items() if kind == name and (signal == "gyro" or together)]
-        if signals:
-            signal = "both" if len(signals) == 2 else signals[0]
-            out.append(found(name, signal, delay=_with_unit(late[signals[0]], "s")))
-    for signal, kind in steps.items():
-        if kind == "backward_difference" and (signal == "gyro" or abs(attitude.value) < 0.5 * abs(accel.value)):
-            tau = late[signal]
-            out.append(found(kind, signal, delay=_with_unit(tau, "s"), step=Estimate(2.0 * tau.value, 2.0 * tau.std, "s")))
-    return out
-
-
-def _is_late_alike(tau: Estimate, attitude: Estimate) -> bool:
-    """Whether a signal is late as its attitude is, but for half a step of an integrator."""
-    return abs(tau.value - attitude.value) < HALF * abs(attitude.value) + 3.0 * float(np.hypot(tau.std, attitude.std))
-
-
-def _delay(tau: Estimate, period_s: float, least: float) -> str:
-    """Name of a delay: half a step or less, a whole step, a step early; empty for none or another."""
-    steps = tau.value / period_s if _clear(tau) else 0.0
-    if abs(steps) > WHOLE:
-        return "step_delay" if steps > 0.0 else "early_stamps"
-    return "backward_difference" if least <= steps < PART else ""
 
 
 def _which(flags: tuple[bool, ...]) -> list[str]:
@@ -243,31 +195,28 @@ def _which(flags: tuple[bool, ...]) -> list[str]:
     return [signal for signal, flag in zip(("gyro", "accel"), flags, strict=True) if flag]
 
 
-def _clear(estimate: Estimate, ideal: float = 0.0) -> bool:
-    return abs(estimate.value - ideal) > CERTAIN * estimate.std
-
-
-def _with_unit(estimate: Estimate, unit: str) -> Estimate:
-    return Estimate(estimate.value, estimate.std, unit)
-
-
 def _solved(
     k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"], ideal: Float64[np.ndarray, " p"]
 ) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"], Vectors]:
     """Coefficients with deviations, and the whole residual.
 
-    What smoothing takes of a motion grows with its frequency, and looks like a part. So each coefficient is that of the slowest
-    band which shows it as well.
+    A part is the same at every frequency. What smoothing takes of a motion grows at least with the square of its frequency, and
+    looks like a part. So where slower bands contradict the whole one (Hausman's test), the difference tells this error of each
+    band, and the band with the least deviation of both kinds is taken.
     """
     p = x.shape[2]
     whole, target = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2), y - x @ ideal
-    least_hz = LEAST_BLOCK / BLOCK_S
-    (theta, std), *slower = (_in_band(replace(k, band_hz=max(share * k.band_hz, least_hz)), target, whole) for share in BANDS)
-    chosen, most = theta.copy(), AS_CERTAIN * std
-    for other, its_std in slower:
-        chosen = np.where(its_std <= most, other, chosen)
-        std = np.where(its_std <= most, its_std, std)
-    return ideal + chosen[:p], std[:p], np.asarray(target - whole @ theta)
+    bands = sorted({max(share * k.band_hz, LEAST_BLOCK / BLOCK_S) for share in BANDS}, reverse=True)
+    each = [_in_band(replace(k, band_hz=band_hz), target, whole) for band_hz in bands]
+    theta, std = (np.array(values) for values in zip(*each, strict=True))
+    square = (np.array(bands)[:, None] / bands[0]) ** 2
+    with np.errstate(invalid="ignore"):  # of parts that the motion does not show, whose deviation is infinite
+        by_chance = AGREE * np.sqrt(np.maximum(std**2 - std[0] ** 2, 0.0))
+    apart = np.abs(theta - theta[0])
+    error = np.max(np.where(apart > by_chance, apart, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
+    total = np.hypot(std, square * error)
+    best = total.argmin(axis=0), np.arange(p + 3)
+    return ideal + theta[best][:p], total[best][:p], np.asarray(target - whole @ theta[0])
 
 
 def _in_band(

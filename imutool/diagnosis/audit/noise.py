@@ -12,6 +12,7 @@ from scipy.signal import spectrogram
 from scipy.stats import gamma
 
 from imutool.array_types import Float64
+from imutool.diagnosis.audit.bandwidth import bandwidth_faults
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.spectral_lines import HANN, SpectralLine
 from imutool.diagnosis.estimation.timestamps import grid, limits
@@ -28,7 +29,6 @@ ALIKE = 1.35  # factor between two densities that are one: a data sheet is typic
 SAME_SAMPLE = 1.12  # factor between the noise of two samples that was meant to be one
 OTHER_RATE = 1.5  # factor between the rates from which they differ
 OVER_LIMIT = 1.02  # of the recording's limit, from which a reading was not clipped
-FALLS, STEP, WHITE = 0.35, 0.75, 0.75  # of the noise that is left near Nyquist, and from band to band; of white noise
 CONSEQUENCES = {
     "noise_absent": ("step_lines", "bias_never_walks", "noise_density", "noise_per_sample", "bandwidth_absent"),
     "repeated_samples": ("step_lines", "noise_density", "noise_per_sample", "bandwidth_absent"),
@@ -36,7 +36,7 @@ CONSEQUENCES = {
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
 LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
-SEGMENT, SHORT = 1024, 32
+SEGMENT, SHORT = 1024, (32, 16)  # samples
 QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
 REST = 20  # equal samples in a row
@@ -85,7 +85,7 @@ def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float, lsb: Column | floa
     noise is the least of both. `lsb` are the digits: where coarse, a reading that stays says nothing.
     """
     long = _between_lines(x, rate_hz)
-    return np.where(lsb > long, long, np.minimum(long, _between_impacts(x)))
+    return np.where(lsb > long, long, np.minimum(long, np.minimum(*(_between_impacts(x, size) for size in SHORT))))
 
 
 def _between_lines(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Column:
@@ -100,12 +100,12 @@ def _between_lines(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Column:
     return np.asarray(np.sqrt(np.quantile(levels, 0.25, axis=-1) / quarter * rate_hz / 2.0))
 
 
-def _between_impacts(x: Float64[np.ndarray, "n k"]) -> Column:
+def _between_impacts(x: Float64[np.ndarray, "n k"], size: int) -> Column:
     """Noise by the mean of the frequencies, in segments that end before the next foot strikes.
 
     Their powers are gamma distributed: neighbours of a Hann window share 4/9 of it, those next to them 1/36.
     """
-    f, _, power = spectrogram(x, 1.0, window="hann", nperseg=min(SHORT, len(x)), axis=0)
+    f, _, power = spectrogram(x, 1.0, window="hann", nperseg=min(size, len(x)), axis=0)
     levels = power[(f > 0.25) & (f < 0.48)]
     n = len(levels)
     shape = n**2 / (n + 2.0 * (n - 1) * 4.0 / 9.0 + 2.0 * (n - 2) / 36.0)
@@ -136,7 +136,7 @@ def noise_faults(
                 out += _clipping(sensor, samples[:, part], reference.samples[:, part])
                 out += _digits(sensor, samples[:, part], reference.samples[:, part])
                 sims = (residual[:, part], samples[:, part])
-                out += _bandwidth(sensor, sims, rate_hz, reference.samples[:, part], reference.rate_hz)
+                out += bandwidth_faults(sensor, sims, rate_hz, reference.samples[:, part], reference.rate_hz)
     untold = [line for line in lines if line.cause == "unknown" and not _follows("step_lines", line.sensor, out)]
     return [fault for fault in out if not _follows(fault.fault, fault.signal, out)], untold
 
@@ -207,39 +207,6 @@ def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.nd
     lsb = float(np.median(steps))
     if min(steps) > LEAST_LSB * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
         yield found("digits_absent", sensor, lsb=Estimate(lsb, 1e-3 * lsb, UNITS[sensor]))
-
-
-def _bandwidth(
-    sensor: Sensor,
-    sims: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]],
-    sim_hz: float,
-    real: Float64[np.ndarray, "k 3"],
-    real_hz: float,
-) -> Iterator[FaultFound]:
-    """White noise near the recording's Nyquist frequency, where the recording's has fallen.
-
-    `sims` are what the motion leaves of the simulation, and all of it: where a body moves in these bands, a fall is that of
-    its motion.
-    """
-    nyquist_hz = min(sim_hz, real_hz) / 2.0
-    white = all(middle * near > WHITE for middle, near in (_left(x, sim_hz, nyquist_hz) for x in sims))
-    middle, near = _left(real, real_hz, nyquist_hz)
-    if white and middle * near < FALLS and max(middle, near) < STEP:
-        yield found("bandwidth_absent", sensor, left=Estimate(middle * near, 0.1 * middle * near, "-"))
-
-
-def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
-    """Power that is left from band to band, towards a Nyquist frequency, in the calm quarter of a log."""
-    f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=min(SEGMENT, len(x)), axis=0)
-    loud = parts[f_hz > BANDS[0][0] * nyquist_hz].sum(axis=0)
-    power = np.stack(
-        [p[:, q <= np.quantile(q, 0.25)].mean(axis=1) for p, q in zip(parts.swapaxes(0, 1), loud, strict=True)], axis=1
-    )
-    low, middle, near = (float(np.median(power[(f_hz > a * nyquist_hz) & (f_hz < b * nyquist_hz)])) for a, b in BANDS)
-    return middle / max(low, 1e-300), near / max(middle, 1e-300)
-
-
-BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
 
 
 def _repeated(samples: Six) -> Iterator[FaultFound]:
