@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import spectrogram
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -69,7 +69,7 @@ class Shown(NamedTuple):
     def at(self, f_hz: float, power: float) -> tuple[Bool[np.ndarray, " f"], float, float]:
         """Where a motion folds to, the power that a line of it would have there, and the largest that is there."""
         f = self.spectrum.f_hz
-        near = np.asarray(np.abs(f - abs(f_hz - self.rate_hz * round(f_hz / self.rate_hz))) < 2.0 * f[1])
+        near = np.asarray(np.abs(f - abs(f_hz - self.rate_hz * round(f_hz / self.rate_hz))) < 2.5 * f[1])
         return near, power * float(np.sinc(f_hz / self.rate_hz) ** self.order), float(self.spectrum.power[near].max())
 
 
@@ -93,7 +93,8 @@ def spectral_lines(
         above &= np.sqrt(2.0 * HANN * left.power * width_hz) > LEAST[sensor]
         lines = np.flatnonzero(above & left.certain & left.steady & (np.minimum(left.ratio, whole.ratio) > ABOVE))
         strongest = lines[np.argsort(-left.ratio[lines])]
-        each = [(float(left.f_hz[line]), rate_hz, float(left.power[line]), by_poses) for line in strongest]
+        peak = maximum_filter1d(left.power, 5)  # as `Shown.at` looks for it
+        each = [(float(left.f_hz[line]), rate_hz, float(peak[line]), by_poses) for line in strongest]
         causes = [_cause(*line) for line in each]
         if "motion" in causes:  # a body that moves in lines has harmonics, too
             causes = [
