@@ -1,4 +1,4 @@
-"""Frame (body or world), signed axes P and unit in which a sensor reads the parts of its motion."""
+"""Unit, frame (body or world) and signed axes P in which a sensor reads its motion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest a
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Parts of a motion in both frames, of which a signal may be made; its bias is free, or at most `MOST_BIAS`."""
+    """Parts of a motion in both frames, of which a signal may be made.
+
+    Its bias is free, or at most `MOST_BIAS`.
+    """
 
     body: Parts
     world: Parts

@@ -1,4 +1,4 @@
-"""Bandwidth of a sensor by its noise, in the calm quarter of a log: where a filter makes it fall, and how late."""
+"""Bandwidth of a sensor by its noise: where a filter makes it fall, and how late it is."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ FOURTH_ORDER = 0.42  # of the period of its cut-off, by which a Butterworth filt
 
 
 def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.ndarray, "m 3"]) -> float:
-    """Most (sample periods) by which a filter that the noise shows delays a sensor; 0 for white noise."""
+    """Most delay (sample periods) of a filter that the noise shows; 0 for white noise.
+
+    Quartiles of short segments are those between two impacts.
+    """
     both = []
     for x in (residual, samples):
         f, _, parts = spectrogram(x, 1.0, window="hann", nperseg=min(SHORT, len(x)), axis=0)

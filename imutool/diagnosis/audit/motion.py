@@ -134,7 +134,7 @@ def kinematic_fit(k: Kinematics) -> KinematicFit:
 
 
 def units(k: Kinematics) -> dict[Sensor, float]:
-    """What the samples of each sensor have to be multiplied by: 1, or what makes rad/s of deg/s and m/s² of g."""
+    """Factor of each sensor's samples: 1, or what makes rad/s of deg/s and m/s² of g."""
     samples, parts = {"gyro": k.gyro, "accel": k.accel}, {"gyro": k.omega[:, :, None], "accel": _force_parts(k)}
     return {
         sensor: _hypotheses(k, parts[sensor], free_bias=sensor == "gyro").unit(k.shown(samples[sensor]), OTHER_UNIT[sensor])

@@ -46,7 +46,7 @@ WALK_SHARES, WALKS = np.geomspace(0.03, 1.0, 8), 2.0  # of the expected walk; lo
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Expected noise: density and walk by column, the recording's rate, its samples and their digits."""
+    """Expected noise by column; of a recording also its rate, samples and digits."""
 
     density: Float64[np.ndarray, "6"]
     walk: Float64[np.ndarray, "6"]

@@ -1,4 +1,4 @@
-"""Timing of a simulated IMU: differences, delays and early stamps, by what each of them moves."""
+"""Timing of a simulated IMU: differences, delays, early stamps, by what each moves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a who
 
 
 def timing_faults(estimates: Mapping[str, Estimate], period_s: float, filters: tuple[float, float]) -> list[FaultFound]:
-    """Faults of timing by the delays of the gyro, of the acceleration and of its attitude (tau_g, tau_a, tau_f).
+    """Faults of timing, by the delays of gyro, acceleration and attitude.
 
     Delays up to those of the sensors' own `filters` (sample periods) are no fault.
 

@@ -1,4 +1,4 @@
-"""What looks like a fault of a simulator and is none: impacts, digits, filters, folded motion, errors of a curve; and units."""
+"""What looks like a fault of a simulator: impacts, digits, filters, folded motion; units."""
 
 from __future__ import annotations
 
