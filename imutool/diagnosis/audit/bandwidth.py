@@ -31,9 +31,11 @@ def most_filter_delay(residual: Float64[np.ndarray, "n 3"], samples: Float64[np.
     if not all(middle * near < FALLS and max(middle, near) < STEP for middle, near in sides):
         return 0.0
     level = both[0][1:].sum(axis=1)
-    last = int(np.flatnonzero(level > level.max() / 2.0)[-1]) + 1
-    above, below = np.log(2.0 * level[last - 1 : last + 1] / level.max())
-    return FOURTH_ORDER / float(f[last] + (f[1] - f[0]) * above / (above - below))
+    half = np.flatnonzero(level[:-1] > level.max() / 2.0)
+    if not len(half):  # no noise
+        return 0.0
+    above, below = np.log(2.0 * np.maximum(level[half[-1] : half[-1] + 2] / level.max(), 1e-300))
+    return FOURTH_ORDER / float(f[half[-1] + 1] + f[1] * above / (above - min(below, 0.0)))
 
 
 def bandwidth_faults(

@@ -12,7 +12,7 @@ from scipy.signal import spectrogram
 from scipy.stats import gamma
 
 from imutool.array_types import Float64
-from imutool.diagnosis.audit.bandwidth import bandwidth_faults
+from imutool.diagnosis.audit.bandwidth import bandwidth_faults, most_filter_delay
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.spectral_lines import HANN, SpectralLine
 from imutool.diagnosis.estimation.timestamps import grid, limits
@@ -69,6 +69,13 @@ class Expected:
         lsb = np.array([grid(column) for column in samples.T])
         density = fast_noise(samples, 1.0 / imu.period_s, lsb) * np.sqrt(imu.period_s)
         return cls(density, np.full(6, np.nan), 1.0 / imu.period_s, samples, lsb)
+
+    def filters(self, sensor: Sensor) -> bool:
+        """Whether the noise of a recording shows a filter; that of a data sheet is white."""
+        if self.samples is None:
+            return False
+        part = self.samples[:, 3 * SENSORS.index(sensor) : 3 * SENSORS.index(sensor) + 3]
+        return most_filter_delay(part, part) > 0.0
 
     def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
         """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
@@ -129,8 +136,11 @@ def noise_faults(
         lsb = np.array([grid(column) for column in samples[:, part].T])
         own = float(np.median(fast_noise(residual[:, part], rate_hz, lsb)))
         noise = _without_digits(own, float(np.median(lsb))), own
+        filters = most_filter_delay(residual[:, part], samples[:, part]) > 0.0
         for reference in expected:
-            out += _density(sensor, noise, rate_hz, reference)
+            density = _density(sensor, noise, rate_hz, reference)
+            comparable = filters == reference.filters(sensor)  # what a filter leaves at high frequency is no density
+            out += [fault for fault in density if comparable or fault.fault == "noise_absent"]
             out += _walk(sensor, residual[:, part], rate_hz, own, reference.walk[part])
             if reference.samples is not None and reference.rate_hz is not None:
                 out += _clipping(sensor, samples[:, part], reference.samples[:, part])

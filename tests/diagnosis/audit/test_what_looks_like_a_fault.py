@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import butter, sosfilt
 from support.audit_bench import bench
 
+from imutool.config import build
 from imutool.diagnosis.audit import simulator_faults
 from imutool.diagnosis.audit.bandwidth import most_filter_delay
 from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
@@ -98,6 +99,9 @@ def test_a_filter_that_the_noise_shows_may_be_late(order: int, cut: float) -> No
     low = sosfilt(butter(order, 2.0 * cut, output="sos"), samples - samples[0], axis=0) + samples[0]
     imu = Imu(sim.imu.t_ns, np.ascontiguousarray(low[:, :3]), np.ascontiguousarray(low[:, 3:]))
     assert simulator_faults(replace(sim, imu=imu), None, Noise()) == []
+    rate_hz = 1.0 / sim.imu.period_s
+    sheet = build(Noise, {f"{s}_density": (float(std / np.sqrt(rate_hz)),) * 3 for s, std in (("gyro", 2e-3), ("accel", 2e-2))})
+    assert simulator_faults(replace(sim, imu=imu), None, sheet) == []
     white = np.random.default_rng(2).normal(size=(4000, 3))
     assert most_filter_delay(white, white) == 0.0
 
