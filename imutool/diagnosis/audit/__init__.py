@@ -6,15 +6,18 @@ log ─ kinematics ─> Kinematics ─ kinematic_fit ─> KinematicFit ─ motio
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from imutool.diagnosis.audit.bandwidth import most_filter_delay
 from imutool.diagnosis.audit.faults import FAULTS, FaultFound, found
-from imutool.diagnosis.audit.motion import CERTAIN, KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults
+from imutool.diagnosis.audit.motion import KinematicFit, Kinematics, kinematic_fit, kinematics, motion_faults, units
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.simulation import AT_BODY, Mount, read_simulation
 from imutool.diagnosis.audit.spectral_lines import SpectralLine, by_differences, spectral_lines
+from imutool.diagnosis.audit.timing import CERTAIN
 from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
@@ -94,13 +97,14 @@ def _faults(
     """Faults, and spectral lines whose cause the poses do not show."""
     if not sim.truths:
         raise sim.no_truth("a simulation without poses", "a simulation with the poses of its body")
-    moved = kinematics(sim)
+    sim, moved, by_motion = _in_si(sim)
     fit = kinematic_fit(moved)
-    by_motion = motion_faults(moved, fit)
+    samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
+    late = [most_filter_delay(fit.residual[:, part], samples[:, part]) for part in (slice(0, 3), slice(3, 6))]
+    by_motion += motion_faults(moved, fit, (late[0], late[1]))
     expected = [Expected.of_sheet(sheet)] if _has_noise(sheet) else []
     expected += [] if real is None else [Expected.of_recording(real.imu)]
     arm = np.array([fit.estimates[axis].value for axis in AXES])
-    samples, rate_hz = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1), 1.0 / sim.imu.period_s
     lines_found = spectral_lines(samples, fit.residual, rate_hz, *by_differences(sim.truth, arm))
     faults, untold = noise_faults(sim.imu, fit.residual, expected, lines_found)
     if any(fault.fault == "repeated_samples" for fault in faults):  # which are late by half of the physics step
@@ -109,6 +113,18 @@ def _faults(
     if real is not None and real.truths:
         faults += _body_centre(fit, real, mounts)
     return faults, untold
+
+
+def _in_si(sim: Recording) -> tuple[Recording, Kinematics, list[FaultFound]]:
+    """A simulation with its motion, in SI units, and the sensors that were in others."""
+    moved = kinematics(sim)
+    factor = units(moved)
+    if set(factor.values()) == {1.0}:
+        return sim, moved, []
+    wrong = [found("wrong_unit", sensor, scale=Estimate(1.0 / by, 0.0, "-")) for sensor, by in factor.items() if by != 1.0]
+    imu = replace(sim.imu, gyro=sim.imu.gyro * factor["gyro"], accel=sim.imu.accel * factor["accel"])
+    moved = replace(moved, gyro=moved.gyro * factor["gyro"], accel=moved.accel * factor["accel"])
+    return replace(sim, imu=imu), moved, wrong
 
 
 def simulator_remarks(sim: Recording) -> list[str]:

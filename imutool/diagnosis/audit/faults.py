@@ -78,6 +78,11 @@ FAULTS: Mapping[str, Fault] = {
         f"{GITHUB}/fsstudio-team/ZeroSimROSUnity/issues/9",
         unless="the sensor is mounted so: state its mount on /tf_static",
     ),
+    "wrong_unit": Fault(
+        "is not in SI units: a rate in deg/s, an acceleration in g",
+        "gyro = 180 / pi x, accel = x / 9.80665",
+        f"{GITHUB}/at-wat/mcl_3dl/issues/423",
+    ),
     "noise_absent": Fault("has no noise", "x = x_true", f"{GITHUB}/PX4/PX4-gazebo-models/pull/33"),
     "noise_per_sample": Fault(
         "has the noise of a sample at another rate: its density changed with the rate",

@@ -14,21 +14,22 @@ compared in the band that the smoothed poses show: what contacts shake above it 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import permutations, product
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
+from imutool.diagnosis.audit.axes import Hypotheses
 from imutool.diagnosis.audit.faults import FaultFound, found
+from imutool.diagnosis.audit.timing import NEAR, clear, timing_faults, with_unit
 from imutool.diagnosis.result import Estimate
 from imutool.errors import DataError
 from imutool.inertial.kinematics import G_W
 from imutool.recording import Recording
 from imutool.sensor.trajectory import smooth_motion
-from imutool.units import AXES
+from imutool.units import AXES, SENSORS, Sensor
 
 Vectors = Float64[np.ndarray, "n 3"]
 Matrix = Float64[np.ndarray, "3 3"]
@@ -36,17 +37,11 @@ JERK_S = 1e-3  # half of the step of a central difference
 BLOCK_S = 2.0  # of the robust covariance
 SHOWN, ORDER = 0.5, 4  # of a curve's cut-off, up to which it follows a motion to 2 %; of the filter
 LEAST_BLOCK = 4.0  # periods of the highest frequency in a block, so that blocks are independent
-MOST_BIAS = 1.0  # m/s², of the accelerometer: gravity in the world frame is none
+BANDS = (1.0, 0.5, 0.25)  # of the band that the poses show: a curve follows the slower motion better
+AGREE = 3.0  # standard deviations by which two bands may differ
 BIAS_RIDGE = 1e-6  # of a bias: a body that stays level shows it and gravity alike, and gravity is the larger
-CLEARLY = 0.5  # of the squares of the body frame and its axes, up to which others are chosen
-ALIKE = 1.1  # times the least squares: hypotheses that explain as much, of which the simplest is taken
-CERTAIN = 6.0  # standard deviations
-NEAR = 0.15  # of a step, or of gravity, by which a number may differ from a whole one
-LEAST_DELAY = 0.05  # of a sample period: less is rounding
-LEAST_GYRO_DELAY = 0.3  # of a sample period: half of a finer step is that of a semi-implicit integrator
-HALF = 0.6  # of a delay by one step: half of it, and errors
-PART, WHOLE = 0.7, 0.8  # of a sample period: up to the one a delay is a part, from the other a whole step
 LEAST_ARM_M, LEAST_S = 5e-3, 5.0
+OTHER_UNIT: Mapping[Sensor, float] = {"gyro": np.pi / 180.0, "accel": 9.80665}  # deg/s, standard gravity
 NAMES = ("m", "k", "c", "x", "y", "z", "tau_a", "tau_f")
 
 
@@ -118,10 +113,9 @@ def kinematics(log: Recording) -> Kinematics:
 
 def kinematic_fit(k: Kinematics) -> KinematicFit:
     """Frames, axes and parts of the samples that explain them best."""
-    gyro_world, P_gyro = _frame(k, k.gyro, k.omega[:, :, None], free_bias=True)
-    gravity, centripetal = k.to_body(np.tile(-np.asarray(G_W), (len(k.t_s), 1))), -np.cross(k.omega, k.to_body(k.v_w))
-    parts = np.stack([k.to_body(k.a_w), gravity, centripetal], axis=2)
-    accel_world, P_accel = _frame(k, k.accel, parts, free_bias=False)
+    parts = _force_parts(k)
+    gyro_world, P_gyro = _hypotheses(k, k.omega[:, :, None], free_bias=True).frame(k.shown(k.gyro))
+    accel_world, P_accel = _hypotheses(k, parts, free_bias=False).frame(k.shown(k.accel))
     force = k.to_body(k.a_w - G_W)
     arms = np.stack([np.cross(k.alpha, e) + np.cross(k.omega, np.cross(k.omega, e)) for e in np.eye(3)], axis=2)
     late = np.stack([-k.to_body(k.j_w), np.cross(k.omega, force)], axis=2)
@@ -139,16 +133,38 @@ def kinematic_fit(k: Kinematics) -> KinematicFit:
     return KinematicFit(estimates, (gyro_world, accel_world), (P_gyro, P_accel), residual)
 
 
-def motion_faults(k: Kinematics, fit: KinematicFit) -> list[FaultFound]:
-    """Faults of gravity, frame, axes, transport term, point and timing."""
-    timing = _timing_faults(fit.estimates, k.period_s)
+def units(k: Kinematics) -> dict[Sensor, float]:
+    """Factor of each sensor's samples: 1, or what makes rad/s of deg/s and m/s² of g."""
+    samples, parts = {"gyro": k.gyro, "accel": k.accel}, {"gyro": k.omega[:, :, None], "accel": _force_parts(k)}
+    return {
+        sensor: _hypotheses(k, parts[sensor], free_bias=sensor == "gyro").unit(k.shown(samples[sensor]), OTHER_UNIT[sensor])
+        for sensor in SENSORS
+    }
+
+
+def _force_parts(k: Kinematics) -> Float64[np.ndarray, "n 3 3"]:
+    """Acceleration, gravity and the transport term, in the body frame."""
+    gravity, centripetal = k.to_body(np.tile(-np.asarray(G_W), (len(k.t_s), 1))), -np.cross(k.omega, k.to_body(k.v_w))
+    return np.stack([k.to_body(k.a_w), gravity, centripetal], axis=2)
+
+
+def _hypotheses(k: Kinematics, parts: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> Hypotheses:
+    return Hypotheses(k.shown(parts), k.shown(np.einsum("nij,njp->nip", k.R_wb, parts)), free_bias=free_bias)
+
+
+def motion_faults(k: Kinematics, fit: KinematicFit, filters: tuple[float, float] = (0.0, 0.0)) -> list[FaultFound]:
+    """Faults of gravity, frame, axes, transport term, point and timing.
+
+    Delays (in sample periods) up to those of the sensors' own `filters` are no fault.
+    """
+    timing = timing_faults(fit.estimates, k.period_s, filters)
     return [*_frame_faults(fit), *_force_faults(fit), *timing, *_arm_faults(fit.estimates)]
 
 
 def _arm_faults(estimates: Mapping[str, Estimate]) -> list[FaultFound]:
-    arm = {axis: _with_unit(estimates[axis], "m") for axis in AXES}
+    arm = {axis: with_unit(estimates[axis], "m") for axis in AXES}
     far = np.linalg.norm([r.value for r in arm.values()]) > LEAST_ARM_M
-    return [found("lever_arm", "accel", **arm)] if far and any(_clear(r) for r in arm.values()) else []
+    return [found("lever_arm", "accel", **arm)] if far and any(clear(r) for r in arm.values()) else []
 
 
 def _frame_faults(fit: KinematicFit) -> list[FaultFound]:
@@ -163,58 +179,13 @@ def _force_faults(fit: KinematicFit) -> list[FaultFound]:
     out = []
     gravity = {0: "coordinate_acceleration", 2: "gravity_doubled", -1: "gravity_sign"}
     for whole, name in gravity.items():
-        if abs(k.value - whole) < NEAR and _clear(k, 1.0):
+        if abs(k.value - whole) < NEAR and clear(k, 1.0):
             out.append(found(name, "accel", gravity=k))
-    if abs(m.value) < NEAR and _clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
+    if abs(m.value) < NEAR and clear(m, 1.0) and abs(k.value - 1.0) < NEAR:
         out.append(found("gravity_only", "accel", acceleration=m))
-    elif abs(c.value - 1.0) < 2.0 * NEAR and _clear(c):
+    elif abs(c.value - 1.0) < 2.0 * NEAR and clear(c):
         out.append(found("transport_term", "accel", missing=c))
     return out
-
-
-def _timing_faults(estimates: dict[str, Estimate], period_s: float) -> list[FaultFound]:
-    """Delays of the gyro, of the acceleration and of its attitude, in sample periods.
-
-    A semi-implicit integrator makes all velocities late alike, by half of its step. So the acceleration counts from the gyro
-    where the gyro is late by a part of a step, unless both are differences of explicit states. No difference and no integrator
-    makes the attitude late: where it is, a step of the physics lies between reading and stamp, however short.
-    """
-    gyro, accel, attitude = (estimates[name] for name in ("tau_g", "tau_a", "tau_f"))
-    steps = {"gyro": _delay(gyro, period_s, LEAST_GYRO_DELAY), "accel": _delay(accel, period_s, LEAST_DELAY)}
-    together = abs(accel.value - attitude.value) < 3.0 * np.hypot(accel.std, attitude.std) + NEAR * period_s
-    whole = together and steps["accel"] in ("step_delay", "early_stamps")
-    if abs(attitude.value) >= LEAST_DELAY * period_s and _clear(attitude) and _is_late_alike(accel, attitude):
-        whole = together = True
-        name = "step_delay" if attitude.value > 0.0 else "early_stamps"
-        steps |= {signal: name for signal, tau in (("gyro", gyro), ("accel", accel)) if _is_late_alike(tau, attitude)}
-    if abs(gyro.value) < PART * period_s and steps["gyro"] != steps["accel"] and not whole:
-        accel = Estimate(accel.value - gyro.value, float(np.hypot(accel.std, gyro.std)), "-")
-        steps["accel"] = _delay(accel, period_s, LEAST_DELAY)
-    late = {"gyro": gyro, "accel": accel}
-    out = []
-    for name in ("step_delay", "early_stamps"):
-        signals = [signal for signal, kind in steps.items() if kind == name and (signal == "gyro" or together)]
-        if signals:
-            signal = "both" if len(signals) == 2 else signals[0]
-            out.append(found(name, signal, delay=_with_unit(late[signals[0]], "s")))
-    for signal, kind in steps.items():
-        if kind == "backward_difference" and (signal == "gyro" or abs(attitude.value) < 0.5 * abs(accel.value)):
-            tau = late[signal]
-            out.append(found(kind, signal, delay=_with_unit(tau, "s"), step=Estimate(2.0 * tau.value, 2.0 * tau.std, "s")))
-    return out
-
-
-def _is_late_alike(tau: Estimate, attitude: Estimate) -> bool:
-    """Whether a signal is late as its attitude is, but for half a step of an integrator."""
-    return abs(tau.value - attitude.value) < HALF * abs(attitude.value) + 3.0 * float(np.hypot(tau.std, attitude.std))
-
-
-def _delay(tau: Estimate, period_s: float, least: float) -> str:
-    """Name of a delay: half a step or less, a whole step, a step early; empty for none or another."""
-    steps = tau.value / period_s if _clear(tau) else 0.0
-    if abs(steps) > WHOLE:
-        return "step_delay" if steps > 0.0 else "early_stamps"
-    return "backward_difference" if least <= steps < PART else ""
 
 
 def _which(flags: tuple[bool, ...]) -> list[str]:
@@ -224,66 +195,40 @@ def _which(flags: tuple[bool, ...]) -> list[str]:
     return [signal for signal, flag in zip(("gyro", "accel"), flags, strict=True) if flag]
 
 
-def _clear(estimate: Estimate, ideal: float = 0.0) -> bool:
-    return abs(estimate.value - ideal) > CERTAIN * estimate.std
-
-
-def _with_unit(estimate: Estimate, unit: str) -> Estimate:
-    return Estimate(estimate.value, estimate.std, unit)
-
-
-AXES_ORDERS = product(permutations(range(3)), product((1.0, -1.0), repeat=3))
-PERMUTATIONS = sorted(  # all 48 signed permutations, those that change fewest axes first
-    (np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in AXES_ORDERS),
-    key=lambda P: float(np.abs(P - np.eye(3)).sum()),
-)
-
-
-def _frame(k: Kinematics, y: Vectors, body: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> tuple[bool, Matrix]:
-    """Whether a signal is in the world frame, and its axes P: the simplest that explains as much as any."""
-    squares: list[tuple[float, int, bool, Matrix]] = []
-    for world, x in ((False, body), (True, np.einsum("nij,njp->nip", k.R_wb, body))):
-        each = zip(PERMUTATIONS, _squares(y, x, free_bias=free_bias), strict=True)
-        squares += [(left, rank + len(PERMUTATIONS) * world, world, P) for rank, (P, left) in enumerate(each)]
-    least = max(min(entry[0] for entry in squares), 1e-9 * float((y**2).sum()))  # an exact sensor leaves rounding
-    if least > CLEARLY * squares[0][0]:
-        return False, np.eye(3)
-    chosen = min((entry for entry in squares if entry[0] <= ALIKE * least), key=lambda entry: entry[1])
-    return chosen[2], chosen[3]
-
-
-def _squares(y: Vectors, x: Float64[np.ndarray, "n 3 p"], *, free_bias: bool) -> list[float]:
-    """Least squares of y P by its parts, for each P: the rate; or acceleration, gravity (0, 1, 2, -1) and transport term."""
-    weights = (
-        [(1.0,)] if x.shape[2] == 1 else [*((1.0, g, c) for g in (1.0, 0.0, 2.0, -1.0) for c in (0.0, 1.0)), (0.0, 1.0, 0.0)]
-    )
-    flat, n, s = x.reshape(-1, x.shape[2]), len(y), float((y**2).sum())
-    G, both = flat.T @ flat, y.T @ x.reshape(n, -1)  # of y and x, whatever P
-    mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
-    out = []
-    for P in PERMUTATIONS:
-        g, best = np.einsum("ji,jip->p", P, both.reshape(3, *x.shape[1:])), np.inf
-        for weight in weights:
-            w = np.array(weight)
-            mean = mean_y @ P - mean_x @ w
-            left = 0.0 if free_bias else float(np.sum(np.maximum(np.abs(mean) - MOST_BIAS, 0.0) ** 2))
-            best = min(best, s - 2.0 * float(w @ g) + float(w @ G @ w) - n * (float(mean @ mean) - left))
-        out.append(best)
-    return out
-
-
 def _solved(
     k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"], ideal: Float64[np.ndarray, " p"]
 ) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"], Vectors]:
-    """Coefficients with deviations by blocks of two seconds, and the whole residual; Huber weights against shocks."""
+    """Coefficients with deviations, and the whole residual.
+
+    A part is the same at every frequency. What smoothing takes of a motion grows at least with the square of its frequency, and
+    looks like a part. So where slower bands contradict the whole one (Hausman's test), the difference tells this error of each
+    band, and the band with the least deviation of both kinds is taken.
+    """
     p = x.shape[2]
-    whole = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2)
-    A, target = k.shown(whole), k.shown(y - x @ ideal)
+    whole, target = np.concatenate([x, np.tile(np.eye(3), (len(y), 1, 1))], axis=2), y - x @ ideal
+    bands = sorted({max(share * k.band_hz, LEAST_BLOCK / BLOCK_S) for share in BANDS}, reverse=True)
+    each = [_in_band(replace(k, band_hz=band_hz), target, whole) for band_hz in bands]
+    theta, std = (np.array(values) for values in zip(*each, strict=True))
+    square = (np.array(bands)[:, None] / bands[0]) ** 2
+    with np.errstate(invalid="ignore"):  # of parts that the motion does not show, whose deviation is infinite
+        by_chance = AGREE * np.sqrt(np.maximum(std**2 - std[0] ** 2, 0.0))
+    apart = np.abs(theta - theta[0])
+    error = np.max(np.where(apart > by_chance, apart, 0.0)[1:] / (1.0 - square[1:]), axis=0, initial=0.0)
+    total = np.hypot(std, square * error)
+    best = total.argmin(axis=0), np.arange(p + 3)
+    return ideal + theta[best][:p], total[best][:p], np.asarray(target - whole @ theta[0])
+
+
+def _in_band(
+    k: Kinematics, y: Vectors, x: Float64[np.ndarray, "n 3 p"]
+) -> tuple[Float64[np.ndarray, " p"], Float64[np.ndarray, " p"]]:
+    """Coefficients with deviations by blocks of two seconds; Huber weights against shocks. The last three are biases."""
+    A, target = k.shown(x), k.shown(y)
     size = np.sqrt((A**2).sum(axis=(0, 1)))
     size[size < 1e-9 * size.max()] = np.inf
     A = A / size
-    weight = np.ones(len(y))
-    ridge = np.diag([1e-9] * p + [BIAS_RIDGE] * 3)
+    weight, p = np.ones(len(y)), x.shape[2]
+    ridge = np.diag([1e-9] * (p - 3) + [BIAS_RIDGE] * 3)
     for _ in range(3):
         H = np.einsum("n,nap,naq->pq", weight, A, A) + ridge
         theta = np.linalg.solve(H, np.einsum("n,nap,na->p", weight, A, target))
@@ -291,10 +236,9 @@ def _solved(
         length = np.sqrt((left**2).sum(axis=1))
         weight = 1.0 / np.maximum(1.0, length / max(3.0 * float(np.median(length)), 1e-12))
     block = np.floor(k.t_s / BLOCK_S).astype(int)
-    scores = np.zeros((int(block.max()) + 1, p + 3))
+    scores = np.zeros((int(block.max()) + 1, p))
     np.add.at(scores, block, np.einsum("n,nap,na->np", weight, A, left))
     half = np.linalg.solve(H, scores.T)
     std = np.sqrt((half**2).sum(axis=1) * len(scores) / max(len(scores) - 2, 1)) / size
-    unseen = ~np.isfinite(size)
-    std[unseen] = np.inf
-    return ideal + (theta / size)[:p], std[:p], np.asarray(y - x @ ideal - whole @ (theta / size))
+    std[~np.isfinite(size)] = np.inf
+    return theta / size, std

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.fft import dct
 from scipy.optimize import minimize_scalar
 from scipy.signal import spectrogram
+from scipy.stats import gamma
 
 from imutool.array_types import Float64
+from imutool.diagnosis.audit.bandwidth import bandwidth_faults, most_filter_delay
 from imutool.diagnosis.audit.faults import FaultFound, found
 from imutool.diagnosis.audit.spectral_lines import HANN, SpectralLine
 from imutool.diagnosis.estimation.timestamps import grid, limits
@@ -21,12 +23,12 @@ from imutool.recording.columns import true_ranges
 from imutool.units import SENSORS, UNITS, Sensor
 
 Six = Float64[np.ndarray, "n 6"]
+Column = Float64[np.ndarray, " k"]
 ABSENT = 0.02  # of the expected noise: less is none
 ALIKE = 1.35  # factor between two densities that are one: a data sheet is typical
 SAME_SAMPLE = 1.12  # factor between the noise of two samples that was meant to be one
 OTHER_RATE = 1.5  # factor between the rates from which they differ
 OVER_LIMIT = 1.02  # of the recording's limit, from which a reading was not clipped
-FALLS, STEP, WHITE = 0.35, 0.75, 0.75  # of the noise that is left near Nyquist, and from band to band; of white noise
 CONSEQUENCES = {
     "noise_absent": ("step_lines", "bias_never_walks", "noise_density", "noise_per_sample", "bandwidth_absent"),
     "repeated_samples": ("step_lines", "noise_density", "noise_per_sample", "bandwidth_absent"),
@@ -34,7 +36,7 @@ CONSEQUENCES = {
     "bandwidth_absent": ("noise_density", "noise_per_sample"),
 }
 LEAST_LSB = 0.3  # of the noise: finer digits leave no trace
-SEGMENT = 1024
+SEGMENT, SHORT = 1024, (32, 16)  # samples
 QUARTILE = 0.674  # of a normal distribution, in deviations
 REPEATED = 0.08  # of the samples
 REST = 20  # equal samples in a row
@@ -44,12 +46,13 @@ WALK_SHARES, WALKS = np.geomspace(0.03, 1.0, 8), 2.0  # of the expected walk; lo
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Expected noise: density and walk by column, the recording's rate, its samples."""
+    """Expected noise by column; of a recording also its rate, samples and digits."""
 
     density: Float64[np.ndarray, "6"]
     walk: Float64[np.ndarray, "6"]
     rate_hz: float | None = None
     samples: Six | None = None
+    lsb: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
 
     @classmethod
     def of_sheet(cls, noise: Noise) -> Expected:
@@ -63,13 +66,37 @@ class Expected:
     def of_recording(cls, imu: Imu) -> Expected:
         """Density of a recording's samples; how far its bias walks is not known."""
         samples = np.concatenate([imu.gyro, imu.accel], axis=1)
-        return cls(
-            fast_noise(samples, 1.0 / imu.period_s) * np.sqrt(imu.period_s), np.full(6, np.nan), 1.0 / imu.period_s, samples
-        )
+        lsb = np.array([grid(column) for column in samples.T])
+        density = fast_noise(samples, 1.0 / imu.period_s, lsb) * np.sqrt(imu.period_s)
+        return cls(density, np.full(6, np.nan), 1.0 / imu.period_s, samples, lsb)
+
+    def filters(self, sensor: Sensor) -> bool:
+        """Whether the noise of a recording shows a filter; that of a data sheet is white."""
+        if self.samples is None:
+            return False
+        part = self.samples[:, 3 * SENSORS.index(sensor) : 3 * SENSORS.index(sensor) + 3]
+        return most_filter_delay(part, part) > 0.0
+
+    def sample(self, sensor: Sensor, rate_hz: float) -> tuple[float, float]:
+        """Least and most noise of a sample at a rate; digits add to the noise of a recording."""
+        part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
+        density, lsb = float(np.nanmedian(self.density[part])), float(np.median(self.lsb[part]))
+        least = _without_digits(density * np.sqrt(self.rate_hz or rate_hz), lsb) / np.sqrt(self.rate_hz or rate_hz)
+        return least * np.sqrt(rate_hz), density * np.sqrt(rate_hz)
 
 
-def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndarray, " k"]:
+def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float, lsb: Column | float = 0.0) -> Column:
     """White noise of a sample (deviation) at high frequency, in the calm quarter of a log.
+
+    A line is seen apart in long segments, and a body that never rests is calm for the short ones between two impacts. So the
+    noise is the least of both. `lsb` are the digits: where coarse, a reading that stays says nothing.
+    """
+    long = _between_lines(x, rate_hz)
+    return np.where(lsb > long, long, np.minimum(long, np.minimum(*(_between_impacts(x, size) for size in SHORT))))
+
+
+def _between_lines(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Column:
+    """Noise by the median of the frequencies.
 
     The median of n exponential powers is ln 2 of their mean, and scatters by 1 / sqrt(n) of that. Steps and impacts are louder.
     """
@@ -78,6 +105,18 @@ def fast_noise(x: Float64[np.ndarray, "n k"], rate_hz: float) -> Float64[np.ndar
     levels = np.median(power[band], axis=0)
     quarter = np.log(2.0) - QUARTILE * np.sqrt(HANN / band.sum()) * (levels.shape[-1] > 1)
     return np.asarray(np.sqrt(np.quantile(levels, 0.25, axis=-1) / quarter * rate_hz / 2.0))
+
+
+def _between_impacts(x: Float64[np.ndarray, "n k"], size: int) -> Column:
+    """Noise by the mean of the frequencies, in segments that end before the next foot strikes.
+
+    Their powers are gamma distributed: neighbours of a Hann window share 4/9 of it, those next to them 1/36.
+    """
+    f, _, power = spectrogram(x, 1.0, window="hann", nperseg=min(size, len(x)), axis=0)
+    levels = power[(f > 0.25) & (f < 0.48)]
+    n = len(levels)
+    shape = n**2 / (n + 2.0 * (n - 1) * 4.0 / 9.0 + 2.0 * (n - 2) / 36.0)
+    return np.asarray(np.sqrt(np.quantile(levels.mean(axis=0), 0.25, axis=-1) / gamma.ppf(0.25, shape) * shape / 2.0))
 
 
 def noise_faults(
@@ -94,15 +133,20 @@ def noise_faults(
     out += _repeated(samples)
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
-        own = float(np.median(fast_noise(residual[:, part], rate_hz)))
+        lsb = np.array([grid(column) for column in samples[:, part].T])
+        own = float(np.median(fast_noise(residual[:, part], rate_hz, lsb)))
+        noise = _without_digits(own, float(np.median(lsb))), own
+        filters = most_filter_delay(residual[:, part], samples[:, part]) > 0.0
         for reference in expected:
-            out += _density(sensor, own, rate_hz, float(np.nanmedian(reference.density[part])), reference.rate_hz)
+            density = _density(sensor, noise, rate_hz, reference)
+            comparable = filters == reference.filters(sensor)  # what a filter leaves at high frequency is no density
+            out += [fault for fault in density if comparable or fault.fault == "noise_absent"]
             out += _walk(sensor, residual[:, part], rate_hz, own, reference.walk[part])
             if reference.samples is not None and reference.rate_hz is not None:
                 out += _clipping(sensor, samples[:, part], reference.samples[:, part])
                 out += _digits(sensor, samples[:, part], reference.samples[:, part])
                 sims = (residual[:, part], samples[:, part])
-                out += _bandwidth(sensor, sims, rate_hz, reference.samples[:, part], reference.rate_hz)
+                out += bandwidth_faults(sensor, sims, rate_hz, reference.samples[:, part], reference.rate_hz)
     untold = [line for line in lines if line.cause == "unknown" and not _follows("step_lines", line.sensor, out)]
     return [fault for fault in out if not _follows(fault.fault, fault.signal, out)], untold
 
@@ -112,21 +156,27 @@ def _follows(fault: str, signal: str, others: list[FaultFound]) -> bool:
     return any(fault in CONSEQUENCES.get(other.fault, ()) for other in others if other.signal in (signal, "both"))
 
 
-def _density(sensor: Sensor, own: float, rate_hz: float, density: float, real_hz: float | None) -> Iterator[FaultFound]:
+def _density(sensor: Sensor, noise: tuple[float, float], rate_hz: float, expected: Expected) -> Iterator[FaultFound]:
     """Noise absent, of a sample at another rate (or a density taken for a sample's), or of another density."""
-    if not density > 0.0:
+    (least, most), own = expected.sample(sensor, rate_hz), noise[1]
+    if not most > 0.0:
         return
-    expected = density * np.sqrt(rate_hz)
-    ratio = own / expected
-    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(expected, 0.0, UNITS[sensor])}
-    meant = density if real_hz is None else density * np.sqrt(real_hz)  # a sample's, as it was given
+    ratio = max(noise[0] / most, 1.0) * min(own / max(least, 1e-300), 1.0)
+    numbers = {"noise": Estimate(own, 0.02 * own, UNITS[sensor]), "expected": Estimate(most, 0.0, UNITS[sensor])}
+    real_hz = expected.rate_hz
+    meant = most / np.sqrt(rate_hz) * (1.0 if real_hz is None else np.sqrt(real_hz))  # a sample's, as it was given
     other_rate = real_hz is None or max(real_hz / rate_hz, rate_hz / real_hz) > OTHER_RATE
-    if ratio < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
+    if own / most < ABSENT and max(meant / max(own, 1e-300), 1.0) > SAME_SAMPLE**2:
         yield found("noise_absent", sensor, **numbers)
     elif other_rate and 1.0 / SAME_SAMPLE < own / meant < SAME_SAMPLE:
         yield found("noise_per_sample", sensor, **numbers)
     elif not 1.0 / ALIKE < ratio < ALIKE:
         yield found("noise_density", sensor, **numbers)
+
+
+def _without_digits(noise: float, lsb: float) -> float:
+    """Least noise of samples whose digits may add up to LSB / sqrt(12)."""
+    return float(np.sqrt(max(noise**2 - lsb**2 / 12.0, 0.0)))
 
 
 def _walk(
@@ -167,39 +217,6 @@ def _digits(sensor: Sensor, sim: Float64[np.ndarray, "n 3"], real: Float64[np.nd
     lsb = float(np.median(steps))
     if min(steps) > LEAST_LSB * float(np.median(fast_noise(real, 1.0))) and all(grid(column) < 0.5 * lsb for column in sim.T):
         yield found("digits_absent", sensor, lsb=Estimate(lsb, 1e-3 * lsb, UNITS[sensor]))
-
-
-def _bandwidth(
-    sensor: Sensor,
-    sims: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "m 3"]],
-    sim_hz: float,
-    real: Float64[np.ndarray, "k 3"],
-    real_hz: float,
-) -> Iterator[FaultFound]:
-    """White noise near the recording's Nyquist frequency, where the recording's has fallen.
-
-    `sims` are what the motion leaves of the simulation, and all of it: where a body moves in these bands, a fall is that of
-    its motion.
-    """
-    nyquist_hz = min(sim_hz, real_hz) / 2.0
-    white = all(middle * near > WHITE for middle, near in (_left(x, sim_hz, nyquist_hz) for x in sims))
-    middle, near = _left(real, real_hz, nyquist_hz)
-    if white and middle * near < FALLS and max(middle, near) < STEP:
-        yield found("bandwidth_absent", sensor, left=Estimate(middle * near, 0.1 * middle * near, "-"))
-
-
-def _left(x: Float64[np.ndarray, "n 3"], rate_hz: float, nyquist_hz: float) -> tuple[float, float]:
-    """Power that is left from band to band, towards a Nyquist frequency, in the calm quarter of a log."""
-    f_hz, _, parts = spectrogram(x, rate_hz, window="hann", nperseg=min(SEGMENT, len(x)), axis=0)
-    loud = parts[f_hz > BANDS[0][0] * nyquist_hz].sum(axis=0)
-    power = np.stack(
-        [p[:, q <= np.quantile(q, 0.25)].mean(axis=1) for p, q in zip(parts.swapaxes(0, 1), loud, strict=True)], axis=1
-    )
-    low, middle, near = (float(np.median(power[(f_hz > a * nyquist_hz) & (f_hz < b * nyquist_hz)])) for a, b in BANDS)
-    return middle / max(low, 1e-300), near / max(middle, 1e-300)
-
-
-BANDS = ((0.2, 0.35), (0.5, 0.65), (0.85, 0.97))  # of Nyquist
 
 
 def _repeated(samples: Six) -> Iterator[FaultFound]:

@@ -2,6 +2,7 @@
 
 A gait, a rotor and a control that is held for some steps move a body in lines, too. Poses that were neither smoothed nor
 averaged show them: differences of poses follow a rate as sinc(f T), an acceleration as sinc(f T)^2, T being their period.
+A simulator reads its IMU at instants, so a motion beyond half of its rate folds; the poses fold it at their own rate.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.signal import spectrogram
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -53,6 +54,25 @@ class Spectrum(NamedTuple):
     steady: Bool[np.ndarray, " f"]
 
 
+class Shown(NamedTuple):
+    """Spectrum of the poses' differences, their rate, and the order of sinc in their power."""
+
+    spectrum: Spectrum
+    rate_hz: float
+    order: int
+
+    @property
+    def lines(self) -> Bool[np.ndarray, " f"]:
+        """Where a line is certain."""
+        return np.asarray(self.spectrum.certain & (self.spectrum.ratio > ABOVE))
+
+    def at(self, f_hz: float, power: float) -> tuple[Bool[np.ndarray, " f"], float, float]:
+        """Where a motion folds to, the power that a line of it would have there, and the largest that is there."""
+        f = self.spectrum.f_hz
+        near = np.asarray(np.abs(f - abs(f_hz - self.rate_hz * round(f_hz / self.rate_hz))) < 2.5 * f[1])
+        return near, power * float(np.sinc(f_hz / self.rate_hz) ** self.order), float(self.spectrum.power[near].max())
+
+
 def spectral_lines(
     samples: Six, residual: Float64[np.ndarray, "m 6"], rate_hz: float, shown: Float64[np.ndarray, "p 6"], poses_hz: float
 ) -> list[SpectralLine]:
@@ -67,27 +87,41 @@ def spectral_lines(
     for k, sensor in enumerate(SENSORS):
         part = slice(3 * k, 3 * k + 3)
         left, whole = (_spectrum(x[:, part], rate_hz, size) for x in (residual, samples))
-        by_poses = _spectrum(shown[:, part], poses_hz, min(round(size * poses_hz / rate_hz), len(shown)))
-        width_hz, order = rate_hz / size, 2 * k + 2  # of sinc, in power
+        poses = _spectrum(shown[:, part], poses_hz, min(round(size * poses_hz / rate_hz), len(shown)))
+        by_poses, width_hz = Shown(poses, poses_hz, order=2 * k + 2), rate_hz / size
         above = (left.f_hz > LEAST_SHARE * rate_hz) & (left.f_hz < MOST_SHARE * rate_hz)
         above &= np.sqrt(2.0 * HANN * left.power * width_hz) > LEAST[sensor]
         lines = np.flatnonzero(above & left.certain & left.steady & (np.minimum(left.ratio, whole.ratio) > ABOVE))
         strongest = lines[np.argsort(-left.ratio[lines])]
-        causes = [_cause(float(left.f_hz[line]), float(left.power[line]), by_poses, poses_hz, order) for line in strongest]
+        peak = maximum_filter1d(left.power, 5)  # as `Shown.at` looks for it
+        each = [(float(left.f_hz[line]), rate_hz, float(peak[line]), by_poses) for line in strongest]
+        causes = [_cause(*line) for line in each]
+        if "motion" in causes:  # a body that moves in lines has harmonics, too
+            causes = [
+                cause if cause != "sensor" or not _is_hidden(*line) else "unknown"
+                for cause, line in zip(causes, each, strict=True)
+            ]
         first = next((cause for cause in told if cause in causes), None)
         if first is not None:
             out.append(SpectralLine(sensor, float(left.f_hz[strongest[causes.index(first)]]), width_hz, first))
     return out
 
 
-def _cause(f_hz: float, power: float, shown: Spectrum, poses_hz: float, order: int) -> Cause:
+def _cause(f_hz: float, rate_hz: float, power: float, shown: Shown) -> Cause:
     """What a line comes from: the poses show it, or nothing as large, or cannot show it."""
-    near = np.abs(shown.f_hz - f_hz) < 2.0 * shown.f_hz[1]
-    if (near & shown.certain & (shown.ratio > ABOVE)).any():
+    near, expected, there = shown.at(f_hz, power)
+    if (near & shown.lines).any():
         return "motion"
-    expected = power * np.sinc(f_hz / poses_hz) ** order
-    known = f_hz < KNOWN_SHARE * poses_hz and near.any()
-    return "sensor" if known and expected > CLEARLY * shown.power[near].max() else "unknown"
+    for folded_hz in (rate_hz - f_hz, rate_hz + f_hz):
+        near, weaker, other = shown.at(folded_hz, power)
+        if (near & shown.lines).any() and weaker / CLEARLY < other < CLEARLY * weaker:
+            return "motion"
+    return "sensor" if f_hz < KNOWN_SHARE * shown.rate_hz and expected > CLEARLY * there else "unknown"
+
+
+def _is_hidden(f_hz: float, rate_hz: float, power: float, shown: Shown) -> bool:
+    """Whether the poses would not show a line, were it the fold of a faster motion."""
+    return any(weaker < CLEARLY * there for _, weaker, there in (shown.at(f, power) for f in (rate_hz - f_hz, rate_hz + f_hz)))
 
 
 def _spectrum(x: Float64[np.ndarray, "n 3"], rate_hz: float, size: int) -> Spectrum:

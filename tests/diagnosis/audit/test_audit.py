@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.audit_bench import bench
 from support.report_schema import assert_valid
 from support.seeds import seeds
 
@@ -31,13 +30,6 @@ from imutool.mcap_io.write import Series, chunks, write
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses, Recording
 
-PATH = Path(__file__).parents[2] / "bench" / "audit.py"
-SPEC = importlib.util.spec_from_file_location("audit_bench", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-bench: Any = importlib.util.module_from_spec(SPEC)
-sys.modules["audit_bench"] = bench
-SPEC.loader.exec_module(bench)
 DURATION_S = 16.0
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -1,0 +1,137 @@
+"""What looks like a fault of a simulator: impacts, digits, filters, folded motion; units."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfilt
+from support.audit_bench import bench
+
+from imutool.config import build
+from imutool.diagnosis.audit import simulator_faults
+from imutool.diagnosis.audit.bandwidth import most_filter_delay
+from imutool.diagnosis.audit.motion import kinematic_fit, kinematics
+from imutool.diagnosis.audit.noise import Expected, fast_noise, noise_faults
+from imutool.diagnosis.audit.timing import clear, timing_faults
+from imutool.diagnosis.result import Estimate
+from imutool.noise.datasheet import Noise
+from imutool.recording import Imu
+
+DURATION_S = 16.0
+
+
+@pytest.mark.parametrize(("gyro", "accel"), [(180.0 / np.pi, 1.0), (1.0, 1.0 / 9.80665), (180.0 / np.pi, 1.0 / 9.80665)])
+def test_another_unit_is_named_and_then_the_rest_is_judged(gyro: float, accel: float) -> None:
+    sim, _, _ = bench.made("transport_term", 5, DURATION_S)
+    imu = replace(sim.imu, gyro=sim.imu.gyro * gyro, accel=sim.imu.accel * accel)
+    faults = simulator_faults(replace(sim, imu=imu), None, Noise())
+    scales = {fault.signal: fault.parameters["scale"].value for fault in faults if fault.fault == "wrong_unit"}
+    assert scales == pytest.approx({s: by for s, by in (("gyro", gyro), ("accel", accel)) if by != 1.0})
+    assert {fault.fault for fault in faults} == {"wrong_unit", "transport_term"}
+
+
+def test_a_motionless_sensor_has_no_wrong_unit() -> None:
+    sim, _, _ = bench.made("null", 5, DURATION_S)
+    dead = replace(sim.imu, gyro=np.zeros_like(sim.imu.gyro), accel=np.zeros_like(sim.imu.accel))
+    assert "wrong_unit" not in {fault.fault for fault in simulator_faults(replace(sim, imu=dead), None, Noise())}
+
+
+@pytest.mark.parametrize("rate_hz", [200.0, 500.0])
+def test_feet_that_strike_the_ground_are_no_noise(rate_hz: float) -> None:
+    """Shocks at 55 Hz, two a second, that ring for 12 ms."""
+    t, rng = np.arange(round(40.0 * rate_hz)) / rate_hz, np.random.default_rng(3)
+    since = t % 0.5
+    shocks = 8.0 * np.exp(-since / 0.012) * np.sin(2.0 * np.pi * 55.0 * since)
+    x = shocks[:, None] + 0.02 * rng.normal(size=(len(t), 3))
+    assert fast_noise(x, rate_hz) == pytest.approx(0.02 * np.ones(3), rel=0.15)
+
+
+def test_digits_are_no_noise_density() -> None:
+    """They add up to LSB / sqrt(12) to what a recording reads."""
+    rng, lsb = np.random.default_rng(3), 3.5
+    sim, real = rng.normal(size=(2, 6000, 6)) + 30.0 * np.sin(np.arange(6000) * 1e-2)[:, None]
+    t_ns = (np.arange(6000) * 1e7).astype(np.int64)
+    held = lsb * np.round(real / lsb)
+    expected = Expected.of_recording(Imu(t_ns, np.ascontiguousarray(held[:, :3]), np.ascontiguousarray(held[:, 3:])))
+    imu = Imu(t_ns, np.ascontiguousarray(sim[:, :3]), np.ascontiguousarray(sim[:, 3:]))
+    faults, _ = noise_faults(imu, sim - 30.0 * np.sin(np.arange(6000) * 1e-2)[:, None], [expected])
+    assert {fault.fault for fault in faults} == {"digits_absent"}
+
+
+def test_a_frame_is_told_by_what_the_poses_follow() -> None:
+    """A shaking above their band is as large as gravity, and a body that hardly leans shows its frame by a tenth of it."""
+    rng, period_s = np.random.default_rng(3), 1.0 / 200.0
+    motion = bench.Motion.drawn(rng)
+    motion.angles[0, 1:] *= 0.05
+    t = np.arange(round(DURATION_S / period_s)) * period_s
+    shocks = 15.0 * np.sin(2.0 * np.pi * 71.0 * t)[:, None]
+    force = motion.attitude(t).apply(motion.force(t)) + shocks
+    samples = np.concatenate([motion.rate(t), force], axis=1) + np.repeat([1e-3, 1e-2], 3) * rng.normal(size=(len(t), 6))
+    faults = simulator_faults(bench._log(motion, t, samples), None, Noise())
+    assert ("world_frame", "accel") in {(fault.fault, fault.signal) for fault in faults}
+    assert "coordinate_acceleration" not in {fault.fault for fault in faults}
+
+
+def test_a_motion_beyond_half_of_the_rate_folds_and_is_no_line_of_the_sensor() -> None:
+    """A thrust that is held: 163 Hz, read at 200 Hz, is a line at 37 Hz; the poses' 250 Hz fold it to 87 Hz."""
+    lines = importlib.import_module("imutool.diagnosis.audit.spectral_lines")
+    rng, f = np.random.default_rng(7), 163.0
+    t, pose_t = np.arange(8000) / 200.0, np.arange(10000) / 250.0
+    line = 0.3 * np.sin(2.0 * np.pi * f * t)[:, None] * np.ones(6)
+    samples = line + 0.01 * rng.normal(size=line.shape)
+    size = 0.3 * np.array([np.sinc(f / 250.0)] * 3 + [np.sinc(f / 250.0) ** 2] * 3)
+    shown = np.sin(2.0 * np.pi * f * pose_t)[:, None] * size + 1e-4 * rng.normal(size=(len(pose_t), 6))
+    assert lines.spectral_lines(samples, samples, 200.0, shown, 250.0) == []
+    still = 1e-4 * rng.normal(size=shown.shape)
+    assert {found.cause for found in lines.spectral_lines(samples, samples, 200.0, still, 250.0)} == {"sensor"}
+
+
+@pytest.mark.parametrize(("order", "cut"), [(1, 0.2), (2, 0.12), (2, 0.2), (4, 0.2)])
+def test_a_filter_that_the_noise_shows_may_be_late(order: int, cut: float) -> None:
+    """A right simulator of a sensor of finite bandwidth is late by its filter, which is no step."""
+    sim, _, _ = bench.made("null", 5, DURATION_S)
+    samples = np.concatenate([sim.imu.gyro, sim.imu.accel], axis=1)
+    samples += np.repeat([2e-3, 2e-2], 3) * np.random.default_rng(1).normal(size=samples.shape)
+    low = sosfilt(butter(order, 2.0 * cut, output="sos"), samples - samples[0], axis=0) + samples[0]
+    imu = Imu(sim.imu.t_ns, np.ascontiguousarray(low[:, :3]), np.ascontiguousarray(low[:, 3:]))
+    assert simulator_faults(replace(sim, imu=imu), None, Noise()) == []
+    rate_hz = 1.0 / sim.imu.period_s
+    sheet = build(Noise, {f"{s}_density": (float(std / np.sqrt(rate_hz)),) * 3 for s, std in (("gyro", 2e-3), ("accel", 2e-2))})
+    assert simulator_faults(replace(sim, imu=imu), None, sheet) == []
+    white = np.random.default_rng(2).normal(size=(4000, 3))
+    assert most_filter_delay(white, white) == 0.0
+
+
+def test_what_grows_with_the_frequency_is_an_error_of_the_curve() -> None:
+    """A delay is the same at every frequency; what grows with its square is what smoothing takes."""
+    sim, _, _ = bench.made("null", 5, 60.0)
+    k = replace(kinematics(sim), band_hz=12.0)
+    k = replace(k, omega=k.omega + np.sin(2.0 * np.pi * np.array([7.0, 8.0, 9.0]) * k.t_s[:, None]))
+    force = k.to_body(k.a_w + np.array([0.0, 0.0, 9.81]))
+    turn = np.cross(k.omega, force)
+    grows = -np.gradient(np.gradient(turn, k.period_s, axis=0), k.period_s, axis=0) / (2.0 * np.pi * 8.0) ** 2
+    exact = replace(k, gyro=k.omega, accel=force + 1e-3 * np.random.default_rng(1).normal(size=force.shape))
+    wrong = replace(exact, accel=exact.accel + 0.5 * k.period_s * grows)
+    assert not clear(kinematic_fit(wrong).estimates["tau_f"])
+    late = replace(exact, accel=exact.accel + 0.5 * k.period_s * turn)
+    assert kinematic_fit(late).estimates["tau_f"].value == pytest.approx(0.5 * k.period_s, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("periods", "accused"),
+    [
+        ({"tau_g": (0.0, 1e-3), "tau_a": (0.01, 0.04), "tau_f": (-0.42, 0.066)}, set()),  # an attitude alone is not late
+        ({"tau_g": (0.51, 0.006), "tau_a": (-0.31, 0.04), "tau_f": (-0.02, 0.05)}, {("backward_difference", "gyro")}),
+        ({"tau_g": (0.25, 1e-3), "tau_a": (0.747, 3e-3), "tau_f": (2e-3, 3e-3)}, {("backward_difference", "accel")}),
+        ({"tau_g": (1.0, 1e-3), "tau_a": (1.0, 0.01), "tau_f": (0.9, 0.1)}, {("step_delay", "both")}),
+    ],
+)
+def test_delays_of_gyro_acceleration_and_attitude_are_weighed_together(
+    periods: Mapping[str, tuple[float, float]], accused: set[tuple[str, str]]
+) -> None:
+    estimates = {name: Estimate(0.01 * value, 0.01 * std, "s") for name, (value, std) in periods.items()}
+    assert {(fault.fault, fault.signal) for fault in timing_faults(estimates, 0.01, (0.0, 0.0))} == accused
