@@ -108,6 +108,8 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     else:
         yield "accel against poses", *_unknown(whole, NO_FORCE)
     yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, NO_FORCE if turned else NO_TURN))
+    if found.unit != "m":
+        yield "unit of positions", True, f"{found.unit}: so they accelerate as accel says"
     if found.delay is not None:
         side = "late" if found.delay.seconds > 0 else "early"
         late_s = abs(found.delay.seconds)
