@@ -20,7 +20,10 @@ BLOCKS_S, FEWEST_BLOCKS = 1.0, 8
 
 
 class Choice(NamedTuple):
-    """Best of several rows of errors; `certain` is its lead over the second best in standard errors."""
+    """Best of several rows of errors.
+
+    `certain` is its lead over the second best in standard errors.
+    """
 
     best: int
     certain: float

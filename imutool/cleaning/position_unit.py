@@ -1,4 +1,4 @@
-"""Unit of the poses' positions: that in which they accelerate as the accelerometer says.
+"""Unit of positions, by the acceleration that the accelerometer measures.
 
 Positions in another unit than metres accelerate a hundred or a thousand times too much. They are named only where metres
 explain less than no motion at all would, and the other unit more than noise in metres ever could.
@@ -23,10 +23,11 @@ LEAST_SHARE = 0.1  # of the squared misfit that a unit explains; noise times a f
 def position_unit(
     residuals: Callable[[float, int], Float64[np.ndarray, "n 3"]], readings: int, blocks: Int64[np.ndarray, " n"]
 ) -> str:
-    """Unit of positions by the misfit of their acceleration; metres where the motion shows no other.
+    """Unit of positions by the misfit of their acceleration.
 
-    `residuals` gives the misfit (m/s²) of a reading of axes and gravity, for positions multiplied by a factor. A constant one is
-    of the accelerometer's scale and bias, and counts for nothing.
+    Metres where the motion shows no other.
+    `residuals` gives the misfit (m/s²) of a reading of axes and gravity, for positions multiplied by a factor. A constant
+    misfit is of the accelerometer's scale and bias, and counts for nothing.
     """
     still, metres = (_best(partial(residuals, factor), readings, blocks) for factor in (0.0, 1.0))
     if still is None or metres is None or np.median(metres) < np.median(still):

@@ -137,10 +137,12 @@ def _turned(
 
 
 def frames_of_copies(log: Log, topic: str) -> frozenset[str]:
-    """Frames of transforms that have the same positions as the poses of a topic wherever they share a stamp."""
+    """Frames of transforms whose positions are those of a topic, wherever they share a stamp."""
     poses = read_truth(log, topics=[topic])
     alike, other = set[str](), set[str]()
-    for named in log.with_schema((schemas.TF,)) if poses is not None else []:
+    if poses is None:
+        return frozenset()
+    for named in log.with_schema((schemas.TF,)):
         for batch in log.pose_batches(named.name):
             _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
             same = len(mine) > 0 and np.array_equal(poses.p_wb[mine], batch.p_wb[theirs])

@@ -69,7 +69,7 @@ def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarra
 def test_positions_in_other_units_come_back_in_metres(scale: float, made: Recording, tmp_path: Path) -> None:
     v_w = None if made.truth.v_w is None else scale * made.truth.v_w
     large = replace(made.truth, p_wb=scale * made.truth.p_wb, v_w=v_w)
-    other = replace(made.truth, p_wb=made.truth.p_wb + [0.5, 0.0, 0.0], v_w=None)
+    other = replace(made.truth, p_wb=made.truth.p_wb + np.array([0.5, 0.0, 0.0]), v_w=None)
     write(replace(made, truths={"/ground_truth/pose": large, "/ground_truth_leica/pose": other}), tmp_path / "large.mcap")
     (warning,) = inspect(tmp_path / "large.mcap").warnings
     assert f"are in {'mm' if scale > 100 else 'cm'} and not in m" in warning

@@ -1,4 +1,4 @@
-"""Axes that contradict poses or gravity, and poses whose world has another axis up or another unit.
+"""Axes that contradict poses or gravity; poses with another axis up or in another unit.
 
 The poses decide where they can. Without them gravity, as the accelerometer reads it, decides how the gyro's axes lie to the
 accelerometer's; which of the two is wrong it cannot say, and the proposal changes the gyro.
