@@ -16,6 +16,7 @@ from ._archive import refusing
 from ._table_headerless import as_table, name_headerless
 from ._table_mocap import is_mocap, read_mocap
 from ._table_packed import opener, read_bytes, text_head
+from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
@@ -72,6 +73,9 @@ def _load_csv(path: Path, columns: Columns) -> None:
     text = text_of(read_bytes(path))
     if read_mocap(text, columns, path):
         return
+    if sentences := of_vectornav(text, columns):
+        read_csv(sentences, columns, path)
+        return
     labelled, left_out = as_table(text)
     if labelled:
         read_csv(labelled, columns, path)
@@ -81,6 +85,8 @@ def _load_csv(path: Path, columns: Columns) -> None:
     elif not read_rows(text, columns, path):
         read_csv(text, columns, path)
         name_headerless(columns)
+        if text.startswith(GYROFLOW):
+            scale_gyroflow(columns)
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:
