@@ -25,6 +25,11 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
 
+CONVERTIBLE = {  # messages of which `convert` makes others
+    "nav_msgs/msg/Path": "poses",
+    "px4_msgs/msg/VehicleOdometry": "poses",
+    "px4_msgs/msg/VehicleImu": "an IMU",
+}
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -170,6 +175,13 @@ def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: I
         starts_after_s=float(knots[0] - start) * 1e-9,
         ends_before_s=float(end - knots[-1]) * 1e-9,
     )
+
+
+def made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:
+    """Hints at topics of which `convert` makes an IMU or poses, where the log has none."""
+    lacking = {"poses": not has_poses, "an IMU": not has_imu}
+    made = {topic.name: CONVERTIBLE.get(topic.own_schema or topic.schema_name, "") for topic in log.topics.values()}
+    return [f"imutool convert LOG OUT makes {what} of {name}" for name, what in made.items() if lacking.get(what)]
 
 
 def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imutool.conversion.run import ConvertReport, convert
+from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 
@@ -120,6 +121,18 @@ def test_a_log_that_was_converted_before_gets_no_second_topic(tmp_path):
     convert(out, tmp_path / "again.mcap")
     with Log(out) as first, Log(tmp_path / "again.mcap") as second:
         assert {t: d.count for t, d in first.topics.items()} == {t: d.count for t, d in second.topics.items()}
+
+
+def test_info_names_what_convert_would_make(tmp_path):
+    log = written(
+        tmp_path / "bag.mcap",
+        {"/path": [(9, path(range(9), 9))], "/fmu/out/vehicle_imu": [(n, integrated(n)) for n in range(9)]},
+    )
+    said = inspect(log).warnings
+    assert "imutool convert LOG OUT makes poses of /path" in said
+    assert "imutool convert LOG OUT makes an IMU of /fmu/out/vehicle_imu" in said
+    convert(log, tmp_path / "out.mcap")
+    assert not [warning for warning in inspect(tmp_path / "out.mcap").warnings if "imutool convert LOG OUT makes" in warning]
 
 
 def test_beside_an_imu_of_ros_px4s_is_no_second_one(tmp_path):
