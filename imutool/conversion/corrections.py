@@ -118,9 +118,8 @@ class Corrections:
         if topic.message_encoding not in ENCODINGS:
             return message
         if topic.name in self.imus and topic.name in self.reflected:
-            return message._replace(
-                payload=self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
-            )
+            patched = self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
+            return message._replace(payload=patched)
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         if not (self.pose_topic and _is_pose(topic)):
@@ -208,8 +207,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
     world, frame_id, late_ns, body, pose_topic, unit = np.eye(3), "", 0, NOT_TURNED, "", "m"
-    copies: frozenset[str] = frozenset()
-    kept: list[str] = []
+    copies, kept = frozenset[str](), list[str]()
     with Log(path) as log:
         stamps = find_stamps(log, notes) if STAMPS in wanted else {}
         for topic in log.imu_topics if CONVENTIONS in wanted else []:
@@ -236,9 +234,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 unit, copies = survey.position_unit, frames_of_copies(log, pose_topic)
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
                 notes[pose_topic] += changes
-        own_types = {
-            topic: found for topic in {**stamps, **imus} if isinstance(found := log.topics[topic].reflected, Reflected)
-        }
+        own_types = {t: found for t in (*stamps, *imus) if isinstance(found := log.topics[t].reflected, Reflected)}
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
     return Corrections(imus, world, frame_id, late_ns, body, pose_topic, unit, copies, stamps, own_types, said, kept)
 
