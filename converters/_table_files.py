@@ -14,6 +14,9 @@ from imutool.errors import DataError, required
 
 from ._archive import refusing
 from ._table_headerless import as_table, name_headerless
+from ._table_mocap import is_mocap, read_mocap
+from ._table_packed import opener, read_bytes, text_head
+from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
@@ -33,10 +36,13 @@ def kind_of(head: bytes, path: Path) -> str:
         return "parquet"
     if head.startswith(ZIP):
         names = _members(path)
-        return "npz" if any(name.endswith(".npy") for name in names) else "sheet" if names & {*SHEETS} else ""
+        if any(name.endswith(".npy") for name in names) or names & {*SHEETS}:
+            return "sheet" if names & {*SHEETS} else "npz"
     if head.startswith(OLD_EXCEL):
         return "sheet"
-    return "csv" if is_text_table(head) or (b"\0" not in head and as_table(text_of(head))[0]) else ""
+    text = text_head(path) if opener(head) else head
+    is_table = is_text_table(text) or (b"\0" not in text and (as_table(text_of(text))[0] or is_mocap(text_of(text))))
+    return "csv" if is_table else ""
 
 
 def load(path: Path, kind: str) -> Columns:
@@ -64,7 +70,12 @@ def _members(path: Path) -> set[str]:
 
 
 def _load_csv(path: Path, columns: Columns) -> None:
-    text = text_of(path.read_bytes())
+    text = text_of(read_bytes(path))
+    if read_mocap(text, columns, path):
+        return
+    if sentences := of_vectornav(text, columns):
+        read_csv(sentences, columns, path)
+        return
     labelled, left_out = as_table(text)
     if labelled:
         read_csv(labelled, columns, path)
@@ -74,6 +85,8 @@ def _load_csv(path: Path, columns: Columns) -> None:
     elif not read_rows(text, columns, path):
         read_csv(text, columns, path)
         name_headerless(columns)
+        if text.startswith(GYROFLOW):
+            scale_gyroflow(columns)
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:

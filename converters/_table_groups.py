@@ -58,7 +58,7 @@ LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set,
 
 def imus_apart(columns: Columns) -> dict[str, Columns]:
     """Columns without those of other IMUs, by topic; empty unless several pair by name."""
-    names = {column: split_name(column)[0] for column in columns.values}
+    names = {column: split_name(column)[0] for column in columns.values if not is_true(column)}
     gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
     if len(gyros) < 2 or gyros.keys() != accels.keys():
         return {}
@@ -95,12 +95,11 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         if beside is None and len(values) == len(columns.values[time]):
             beside = time, unit
         if beside is not None and "quaternion_wxyz" not in entries:
-            leaf = split_name(column.removeprefix(_group(column)))[0]
-            is_true = any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", _group(column)))
+            leaf = split_name(column.removeprefix(group_of(column)))[0]
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
-            groups.setdefault((beside, is_true or name != leaf), {})[name] = column
+            groups.setdefault((beside, is_true(column) or name != leaf), {})[name] = column
     poses = []
-    for (clock, is_true), leaves in groups.items():
+    for (clock, named_true), leaves in groups.items():
         arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
         q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
         if (
@@ -110,8 +109,8 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         ):
             reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
         position = _axes(POSITION, leaves, "xyz")
-        if q and (position or is_true or clock[0] != time):
-            poses.append((not is_true, clock, q, position))
+        if q and (position or named_true or clock[0] != time):
+            poses.append((not named_true, clock, q, position))
         elif clock[0] == time:
             continue
         elif array := next((c for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), ""):
@@ -123,6 +122,13 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
             found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
     return found
+
+
+def has_poses(columns: Columns) -> bool:
+    """Whether a table has positions and quaternions, in whatever order."""
+    leaves = {split_name(column)[0]: column for column in columns.values}
+    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123")
+    return bool(turns and _axes(POSITION, leaves, "xyz"))
 
 
 def _axes(pattern: str, leaves: dict[str, str], axes: str) -> list[str]:
@@ -142,13 +148,13 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     """
     if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
         return None  # a dot in the name of a plain table's column makes no group
-    group, other = _group(column), ""
+    group, other = group_of(column), ""
     while group and not other:
         for wanted, values in columns.values.items():
-            is_time = _group(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
+            is_time = group_of(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
             if is_time and len(values) == len(columns.values[column]) and rises(values):
                 other = other or wanted
-        group = _group(group)
+        group = group_of(group)
     if other in ("", time):
         return None
     stated = name_and_unit(other, columns.units.get(other, ""))[1]
@@ -163,9 +169,14 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     return (other, best) if overlap[best] > LEAST_OVERLAP else None
 
 
-def _group(column: str) -> str:
-    """Group of a column: of `mocap/position[0]`, and of a structure's `mocap.position[0]`, it is `mocap`."""
-    return re.sub(r"(^|[/.])[^/.]*$", "", column)
+def is_true(column: str) -> bool:
+    """Whether a column is in a group of true poses."""
+    return any(re.fullmatch(TRUE_GROUPS, part.lower()) for part in re.split(r"[/.]", group_of(column)))
+
+
+def group_of(column: str) -> str:
+    """Group of a column: `mocap` of `mocap/v [m/s]`, and of a structure's `mocap.position[0]`."""
+    return re.sub(r"(^|[/.])[^/.]*$", "", re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", column))
 
 
 def _columns_of(entries: Entries) -> set[str]:

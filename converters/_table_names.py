@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
-ROS_WORDS = r"angular_?velocity|linear_?acceleration"  # fields of ROS messages, which are in SI units
+ROS_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_"  # of ROS' and PX4's messages, in SI units
 TIME_WORDS = (
     rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
@@ -34,9 +34,9 @@ CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
-    r"|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?",
+    r"|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
     "accel": r"accel(eration|erometer)?|acc[el]?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
-    r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione",
+    r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
 STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column
 PLACES = (  # of several IMUs on a body
@@ -92,8 +92,8 @@ def unit_named(text: str) -> str:
 
 
 def spaced_name(column: str) -> str:
-    """Name of a column with underscores between its words: UncompGyro_0, gyroTimestamp."""
-    return split_name(re.sub(r"(?<=[a-z]{2})(?=[A-Z][a-z])", "_", column))[0]
+    """Name of a column with underscores between its words: UncompGyro_0, gyroTimestamp, xAccel."""
+    return split_name(re.sub(r"((?<=[a-z]{2})|(?<=^[xyz]))(?=[A-Z][a-z])", "_", column.strip()))[0]
 
 
 def split_name(column: str) -> tuple[str, str]:

@@ -10,6 +10,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.recording.joined_imu import in_order, unit_by_gravity
 
+from ._table_groups import is_true
 from ._table_headerless import perhaps
 from ._table_map import NO_UNIT, Proposal
 from ._table_names import (
@@ -48,7 +49,7 @@ OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names 
 def propose(columns: Columns) -> Proposal:
     """Map that names, units and magnitudes of the columns suggest."""
     proposal = Proposal({}, [], [])
-    names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values}
+    names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values if not is_true(column)}
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
@@ -174,14 +175,14 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
     if "gyro" in proposal.entries:
-        group = proposal.entries["gyro"][0].rpartition("/")[0]
-        found.sort(key=lambda c: c.rpartition("/")[0] != group)
+        group = _table_of(proposal.entries["gyro"][0])
+        found.sort(key=lambda c: _table_of(c) != group)
         found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     counter = counter_of(columns, length or 0)
     measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
     # of each table, without a count of rows; further columns may rise as a temperature does
-    firsts = {c.rpartition("/")[0]: c for c in reversed(columns.values) if c != counter}
+    firsts = {_table_of(c): c for c in reversed(names) if c != counter}
     rising = [
         c
         for c in firsts.values()
@@ -207,6 +208,11 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         proposal.hints.append(
             f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
         )
+
+
+def _table_of(column: str) -> str:
+    """Table of a folder that a column is of; a unit behind its name may hold a slash."""
+    return re.sub(r"[\[(][^\])]*[\])]\s*$", "", column).rpartition("/")[0]
 
 
 def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[str, str]], columns: Columns) -> None:
@@ -237,8 +243,8 @@ def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[s
 def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tuple[str, str]]) -> str:
     """How another time, whose unit is stated, contradicts the unit of this one; empty if none does."""
     span = float(columns.values[column][-1] - columns.values[column][0]) * TIME_NS[unit]
-    for other, values in columns.values.items():
-        stated = unit_named(columns.units.get(other, "")) or names[other][1]
+    for other, (_, unit_in_name) in names.items():
+        values, stated = columns.values[other], unit_named(columns.units.get(other, "")) or unit_in_name
         if other != column and stated in TIME_NS and len(values) == len(columns.values[column]) and goes_on(values):
             passed = float(values[-1] - values[0]) * TIME_NS[stated]
             if abs(passed - span) > MOST_APART * passed + WHOLE_NS:

@@ -40,7 +40,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass
 class Columns:
-    """Columns by name, with units, matrices, single numbers, texts of decimals, and remarks."""
+    """Columns by name, with units, matrices, single numbers, texts, remarks, and files by group."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
@@ -48,6 +48,7 @@ class Columns:
     numbers: dict[str, float] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
     remarks: Remarks = field(default_factory=Remarks)
+    sources: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, array: Any, unit: str = "") -> None:
         """Take in an array of numbers of one, two or three dimensions."""
@@ -72,6 +73,7 @@ class Columns:
 
     def take(self, group: str, other: Columns, label: str) -> None:
         """Take in the columns and remarks of another table as a group."""
+        self.sources[group] = label
         for name, values in other.values.items():
             column = f"{group}/{name}"
             self.values[column], self.units[column] = values, other.units.get(name, "")

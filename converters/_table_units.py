@@ -11,6 +11,7 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.recording import GRAVITY_M_S2, Imu
+from imutool.recording.joined_imu import unit_by_gravity
 
 from ._table_text import Columns
 
@@ -74,7 +75,7 @@ def is_motion_alone(columns: Columns, chosen: Sequence[str]) -> bool:
 
 
 def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
-    """Doubts about stated units: accelerations far from gravity, rates beyond the gyros' range."""
+    """Doubts about units: by the size of gravity, the gyros' range, and the way gravity turns."""
     if not len(imu):
         return []
     doubts = []
@@ -89,6 +90,12 @@ def unit_doubts(imu: Imu, gyro_unit: str, accel_unit: str) -> list[str]:
         doubts.append(
             f"the gyro reaches {rate:.3g} rad/s with gyro_unit {gyro_unit!r}, and common gyros measure up to"
             f" {FULL_SCALE_RAD_S:g} rad/s: is the unit right?"
+        )
+    turned = unit_by_gravity(imu.t_ns, imu.gyro / GYRO_SI[gyro_unit], imu.accel, GYRO_SI)
+    if turned is not None and turned[0] != gyro_unit:
+        doubts.append(
+            f"gravity turns in the accelerometer as a gyro in {turned[0]} says (t = {turned[1]:.1f}), and gyro_unit is"
+            f" {gyro_unit!r}: is the unit right?"
         )
     return doubts
 

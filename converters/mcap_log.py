@@ -1,32 +1,44 @@
 """MCAP of any encoding: IMUs and poses become those of ROS 2, all else stays.
 
-The translated topic has the name of the source's; the original messages are on TOPIC/as_recorded.
+The translated topic has the name of the source's; the original messages are on TOPIC/as_recorded. A folder with the numbered
+parts of a ROS 2 bag (`NAME_0.mcap`, `NAME_1.mcap`, ...) and no metadata.yaml is one log: its recorder did not finish.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from imutool.errors import DataError
-from imutool.recording.message_log import Message, MessageLog, MessageTopic
+from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._source import head, name
+from ._source import find_folders, head, name
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
 IMU = "sensor_msgs/msg/Imu", "cdr"  # defined ahead of the messages: a gyro's and an accelerometer's may be joined
+METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
+PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
+MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
 IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is an MCAP log; logs in folders are not looked for."""
+    """The source itself, if it is an MCAP log, or folders with the parts of one.
+
+    Other logs in folders are not looked for.
+    """
+    if source.is_dir():
+        return find_folders(source, lambda folder: bool(_parts(folder)))
     return [Sequence(name(source), source)] if source.is_file() and head(source, len(MAGIC)) == MAGIC else []
 
 
@@ -36,11 +48,13 @@ def recognises(sequence: Sequence) -> bool:
 
 
 def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
-    """Message log of an MCAP log.
+    """Message log of an MCAP log, or of the parts of one.
 
     Raises:
         DataError: the log is damaged.
     """
+    if sequence.path.is_dir():
+        return _read_parts(sequence, images)
     with _refusing(sequence.path), sequence.path.open("rb") as file:
         reader = _reader(file)
         summary = reader.get_summary()
@@ -92,6 +106,112 @@ def _refusing(path: Path) -> Iterator[None]:
         reason = str(error).partition("\n")[0] or type(error).__name__
         fix = "Save what is intact with imutool repair, and convert that"
         raise DataError(f"cannot be read as an MCAP log ({reason})", where=path, fix=fix) from error
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Parts of a ROS 2 bag without metadata.yaml, in order; none where the logs in a folder are not those of one recording.
+
+    A recorder numbers its parts from 0, and each begins where the one before it ends.
+    """
+    if b"rosbag2_bagfile_information" in head(folder / METADATA):
+        return []
+    files = [path for path in folder.glob("*.mcap") if path.is_file() and path.stat().st_size]
+    named = {int(match[2]): (match[1], path) for path in files if (match := re.fullmatch(PART, path.stem))}
+    parts = [named[number][1] for number in sorted(named)]
+    one_name = len(files) == len(named) and len({stem for stem, _ in named.values()}) == 1
+    if not one_name or sorted(named) != [*range(len(named))] or any(head(p, len(MAGIC)) != MAGIC for p in parts):
+        return []
+    spans = map(_span, parts) if len(parts) > 1 else ()
+    gaps = (after[0] - before[1] for before, after in pairwise(spans) if before and after)
+    return parts if all(abs(gap) < MOST_PAUSE_NS for gap in gaps) else []
+
+
+def _span(path: Path) -> tuple[int, int] | None:
+    """First and last log time of a finished log; None of any other."""
+    try:
+        with _refusing(path), path.open("rb") as file:
+            summary = _reader(file).get_summary() if _is_finished(file) else None
+    except DataError:  # said again when the log is read
+        return None
+    statistics = None if summary is None else summary.statistics
+    return (statistics.message_start_time, statistics.message_end_time) if statistics and statistics.message_count else None
+
+
+def _is_finished(file: BinaryIO) -> bool:
+    """Whether a log ends as its writer ends one."""
+    file.seek(-len(MAGIC), 2)
+    end = file.read()
+    file.seek(0)
+    return end == MAGIC
+
+
+def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
+    """Message log of the parts of a ROS 2 bag, one after the other; an unfinished one is read up to its end."""
+    paths, remarks, counts = _parts(sequence.path), Remarks(), Counter[str]()
+    topics: dict[str, MessageTopic] = {}
+    sources = []
+    remarks.notes.append(f"the bag has no {METADATA}; read in this order: {', '.join(path.name for path in paths)}")
+    for path in paths:
+        with path.open("rb") as file:
+            is_finished = _is_finished(file)
+        if is_finished:
+            part = read_sequence(Sequence(path.stem, path), images=images)
+            remarks.notes += [note for note in part.remarks.notes if note not in remarks.notes]
+            counts.update(part.counts)
+            found, messages = part.topics, part.messages
+        else:
+            messages = partial(_unfinished, path, images)
+            found = tuple(dict.fromkeys(message.topic for message in messages()))
+            what = f"{path.name} was not finished: it is read up to its last whole chunk, at byte"
+            remarks.losses.append(f"{what} {_whole_size(path)} of {path.stat().st_size}")
+        topics |= {topic.name: topic for topic in found if (topic.schema_name, topic.message_encoding) == IMU} | topics
+        sources.append(messages)
+    return MessageLog(
+        sequence.name,
+        sequence.path.name,
+        topics=tuple(topics.values()),
+        messages=lambda: chain.from_iterable(messages() for messages in sources),
+        counts=counts,
+        metadata={"imutool": {"format": "mcap_log", "sequence": sequence.name}},
+        remarks=remarks,
+    )
+
+
+def _whole_size(path: Path) -> int:
+    """Bytes of a log up to the end of its last whole record."""
+    size, at = path.stat().st_size, len(MAGIC)
+    with path.open("rb") as file:
+        file.seek(at)
+        while len(record := file.read(RECORD_HEAD)) == RECORD_HEAD:
+            following = at + RECORD_HEAD + int.from_bytes(record[1:], "little")
+            if following > size:
+                break
+            at = following
+            file.seek(at)
+    return at
+
+
+def _unfinished(path: Path, images: bool) -> Iterator[Message]:
+    """Messages of a log without an end, in log-time order within each chunk."""
+    from mcap.records import Channel, Chunk, Schema
+    from mcap.records import Message as Record
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    schemas: dict[int, Any] = {}
+    topics: dict[int, MessageTopic] = {}
+    end = _whole_size(path)
+    with _refusing(path), path.open("rb") as file:
+        for record in StreamReader(file, emit_chunks=True, validate_crcs=True).records:
+            parts = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+            for part in sorted(parts, key=lambda part: part.log_time if isinstance(part, Record) else -1):
+                if isinstance(part, Schema):
+                    schemas[part.id] = part
+                elif isinstance(part, Channel):
+                    topics[part.id] = _topic(schemas.get(part.schema_id), part)
+                elif isinstance(part, Record) and (images or not re.fullmatch(IMAGES, topics[part.channel_id].schema_name)):
+                    yield Message(topics[part.channel_id], part.log_time, part.publish_time, part.data)
+            if file.tell() >= end:
+                return
 
 
 def _reader(file: Any) -> Any:

@@ -80,10 +80,12 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def _is_bag(folder: Path) -> bool:
-    metadata = folder / METADATA
-    if metadata.is_file():
-        return b"rosbag2_bagfile_information" in head(metadata)
-    return any(_has_messages(path) for path in folder.glob("*.db3"))
+    return _has_metadata(folder) or any(_has_messages(path) for path in folder.glob("*.db3"))
+
+
+def _has_metadata(folder: Path) -> bool:
+    """Whether a folder's metadata.yaml is that of a bag; a recorder that died leaves none, or an empty one."""
+    return b"rosbag2_bagfile_information" in head(folder / METADATA)
 
 
 def _has_messages(path: Path) -> bool:
@@ -96,6 +98,15 @@ def _has_messages(path: Path) -> bool:
     except sqlite3.Error:
         return path.suffix == ".db3"
     return {"topics", "messages"} <= names
+
+
+def _first_ns(path: Path) -> int:
+    """Time of the first message of a database; 0 if there is none: names of parts do not sort, `_10` comes before `_2`."""
+    try:
+        with sqlite3.connect(f"file:{path}?immutable=1", uri=True) as database:
+            return int(database.execute("SELECT min(timestamp) FROM messages").fetchone()[0] or 0)
+    except sqlite3.Error:
+        return 0
 
 
 def _topic(connection: Any, path: Path, remarks: Remarks) -> MessageTopic:
@@ -156,13 +167,18 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
     readers: list[Any]
     if path.is_file():
         readers = [Sqlite3Reader(path)]
-    elif (path / METADATA).is_file() and not _renamed(path, remarks):
+    elif _has_metadata(path) and not _renamed(path, remarks):
         readers = [DirectoryReader(path)]
     else:
-        readers = [Sqlite3Reader(file) for file in sorted(path.glob("*.db3")) if _has_messages(file)]
+        readers = [Sqlite3Reader(file) for file in sorted(path.glob("*.db3"), key=_first_ns) if _has_messages(file)]
         readers = readers or [McapReader(file) for file in sorted(path.glob("*.mcap"))]
-        if not (path / METADATA).is_file():
-            remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their names")
+        if not _has_metadata(path):
+            remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their first messages")
+    for log in path.glob("*.db3-wal") if path.is_dir() else path.parent.glob(f"{path.name}-wal"):
+        if log.stat().st_size:
+            command = f"sqlite3 {log.name.removesuffix('-wal')} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+            fix = f"to have them, run {command} in a copy of the bag"
+            remarks.losses.append(f"{log.name} may hold messages that the database lacks, and is not read; {fix}")
     try:
         with ExitStack() as stack:
             for reader in readers:

@@ -36,10 +36,12 @@ GENERAL = True
 IMU_TOPIC = "/imu0"
 GYRO = "gyroscope", "gyroscopeuncalibrated"  # tables by falling preference, names without spaces in lower case
 ACCEL = "totalacceleration", "accelerometeruncalibrated"
+LINEAR = "linearaccelerometer", "linearacceleration"  # of phyphox, without gravity; Sensor Logger's `accelerometer` may be
 OXTS = re.compile(r"(.*/)?oxts/data/\d+\.txt")
 OXTS_TIMES = "oxts/timestamps.txt"
 EARTH_M = 6_378_137.0
 NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+FIX = "Record the acceleration with gravity, or gravity too"
 LEAST_GRAVITY, MOST_IN_G = 0.5, 2.0  # median lengths, in m/s² of nothing but motion, and of readings in g
 
 
@@ -110,7 +112,7 @@ def is_phone(path: Path) -> bool:
     gyro = next((tables[table] for table in GYRO if table in tables), "")
     return any(map(OXTS.fullmatch, files.names)) or (
         bool(gyro)
-        and any(table in tables for table in (*ACCEL, "accelerometer"))
+        and any(table in tables for table in (*ACCEL, *LINEAR, "accelerometer"))
         and re.search(r"\btime\b", files.text(gyro).partition("\n")[0], re.IGNORECASE) is not None
     )
 
@@ -138,8 +140,7 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     level = float(np.median(np.linalg.norm(accel, axis=1)))
     is_alone = used == ("accelerometer",) and "seconds_elapsed" in files.text(tables["accelerometer"]).partition("\n")[0]
     if level <= LEAST_GRAVITY or (is_alone and abs(level / STANDARD_GRAVITY - 1.0) > GRAVITY_BAND):
-        fix = "Record the acceleration with gravity, or gravity too"
-        raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=fix)
+        raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=FIX)
     if in_g := level < MOST_IN_G:
         accel = accel * STANDARD_GRAVITY
         remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
@@ -163,14 +164,17 @@ def _acceleration(
     for table in ACCEL:
         if table in tables:
             return *_vector(files, tables[table], clock, where, remarks), (table,)
-    t_ns, accel = _vector(files, tables["accelerometer"], clock, where, remarks)
+    named = next(table for table in ("accelerometer", *LINEAR) if table in tables)
+    t_ns, accel = _vector(files, tables[named], clock, where, remarks)
     if "gravity" not in tables:
-        return t_ns, accel, ("accelerometer",)
+        if named in LINEAR:
+            raise DataError(f"{tables[named]} has no gravity in it, and no other acceleration is there", where=where, fix=FIX)
+        return t_ns, accel, (named,)
     other_ns, gravity = _vector(files, tables["gravity"], clock, where, remarks)
     start = t_ns[0]
     t, knots = (t_ns - start).astype(float), (other_ns - start).astype(float)
     whole = accel + np.stack([np.interp(t, knots, column) for column in gravity.T], axis=1)
-    return t_ns, whole, ("accelerometer", "gravity")
+    return t_ns, whole, (named, "gravity")
 
 
 def _is_ios(files: _Files) -> bool:

@@ -22,9 +22,10 @@ from imutool.recording.message_log import MessageLog, Remarks
 from . import Sequence
 from ._source import find_folders, head, name
 from ._table_files import kind_of, load
-from ._table_folder import is_split, load_split
+from ._table_folder import POSES_GROUP, TRUTH_GROUP, is_split, load_split
 from ._table_groups import group_entries, imus_apart, known_layout, time_beside
 from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
+from ._table_packed import table_name
 from ._table_propose import propose
 from ._table_rotations import of_matrices, unit_by_poses
 from ._table_text import Columns
@@ -46,7 +47,7 @@ def sequences(source: Path) -> list[Sequence]:
         return [*(Sequence(folder.name, folder.path / DATA_FILE) for folder in folders), *split]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
-    return [Sequence(name(source), source)] if kind_of(head(source), source) else []
+    return [Sequence(name(Path(table_name(source))), source)] if kind_of(head(source), source) else []
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -70,6 +71,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c.removeprefix("-") for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
+    if not poses and path.is_dir() and (file := columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)):
+        what = f"{file} gives no poses: no time with positions and a certain order of quaternions was found in it"
+        remarks.losses.append(f"{what}; a map names its columns (truth_time, position, quaternion_wxyz or rotation_matrix)")
     if poses and not table.truth_file:
         used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
     scalars, constants = _further(columns, table, used, place)

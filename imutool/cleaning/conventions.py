@@ -4,9 +4,6 @@ Each answer is the best of a finite set of readings: 48 signed permutations of t
 directions that may be up. A reading is taken where it beats every other by a likelihood ratio of `SURE` standard errors, where
 it explains most of what is there to be explained, and where the motion turns about two axes at least. Else the answer is None:
 rest, planar motion and level flight are no evidence.
-
-The likelihood is Student's, so that a jolt does not decide; its ratio is tested over blocks of time, as neighbours are not
-independent (Vuong, Likelihood ratio tests for model selection, Econometrica 57, 1989, eq. 5.6).
 """
 
 from __future__ import annotations
@@ -18,8 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Float64, Int64
+from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, choose
 from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
+from imutool.cleaning.position_unit import POSITIONS, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, force_in_world, turning
 from imutool.cleaning.unit_evidence import RATES
@@ -27,12 +26,7 @@ from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
 from imutool.recording.columns import median, quantile
 
-SURE = 3.0  # standard errors of the log likelihood ratio
-CLEARLY = 0.5  # of the misfit of a zero reading, or of the log as it is, that of the best reading at most
-STUDENT = 3.0  # degrees of freedom of the errors
 SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at least: more than a tilted mount leaks
-BLOCKS_S, FEWEST_BLOCKS = 1.0, 8
-
 WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
 MOST_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
@@ -75,6 +69,7 @@ class Conventions:
         relative: the gyro against gravity as the accelerometer reads it.
         up: axis of the poses' world that points up, as `+z`.
         delay: of the poses.
+        unit: of the poses' positions, metres unless the motion shows another.
     """
 
     topic: str = ""
@@ -83,6 +78,7 @@ class Conventions:
     relative: Reading | None = None
     up: str | None = None
     delay: Delay | None = None
+    unit: str = "m"
 
 
 def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventions:
@@ -97,8 +93,8 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
     late_ns = 0 if delay is None else round(delay.seconds * 1e9)
     shifted = truth._replace(t_ns=truth.t_ns - late_ns)
     gyro = _gyro_against_poses(step, mean, motion.middle_ns, shifted)
-    accel, up = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
-    return Conventions(truth.topic, gyro, accel, relative, up, delay)
+    accel, up, unit = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
+    return Conventions(truth.topic, gyro, accel, relative, up, delay, unit)
 
 
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
@@ -117,33 +113,6 @@ def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:
     return " ".join(f"{'+' if row[np.argmax(np.abs(row))] > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P)
 
 
-class _Choice(NamedTuple):
-    best: int
-    certain: float
-    misfit: Float64[np.ndarray, " c"]
-    alike: Bool[np.ndarray, " c"]  # not told from the best
-
-
-def _choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"]) -> _Choice | None:
-    """Best row of errors, by Student's likelihood; None for too little time.
-
-    `certain` is the smallest ratio of the mean of the blocks' likelihood ratios to its standard error.
-    """
-    number, inverse = np.unique(blocks, return_inverse=True)
-    if len(number) < FEWEST_BLOCKS:
-        return None
-    misfit = np.sqrt(median(errors**2, axis=1))
-    sigma = max(float(misfit.min()), 1e-9)
-    likelihood = -0.5 * (STUDENT + 3.0) * np.log1p((errors / sigma) ** 2 / STUDENT)
-    sums = np.stack([np.bincount(inverse, row) for row in likelihood])
-    best = int(np.argmax(sums.sum(axis=1)))
-    ahead = sums[best] - sums
-    error = ahead.std(axis=1, ddof=1) * np.sqrt(len(number))
-    z = np.where(error > 0, ahead.sum(axis=1) / np.maximum(error, 1e-300), 0.0)
-    others = np.delete(z, best)
-    return _Choice(best, float(others.min()), misfit, z < SURE)
-
-
 def _excited(rate: Float64[np.ndarray, "n 3"]) -> bool:
     """Whether the motion turns about two axes at least."""
     _, second, main = np.linalg.eigvalsh(rate.T @ rate)
@@ -156,7 +125,7 @@ def _rate_readings(fast: float) -> list[tuple[str, Float64[np.ndarray, "3 3"]]]:
     return [(unit, RATES[unit] * P) for unit in units for P in signed_permutations()]
 
 
-def _reading(choice: _Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
+def _reading(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
     unit, matrix = readings[choice.best]
     as_is = next(row for row, (name, M) in enumerate(readings) if name == unit and (RATES[unit] * np.eye(3) == M).all())
     return Reading(
@@ -175,7 +144,7 @@ def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m
     readings = _rate_readings(float(quantile(np.linalg.norm(rate, axis=2).ravel(), 0.9)))
     if not readings:
         return None
-    choice = _choose(_carried(rate, first, last, readings), number)
+    choice = choose(_carried(rate, first, last, readings), number)
     if choice is None or choice.certain < SURE or not _excited(rate.reshape(-1, 3)):
         return None
     nothing = float(np.sqrt(median(((last - first) ** 2).sum(axis=1))))
@@ -241,7 +210,7 @@ def _gyro_against_poses(
     if not readings:
         return None
     errors = np.stack([np.linalg.norm(true - measured @ M.T, axis=1) for _, M in readings])
-    choice = _choose(errors, (first_s / BLOCKS_S).astype(np.int64))
+    choice = choose(errors, (first_s / BLOCKS_S).astype(np.int64))
     lively = np.linalg.norm(true, axis=1) >= median(np.linalg.norm(true, axis=1))
     if choice is None or median(errors[choice.best][lively]) > CLEARLY * median(np.linalg.norm(true[lively], axis=1)):
         return None
@@ -250,7 +219,7 @@ def _gyro_against_poses(
     return _nearest(choice, readings) if truth.kind == "truth" else None
 
 
-def _nearest(choice: _Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
+def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
     """Of the readings that fit about as well as the best, the one nearest to the log's axes; it is no proposal."""
     close = choice.misfit < choice.misfit.min() / CLEARLY
     good = [row for row in np.flatnonzero(close).tolist() if readings[row][0] == readings[choice.best][0]]
@@ -265,15 +234,15 @@ def _accel_against_poses(
     truth: Truth,
     gyro: Reading | None,
     relative: Reading | None,
-) -> tuple[Reading | None, str | None]:
-    """Axes of the accelerometer against the poses, and the axis of their world that is up.
+) -> tuple[Reading | None, str | None, str]:
+    """Axes of the accelerometer against the poses, the axis of their world that is up, and the unit of their positions.
 
     a_w + g up = R_wb axes f. Without acceleration (axes, up) and (-axes, -up) fit alike; then neither is told.
     """
     at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
     if len(use) < FEWEST_BLOCKS:
-        return None, None
+        return None, None, "m"
     f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
     ups = np.concatenate([np.eye(3)[2:], -np.eye(3)[2:], np.eye(3)[:2], -np.eye(3)[:2]])
     every = signed_permutations()
@@ -282,19 +251,24 @@ def _accel_against_poses(
         every = np.stack([agreed, -agreed])
     readings = [(P, up) for P in every for up in ups]
     turned = {k: quaternion.rotate(q_wb[use], f @ P.T) for k, P in enumerate(every)}
-    errors = np.stack(
-        [np.linalg.norm(a_w[use] + GRAVITY_M_S2 * up - turned[k], axis=1) for k in range(len(every)) for up in ups]
-    )
-    choice = _choose(errors, (first_s / BLOCKS_S).astype(np.int64))
+    blocks, a_w = (first_s / BLOCKS_S).astype(np.int64), a_w[use]
+
+    def residuals(factor: float, row: int) -> Float64[np.ndarray, "n 3"]:
+        k, which = divmod(row, len(ups))
+        return np.asarray(factor * a_w + GRAVITY_M_S2 * ups[which] - turned[k])
+
+    unit = position_unit(residuals, len(readings), blocks)
+    a_w = POSITIONS[unit] * a_w
+    choice = choose(np.stack([np.linalg.norm(residuals(1.0, row), axis=1) for row in range(len(readings))]), blocks)
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
-        return None, None
+        return None, None, unit
     P, up = readings[choice.best]
-    as_is = float(np.sqrt(median(np.sum((a_w[use] + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
+    as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_up = all((up == other).all() for _, other in alike)
     one_axes = all((other == P).all() for other, _ in alike)
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
     named = ("+" if up.sum() > 0 else "-") + "xyz"[int(np.argmax(np.abs(up)))] if one_up else None
     if gyro is None or not gyro.sole:  # without turns about two axes a proposal has no evidence
-        return found if found is not None and found.as_is else None, named if named == "+z" else None
-    return found, named
+        return found if found is not None and found.as_is else None, named if named == "+z" else None, unit
+    return found, named, unit

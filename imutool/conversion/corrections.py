@@ -1,4 +1,4 @@
-"""Correct a converted log: units, axes and stamps of IMUs, world and clock of poses.
+"""Correct a converted log: units, axes and stamps of IMUs, world, unit and clock of poses.
 
 Messages are patched where they stand, so everything else of them stays: covariances turn with their vectors, and the poses in
 the judged poses' frame turn with it. The record `imutool_corrections` says what was changed.
@@ -20,13 +20,14 @@ from imutool import registry
 from imutool.array_types import Float64, Int64
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.conventions import axis_names
+from imutool.cleaning.position_unit import POSITIONS
 from imutool.conversion.message_patch import MessagePatch
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import SAME_CLOCK_NS, find_stamps
 from imutool.errors import ConfigError
 from imutool.geometry import quaternion
 from imutool.log_info.inspection import sound_samples
-from imutool.log_info.pose_imu_rotation import Body, turned_body
+from imutool.log_info.pose_imu_rotation import Body, frames_of_copies, turned_body
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.codec.reflection import Reflected
@@ -50,6 +51,7 @@ class Corrections:
         imus: by topic, the matrices that lead from its gyro and accel to right ones.
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
         body: rotation from the body of the poses on `pose_topic` to the IMU.
+        unit: of the positions on `pose_topic`, of their velocities, and of transforms of the frames `copies`.
         stamps: new stamps of messages of an IMU, of poses or vectors, in file order.
         reflected: topics among them whose messages have a type of their own.
         notes: what is corrected, by topic.
@@ -62,6 +64,8 @@ class Corrections:
     late_ns: int = 0
     body: Body = NOT_TURNED
     pose_topic: str = ""
+    unit: str = "m"
+    copies: frozenset[str] = frozenset()
     stamps: Mapping[str, Int64[np.ndarray, "..."]] = field(default_factory=dict)
     reflected: Mapping[str, Reflected] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
@@ -114,9 +118,8 @@ class Corrections:
         if topic.message_encoding not in ENCODINGS:
             return message
         if topic.name in self.imus and topic.name in self.reflected:
-            return message._replace(
-                payload=self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
-            )
+            patched = self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
+            return message._replace(payload=patched)
         if topic.name in self.imus:
             return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         if not (self.pose_topic and _is_pose(topic)):
@@ -144,9 +147,12 @@ class Corrections:
             numbers = patch.numbers(which)
             patch.move_stamp(-self.late_ns, which)
             if patch.schema_name == schemas.VECTOR3:
-                numbers[:] = self.world @ numbers
+                factor = POSITIONS[self.unit] if dict(topic.metadata)[VELOCITY_KEY] == self.pose_topic else 1.0
+                numbers[:] = factor * self.world @ numbers
                 continue
-            numbers[schemas.POSITION] = self.world @ numbers[schemas.POSITION]
+            is_copy = named == 2 and patch.layout.texts[2 * which + 1] in self.copies
+            factor = POSITIONS[self.unit] if topic.name == self.pose_topic or is_copy else 1.0
+            numbers[schemas.POSITION] = factor * self.world @ numbers[schemas.POSITION]
             q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW][None].astype(np.float64)
             if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
                 q_wxyz = quaternion.multiply(q_wxyz, body)
@@ -200,8 +206,8 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     """
     imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
-    world, frame_id, late_ns, body, pose_topic = np.eye(3), "", 0, NOT_TURNED, ""
-    kept: list[str] = []
+    world, frame_id, late_ns, body, pose_topic, unit = np.eye(3), "", 0, NOT_TURNED, "", "m"
+    copies, kept = frozenset[str](), list[str]()
     with Log(path) as log:
         stamps = find_stamps(log, notes) if STAMPS in wanted else {}
         for topic in log.imu_topics if CONVENTIONS in wanted else []:
@@ -225,13 +231,12 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             turned = None if comes_later else turned_body(log, sound_samples(log, topic), survey.pose_topic)
             if changes := _pose_notes(survey, turned):
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
+                unit, copies = survey.position_unit, frames_of_copies(log, pose_topic)
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
                 notes[pose_topic] += changes
-        own_types = {
-            topic: found for topic in {**stamps, **imus} if isinstance(found := log.topics[topic].reflected, Reflected)
-        }
+        own_types = {t: found for t in (*stamps, *imus) if isinstance(found := log.topics[t].reflected, Reflected)}
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
-    return Corrections(imus, world, frame_id, late_ns, body, pose_topic, stamps, own_types, said, kept)
+    return Corrections(imus, world, frame_id, late_ns, body, pose_topic, unit, copies, stamps, own_types, said, kept)
 
 
 def _imu_note(survey: Survey) -> str:
@@ -242,6 +247,8 @@ def _imu_note(survey: Survey) -> str:
 
 def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
     parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
+    if survey.position_unit != "m":
+        parts.append(f"positions are now in m, and were in {survey.position_unit}")
     if survey.pose_delay_ns:
         side = "earlier" if survey.pose_delay_ns > 0 else "later"
         parts.append(f"stamps are {abs(survey.pose_delay_ns) * 1e-9:.6f} s {side} now")

@@ -15,6 +15,7 @@ import numpy as np
 
 import imutool
 from imutool.array_types import Shaped, UInt8
+from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of
 from imutool.conversion.sensor_pairs import SensorPairs
 from imutool.errors import DataError, not_installed
 from imutool.file_location import Location
@@ -73,12 +74,27 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
             series = Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
             for chunk in chunks([series]):
                 log.chunk(chunk)
+        _write_trajectories(log, source, stream.paths)
         if not log.contents.counts.total():
             raise DataError("holds no messages", where=source.name, expected="a log with data")
         _compare(source, stream.counts)
         if source.remarks.notes or source.remarks.losses:
             lines = [*source.remarks.losses, *source.remarks.notes]
             log.metadata("imutool/remarks", {f"{number:03d}": line for number, line in enumerate(lines, start=1)})
+
+
+def _write_trajectories(log: LogWriter, source: MessageLog, paths: Paths) -> None:
+    """Write the poses that paths left behind, but where a log that was converted before has them."""
+    for topic, found in paths.trajectories():
+        if (made := f"{topic}/pose") in source.counts:
+            continue
+        kind = {KIND_KEY: source.kinds.get(made, pose_kind(topic))}
+        columns = (found.t_ns, found.numbers[:, :3], found.numbers[:, [6, 3, 4, 5]])
+        encode = partial(encode_pose, frame_id=found.frame_id)
+        for chunk in chunks([Series(log.channel(made, schemas.POSE, kind), found.t_ns, columns, encode)]):
+            log.chunk(chunk)
+        note = f"{made} is made of the messages on {topic}: {paths.messages[topic]}; a later one replaces what it has, too"
+        source.remarks.notes.append(note)
 
 
 class _Stream:
@@ -90,7 +106,11 @@ class _Stream:
         self._buffers: dict[int, MessageBuffer] = {}  # by channel
         self._shared = MessageBuffer(packed=False), MessageBuffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
-        self._reflected: dict[int, tuple[int, Reflected]] = {}  # channel of the CDR, by that of the original
+        self._reflected: dict[int, tuple[int, Reflected | Px4]] = {}  # channel of the CDR, by that of the original
+        self._has_imu = any(schemas.canonical(topic.schema_name) == schemas.IMU for topic in source.topics)
+        self._begun = set[int]()  # channels that have messages
+        self._made_of = set[str]()  # topics of PX4 beside which another is made
+        self.paths = Paths()
         self._lacking = Counter[str]()  # messages without a sample, by topic
         self.counts = Counter[str]()
         for topic in source.topics:
@@ -133,6 +153,9 @@ class _Stream:
                 jumps.append((log_time, (log_time - last) * 1e-9))
             last = log_time
             self._pairs.take(topic, payload)
+            self.paths.take(topic, payload)
+            if number not in self._begun:
+                self._begin(number, topic)
             if number in self._reflected:
                 self._put_as_cdr(number, topic, log_time, publish_time, bytes(payload))
             buffer = self._put(number, log_time, publish_time, payload)
@@ -145,7 +168,19 @@ class _Stream:
         for topic, number in self._channels.items():
             self.counts[topic.name] += self._sequence[number]
         for name, count in self._lacking.items():
-            self._source.remarks.losses.append(f"messages of {name} without a sample: {count}; see {name}/as_recorded")
+            where = f"; see {name}/as_recorded" if name not in self._made_of else ""
+            self._source.remarks.losses.append(f"messages of {name} without a sample: {count}{where}")
+
+    def _begin(self, number: int, topic: MessageTopic) -> None:
+        """Define the topic that is made of one of PX4's."""
+        self._begun.add(number)
+        found = px4_of(topic, has_imu=self._has_imu) if topic.message_encoding == "cdr" else None
+        made = f"{topic.name}/{found.ending}" if found else ""
+        if found is not None and made not in self._source.counts:  # which it is in a log that was converted before
+            marks = ((KIND_KEY, self._source.kinds.get(made, pose_kind(topic.name))),) if found.ending == "pose" else ()
+            self._reflected[number] = self._define(MessageTopic(made, found.schema_name, "ros2msg", b"", "cdr", marks)), found
+            self._made_of.add(topic.name)
+            self._source.remarks.notes.append(f"{made} is made of {topic.name}, in FLU and ENU")
 
     def _put(self, number: int, log_time: int, publish_time: int, payload: bytes | memoryview) -> MessageBuffer:
         buffer = self._buffers[number]

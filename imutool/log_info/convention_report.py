@@ -25,6 +25,11 @@ from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
 
+CONVERTIBLE = {  # messages of which `convert` makes others
+    "nav_msgs/msg/Path": "poses",
+    "px4_msgs/msg/VehicleOdometry": "poses",
+    "px4_msgs/msg/VehicleImu": "an IMU",
+}
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -108,6 +113,8 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     else:
         yield "accel against poses", *_unknown(whole, NO_FORCE)
     yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, NO_FORCE if turned else NO_TURN))
+    if found.unit != "m":
+        yield "unit of positions", True, f"{found.unit}: so they accelerate as accel says"
     if found.delay is not None:
         side = "late" if found.delay.seconds > 0 else "early"
         late_s = abs(found.delay.seconds)
@@ -168,6 +175,13 @@ def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: I
         starts_after_s=float(knots[0] - start) * 1e-9,
         ends_before_s=float(end - knots[-1]) * 1e-9,
     )
+
+
+def made_by_convert(log: Log, *, has_imu: bool, has_poses: bool) -> list[str]:
+    """Hints at topics of which `convert` makes an IMU or poses, where the log has none."""
+    lacking = {"poses": not has_poses, "an IMU": not has_imu}
+    made = {topic.name: CONVERTIBLE.get(topic.own_schema or topic.schema_name, "") for topic in log.topics.values()}
+    return [f"imutool convert LOG OUT makes {what} of {name}" for name, what in made.items() if lacking.get(what)]
 
 
 def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:

@@ -27,6 +27,7 @@ from imutool.log_info.convention_report import (
     convention_warnings,
     conventions,
     coverage,
+    made_by_convert,
     transforms,
     truth_warnings,
 )
@@ -89,6 +90,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
     vectors = log.with_schema((schemas.VECTOR3,))
     warnings += [*(truth_warnings(truths) if own else [f"no IMU topic{JOIN_VECTORS if len(vectors) > 1 else ''}"]), *refused]
+    warnings += made_by_convert(log, has_imu=bool(own), has_poses=bool(truths))
     stamps = [clock for clock in clocks.values() if len(clock)]
     first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
     return LogInfo(

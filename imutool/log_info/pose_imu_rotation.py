@@ -134,3 +134,17 @@ def _turned(
         return None
     std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
     return Turned(np.degrees(quaternion.log(quaternion.of_matrix(turn))[0]), std_deg) if std_deg.max() < UNSURE_DEG else None
+
+
+def frames_of_copies(log: Log, topic: str) -> frozenset[str]:
+    """Frames of transforms whose positions are those of a topic, wherever they share a stamp."""
+    poses = read_truth(log, topics=[topic])
+    alike, other = set[str](), set[str]()
+    if poses is None:
+        return frozenset()
+    for named in log.with_schema((schemas.TF,)):
+        for batch in log.pose_batches(named.name):
+            _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
+            same = len(mine) > 0 and np.array_equal(poses.p_wb[mine], batch.p_wb[theirs])
+            (alike if same else other).add(batch.child_frame_id)
+    return frozenset(alike - other)

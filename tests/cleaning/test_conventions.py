@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from support.imu_defects import batch_of
 
 from imutool.cleaning.conventions import Conventions, judge, signed_permutations
+from imutool.cleaning.position_unit import POSITIONS
 from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.rules.axes import TO_Z_UP
 from imutool.cleaning.samples import Motion, Samples
@@ -81,6 +82,30 @@ def test_units_axes_and_worlds_are_named_by_poses(number: int, flown: tuple[Imu,
     assert found.up == up
     assert found.delay is not None
     assert found.delay.seconds == pytest.approx(late_ns * 1e-9, abs=0.005)
+
+
+@pytest.mark.parametrize(("unit", "up"), [("mm", "+z"), ("cm", "-z"), ("mm", "+y"), ("m", "+z")])
+def test_the_unit_of_positions_is_named_by_the_accelerometer(unit: str, up: str, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    C = np.eye(3) if up == "+z" else TO_Z_UP[up].T
+    turns = Rotation.from_matrix(C) * Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)
+    world = truth._replace(p_wb=truth.p_wb @ C.T / POSITIONS[unit], q_wb_wxyz=turns.as_quat(scalar_first=True))
+    found = judge(motion_of(imu), world, 1.0)
+    assert (found.unit, found.up, found.accel and found.accel.as_is) == (unit, up, True)
+
+
+@pytest.mark.parametrize("scale", [0.02, 3.0, 30.0, 300.0, 3000.0])
+def test_positions_of_no_certain_scale_have_no_other_unit(scale: float, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    assert judge(motion_of(imu), truth._replace(p_wb=scale * truth.p_wb), 1.0).unit == "m"
+
+
+@pytest.mark.parametrize("noise_m", [0.02, 0.2, 2.0, 20.0])
+def test_noisy_or_unrelated_positions_have_no_other_unit(noise_m: float, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    noise = noise_m * np.random.default_rng(4).normal(size=truth.p_wb.shape)
+    for p_wb in (truth.p_wb + noise, truth.p_wb[::-1] / noise_m, 0.0 * noise):
+        assert judge(motion_of(imu), truth._replace(p_wb=p_wb), 1.0).unit == "m"
 
 
 @pytest.mark.parametrize("number", range(48))

@@ -65,6 +65,27 @@ def test_a_log_in_g_and_degrees_permuted_in_ned_comes_back(accel_axes: np.ndarra
     assert sorted(path.name for path in tmp_path.iterdir()) == ["right.mcap", "wrong.mcap"]
 
 
+@pytest.mark.parametrize("scale", [100.0, 1000.0])
+def test_positions_in_other_units_come_back_in_metres(scale: float, made: Recording, tmp_path: Path) -> None:
+    v_w = None if made.truth.v_w is None else scale * made.truth.v_w
+    large = replace(made.truth, p_wb=scale * made.truth.p_wb, v_w=v_w)
+    other = replace(made.truth, p_wb=made.truth.p_wb + np.array([0.5, 0.0, 0.0]), v_w=None)
+    write(replace(made, truths={"/ground_truth/pose": large, "/ground_truth_leica/pose": other}), tmp_path / "large.mcap")
+    (warning,) = inspect(tmp_path / "large.mcap").warnings
+    assert f"are in {'mm' if scale > 100 else 'cm'} and not in m" in warning
+    convert(tmp_path / "large.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "right.mcap")
+    np.testing.assert_allclose(fixed.truth.p_wb, made.truth.p_wb, rtol=1e-12)
+    if made.truth.v_w is not None:
+        np.testing.assert_allclose(fixed.truth.v_w, made.truth.v_w, rtol=1e-12)
+    np.testing.assert_array_equal(fixed.truths["/ground_truth_leica/pose"].p_wb, other.p_wb)  # in the same frame, and in metres
+    with Log(tmp_path / "right.mcap") as log:
+        transforms = np.concatenate([batch.p_wb for batch in log.pose_batches("/tf")])
+        assert "positions are now in m" in log.metadata()[RECORD]["/ground_truth/pose"]
+    np.testing.assert_allclose(transforms, made.truth.p_wb, rtol=1e-12)
+    assert inspect(tmp_path / "right.mcap").warnings == []
+
+
 def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_path: Path) -> None:
     """Poses of another frame than the IMU's, as of a marker that was mounted askew, and the transform beside them."""
     turn = Rotation.from_rotvec([20.0, -30.0, 25.0], degrees=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -113,6 +115,71 @@ def test_a_bag_without_metadata_and_a_lone_database_convert(convert, tmp_path):
     (database,) = bag.glob("*.db3")
     assert convert(database.rename(tmp_path / "found.sqlite"), tmp_path / "b.mcap").returncode == 0
     assert messages_of(tmp_path / "a.mcap") == messages_of(tmp_path / "b.mcap")
+
+
+def unfinished(folder: Path, suffix: str, parts: int) -> Path:
+    """A bag whose recorder died: numbered parts, and no metadata.yaml."""
+    folder.mkdir()
+    storage = StoragePlugin.MCAP if suffix == "mcap" else StoragePlugin.SQLITE3
+    for n in range(parts):
+        part = write_bag(folder.parent / f"{folder.name}_part_{n}", storage, start=n * COUNT)
+        next(part.glob(f"*.{suffix}")).rename(folder / f"run_{n}.{suffix}")
+    return folder
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "db3"])
+def test_parts_without_metadata_are_read_in_the_order_of_their_times(convert, tmp_path, suffix):
+    bag = unfinished(tmp_path / "walk", suffix, 11)
+    (bag / "metadata.yaml").touch()  # the recorder had begun it
+    done = convert(bag, tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "the bag has no metadata.yaml" in done.stderr
+    loads = [data for topic, _, data in messages_of(tmp_path / "out.mcap")[0] if topic == "/load"]
+    assert loads == [bytes(STORE.serialize_cdr(load(0, n), "my_robot/msg/Load")) for n in range(11 * COUNT)]
+    assert "goes back" not in done.stderr  # the writer names jumps of the clock
+
+
+def test_an_unfinished_part_is_read_up_to_its_last_whole_chunk(convert, tmp_path):
+    bag = unfinished(tmp_path / "walk", "mcap", 2)
+    with (bag / "run_1.mcap").open("wb") as file:
+        writer = McapWriter(file, chunk_size=1024)
+        writer.start("ros2")
+        schema = writer.register_schema("my_robot/msg/Load", "ros2msg", b"float64 load\nstring[] names\n")
+        channel = writer.register_channel("/load", "cdr", schema)
+        for n in range(COUNT, 2 * COUNT):
+            message = bytes(STORE.serialize_cdr(load(0, n), "my_robot/msg/Load"))
+            writer.add_message(channel, START_NS + n * 10_000_000, message, START_NS + n * 10_000_000)
+    content = (bag / "run_1.mcap").read_bytes()  # `finish` was never called
+    (bag / "run_1.mcap").write_bytes(content[:-20])
+    done = convert(bag, tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "run_1.mcap was not finished: it is read up to its last whole chunk, at byte" in done.stderr
+    loads = [data for topic, _, data in messages_of(tmp_path / "out.mcap")[0] if topic == "/load"]
+    assert COUNT < len(loads) < 2 * COUNT
+    assert loads == [bytes(STORE.serialize_cdr(load(0, n), "my_robot/msg/Load")) for n in range(len(loads))]
+
+
+@pytest.mark.parametrize("change", ["another name", "a pause"])
+def test_logs_of_several_recordings_in_a_folder_are_no_bag(convert, tmp_path, change):
+    bag = unfinished(tmp_path / "walks", "mcap", 1)
+    later = write_bag(tmp_path / "later", StoragePlugin.MCAP, start=COUNT if change == "another name" else 100 * COUNT)
+    next(later.glob("*.mcap")).rename(bag / ("hall_1.mcap" if change == "another name" else "run_1.mcap"))
+    assert convert(bag, tmp_path / "out.mcap").returncode == 4
+
+
+def test_what_sqlite_has_not_written_into_the_database_is_a_loss(convert, tmp_path):
+    bag = unfinished(tmp_path / "walk", "db3", 1)
+    with sqlite3.connect(bag / "run_0.db3") as database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute(
+            "INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp, data FROM messages LIMIT 1"
+        )
+        database.commit()
+        shutil.copytree(bag, tmp_path / "crashed")  # while it is open
+    done = convert(tmp_path / "crashed", tmp_path / "out.mcap")
+    assert done.returncode == 3
+    assert "run_0.db3-wal may hold messages that the database lacks" in done.stderr
+    assert len(messages_of(tmp_path / "out.mcap")[0]) == 3 * COUNT
 
 
 @pytest.mark.parametrize(("storage", "suffix"), [(StoragePlugin.SQLITE3, "db3"), (StoragePlugin.MCAP, "mcap")])

@@ -129,6 +129,16 @@ def test_motion_without_gravity_is_refused_and_says_what_to_record(convert, tmp_
     assert "Record the acceleration with gravity" in done.stderr
 
 
+@pytest.mark.parametrize("with_gravity", [True, False])
+def test_the_linear_acceleration_of_phyphox_counts_with_gravity_alone(convert, tmp_path, with_gravity):
+    files = {"Gyroscope.csv": phyphox(GYRO, "rad/s"), "Linear Accelerometer.csv": phyphox(MOTION, "m/s^2")}
+    if with_gravity:
+        files["Gravity.csv"] = phyphox(GRAVITY, "m/s^2")
+    done = convert(pack(tmp_path / "walk.zip", files), tmp_path / "out.mcap")
+    assert done.returncode == (0 if with_gravity else 4)
+    assert ("Linear Accelerometer.csv has no gravity in it" in done.stderr) != with_gravity
+
+
 def test_oxts_of_kitti_gives_the_imu_and_an_estimate(convert, imutool, tmp_path):
     drive = {}
     for n in range(50):

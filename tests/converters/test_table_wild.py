@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import table
@@ -109,6 +110,8 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"gyr_left_wrist_{a}_dps" for a in "xyz"], [f"acc_left_wrist_{a}" for a in "xyz"]),
         ([f"Gyro{a}_chest (deg/s)" for a in "XYZ"], [f"Accel{a}_chest" for a in "XYZ"]),
         (["p [deg/s]", "q [deg/s]", "r [deg/s]"], [f"accl{k}" for k in range(3)]),
+        ([f"{a}Rate (deg/s)" for a in "xyz"], [f"{a}Accel (m/s2)" for a in "xyz"]),  # Aceinna
+        ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
 def test_names_of_other_programs(tmp_path, gyro, accel):
@@ -116,6 +119,67 @@ def test_names_of_other_programs(tmp_path, gyro, accel):
     (imu,) = read(path).imus.values()
     np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_a_table_of_ulog2csv_is_in_the_units_of_px4(tmp_path):
+    names = [
+        "timestamp",
+        *(f"gyro_rad[{k}]" for k in range(3)),
+        "gyro_integral_dt",
+        *(f"accelerometer_m_s2[{k}]" for k in range(3)),
+    ]
+    columns = [1e6 * T_S, *(0.01 * COUNTS).T, 0 * T_S + 10_000, *(9.80665 * ACCEL_G).T]
+    imu = read(write_csv(tmp_path / "run_sensor_combined_0.csv", names, columns)).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS, rtol=1e-12)
+
+
+@pytest.mark.parametrize("sentence", ["VNIMU", "VNYMR", "VNQMR"])
+def test_sentences_of_a_vectornav_lack_a_time_alone(tmp_path, sentence):
+    ahead = {"VNIMU": "", "VNYMR": "10.0,20.0,30.0,", "VNQMR": "0.0,0.0,0.0,1.0,"}[sentence] + "+1.1,-0.2,+0.3,"
+    behind = ",+20.7,+084.3" if sentence == "VNIMU" else ""
+    lines = [
+        f"${sentence},{ahead}{','.join(f'{v:+.4f}' for v in (*accel, *gyro))}{behind}*66"
+        for gyro, accel in zip(0.01 * COUNTS, 9.80665 * ACCEL_G, strict=True)
+    ]
+    (tmp_path / "vn.txt").write_text("\n".join(["$VNRRG,01,VN-100*58", *lines][sentence == "VNIMU" :]) + "\n")
+    (tmp_path / "map.toml").write_text(
+        'rate_hz = 100.0\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n'
+        'gyro = ["gyro_x [rad/s]", "gyro_y [rad/s]", "gyro_z [rad/s]"]\n'
+        'accel = ["accel_x [m/s^2]", "accel_y [m/s^2]", "accel_z [m/s^2]"]\n'
+    )
+    with pytest.raises(ConfigError) as refused:
+        read(tmp_path / "vn.txt")
+    assert 'gyro_unit = "rad/s"' in str(refused.value.fix)
+    imu = table.read_sequence(table.sequences(tmp_path / "vn.txt")[0], mapping=tmp_path / "map.toml").imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, 0.01 * COUNTS, atol=1e-4)
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, atol=1e-4)
+
+
+def test_the_scales_of_a_log_of_gyroflow_are_applied(tmp_path):
+    stated = (
+        "GYROFLOW IMU LOG\nversion,1.3\nid,logger\norientation,YxZ\ntscale,0.001\ngscale,0.00122173047\nascale,0.00048828125\n"
+    )
+    accel = np.round(ACCEL_G / 0.00048828125)
+    rows = np.column_stack([1000.0 * T_S, COUNTS, accel]).astype(int).tolist()
+    text = stated + "t,gx,gy,gz,ax,ay,az\n" + "".join(",".join(map(str, row)) + "\n" for row in rows)
+    (tmp_path / "run.gcsv").write_text(text)
+    imu = read(tmp_path / "run.gcsv").imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, 0.00122173047 * COUNTS, rtol=1e-12)
+    np.testing.assert_allclose(imu.accel, 9.80665 * 0.00048828125 * accel, rtol=1e-12)
+    np.testing.assert_allclose(imu.t_ns, 1e9 * T_S, atol=1.0)
+
+
+@pytest.mark.parametrize(("named", "written", "doubted"), [("dps", "rad", True), ("rads", "rad", False), ("dps", "deg", False)])
+def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named, written, doubted):
+    t_s = np.arange(6000) * 0.01
+    turn = Rotation.from_euler("xyz", 0.8 * np.sin(t_s[:, None] * [0.9, 1.3, 0.7]))
+    gyro = np.vstack([(turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    gyro = gyro + 0.002 * np.random.default_rng(3).normal(size=gyro.shape)
+    accel = turn.inv().apply([0.0, 0.0, 1.0])
+    names = ["t", *(f"gyro_{a}_{named}" for a in "xyz"), *(f"accel_{a}_g" for a in "xyz")]
+    values = gyro if written == "rad" else np.degrees(gyro)
+    notes = read(write_csv(tmp_path / "imu.csv", names, [t_s, *values.T, *accel.T])).remarks.notes
+    assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
 
 
 def test_forces_are_no_accelerations(tmp_path):

@@ -1,4 +1,4 @@
-"""Axes that contradict poses or gravity, and poses whose world has another axis up.
+"""Axes that contradict poses or gravity; poses with another axis up or in another unit.
 
 The poses decide where they can. Without them gravity, as the accelerometer reads it, decides how the gyro's axes lie to the
 accelerometer's; which of the two is wrong it cannot say, and the proposal changes the gyro.
@@ -53,6 +53,10 @@ class Axes(Rule):
             yield Finding(
                 "axes", "warning", what, 1, values={"fix": f"turn the world: z up instead of {found.up}"}, confidence=0.95
             )
+        if found.unit != "m":
+            whole.position_unit = found.unit
+            what = f"the positions of the poses {found.topic} are in {found.unit} and not in m, by the accelerometer"
+            yield Finding("axes", "warning", what, 1, values={"fix": f"{found.unit} to m"}, confidence=0.95)
         if found.delay is not None and abs(found.delay.seconds) > max(LATE_S, LATE_STDS * found.delay.std_s):
             whole.pose_delay_ns = round(found.delay.seconds * 1e9)
             side = "late" if found.delay.seconds > 0 else "early"

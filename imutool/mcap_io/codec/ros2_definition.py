@@ -33,6 +33,7 @@ TIMES = {  # the types of the seconds; ROS 1 has no package for them
 }
 PADDING = 4  # bytes to which some writers fill up a payload
 MOST_TEXT = 1 << 20  # bytes of a definition
+VECTORS = 3, 4  # numbers of a vector and of a quaternion, which are fields of their own
 MOST_COUNTED = 4096  # counts and texts before a number in one message
 
 _FIELD = re.compile(
@@ -238,7 +239,7 @@ class DescribedCdr:
                 size, form = int(leaf.kind[1]), walk.order + FORMATS[leaf.kind]
                 if leaf.length is None:
                     places[leaf.path] = leaf.offset, form
-                for number in range(3 if leaf.length == 3 else 0):
+                for number in range(leaf.length if leaf.length in VECTORS else 0):
                     places[f"{leaf.path}[{number}]"] = leaf.offset + size * number, form
         except LogError as error:
             raise ValueError(error.what) from error

@@ -1,0 +1,117 @@
+"""Packed tables of text: .csv.gz, .xz, .bz2, .zst, or the only one in a .zip.
+
+They are unpacked in memory, under a bound.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import zstandard
+
+from imutool.errors import DataError
+
+from ._archive import HEAD, MAX_RATIO, RATIO_FREE, refusing
+from ._source import head
+
+TABLES = ".csv", ".txt", ".tsv", ".dat"
+ENDINGS = ".gz", ".xz", ".bz2", ".zst", ".zip"
+LIMIT = 4 << 30  # bytes of a table
+ZSTD = b"\x28\xb5\x2f\xfd"
+FOREIGN = lzma.LZMAError, zstandard.ZstdError  # errors of damaged bytes that are no OSError
+
+
+def _open_zip(path: Path) -> Any:
+    """Only table of a zip; others are read as folders."""
+    archive = zipfile.ZipFile(path)
+    names = [name for name in archive.namelist() if not name.endswith("/") and "__MACOSX" not in name]
+    if len(names) != 1 or not names[0].lower().endswith(TABLES):
+        raise ValueError("no zip of one table")
+    return archive.open(names[0])
+
+
+def _open_zstd(path: Path) -> Any:
+    """Text of all frames; the library passes over the end of one that is cut."""
+    return zstandard.ZstdDecompressor().stream_reader(path.open("rb"), read_across_frames=True)
+
+
+OPENERS: dict[bytes, Callable[[Path], Any]] = {
+    b"\x1f\x8b": gzip.open,
+    b"\xfd7zXZ\0": lzma.open,
+    b"BZh": bz2.open,
+    ZSTD: _open_zstd,
+    b"PK\x03\x04": _open_zip,
+}
+
+
+def opener(start: bytes) -> Callable[[Path], Any] | None:
+    """What opens a file with these first bytes; None for one that is not packed."""
+    return next((open_it for magic, open_it in OPENERS.items() if start.startswith(magic)), None)
+
+
+def table_name(path: Path) -> str:
+    """Name of a table's file without the ending of its packing."""
+    return path.stem if path.suffix.lower() in ENDINGS else path.name
+
+
+def text_head(path: Path) -> bytes:
+    """First bytes of a packed text.
+
+    None of one that cannot be unpacked.
+    """
+    try:
+        with _opened(path) as file:
+            return bytes(file.read(HEAD))
+    except DataError:
+        return b""
+
+
+def read_bytes(path: Path) -> bytes:
+    """All bytes of a file, unpacked.
+
+    Raises:
+        DataError: damaged, or unpacking beyond all proportion.
+    """
+    if opener(head(path)) is None:
+        return path.read_bytes()
+    most = min(LIMIT, MAX_RATIO * path.stat().st_size + RATIO_FREE)
+    with _opened(path) as file:
+        content = bytes(file.read(most + 1))
+    if len(content) > most:
+        raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
+    if head(path).startswith(ZSTD):
+        _check_frames(path)
+    return content
+
+
+def _check_frames(path: Path) -> None:
+    """Refuse a last frame that is cut; the frames together are known to be within the bound."""
+    rest = path.read_bytes()
+    while rest:
+        frame = zstandard.ZstdDecompressor().decompressobj()
+        frame.decompress(rest)
+        if not frame.eof:
+            raise DataError(
+                "cannot be unpacked (it is cut off)", where=path, fix="Unpack what is there with zstd -d, and convert that"
+            )
+        rest = frame.unused_data
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    open_it = opener(head(path))
+    try:
+        with refusing(path):
+            if open_it is None:
+                raise ValueError("not packed")
+            with open_it(path) as file:
+                yield file
+    except FOREIGN as error:
+        raise DataError(f"cannot be unpacked ({error})", where=path) from error

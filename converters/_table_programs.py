@@ -1,0 +1,49 @@
+"""Texts of programs that state their columns elsewhere than in a header.
+
+A VectorNav sensor writes sentences whose name says what is in them (`$VNIMU,...*66`), by its user manual. A log of Gyroflow
+(.gcsv) holds raw numbers, with their scales above the table: of time in s, gyro in rad/s, accel in g.
+"""
+
+from __future__ import annotations
+
+import re
+
+from ._table_text import Columns
+
+MAG = ["mag_x", "mag_y", "mag_z"]
+IMU = [*(f"accel_{axis} [m/s^2]" for axis in "xyz"), *(f"gyro_{axis} [rad/s]" for axis in "xyz")]
+SENTENCES = {
+    "VNIMU": [*MAG, *IMU, "temperature", "pressure"],
+    "VNYMR": ["yaw", "pitch", "roll", *MAG, *IMU],
+    "VNQMR": ["qx", "qy", "qz", "qw", *MAG, *IMU],
+}
+LOOKED_AT = 4096  # first characters of a text
+GYROFLOW = "GYROFLOW IMU LOG"
+SCALES = {"tscale": ("t", "s"), "gscale": (r"g[xyz]", "rad/s"), "ascale": (r"a[xyz]", "g")}  # columns, and their unit after it
+
+
+def of_vectornav(text: str, columns: Columns) -> str:
+    """Table of the sentences of a VectorNav sensor; empty for any other text."""
+    match = re.search(rf"^\$({'|'.join(SENTENCES)}),", text[:LOOKED_AT], re.MULTILINE)
+    if match is None or not text.lstrip().startswith("$VN"):
+        return ""
+    lines = [line for line in text.splitlines() if line.strip()]
+    rows = [line.partition("*")[0].partition(",")[2] for line in lines if line.startswith(match[0])]
+    columns.remarks.notes.append(f"the sentences {match[1]} of a VectorNav sensor")
+    if len(rows) < len(lines):
+        columns.remarks.losses.append(f"{len(lines) - len(rows)} lines of other sentences are left out")
+    return "\n".join([",".join(SENTENCES[match[1]]), *rows]) + "\n"
+
+
+def scale_gyroflow(columns: Columns) -> None:
+    """Bring the numbers of a log of Gyroflow to their units.
+
+    Its orientation, one of both sensors, is not applied.
+    """
+    for name, (pattern, unit) in SCALES.items():
+        scale = columns.numbers.get(name, 1.0)
+        for column in [column for column in columns.values if re.fullmatch(pattern, column)]:
+            columns.values[column] = columns.values[column].astype(float) * scale
+            columns.units[column] = unit
+            columns.texts.pop(column, None)
+    columns.remarks.notes.append("a log of Gyroflow: its scales are applied, and its orientation is not")

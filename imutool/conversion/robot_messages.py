@@ -1,0 +1,224 @@
+"""IMUs and poses in other messages of ROS 2: those of PX4, and paths.
+
+PX4's messages (px4_msgs) are in FRD and NED, in microseconds. The topics made of them are in FLU and ENU, as those of a ULog.
+A path (nav_msgs/Path) that grows as its robot moves is a trajectory: each new one replaces the poses from its first stamp on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from imutool.array_types import Float64, Int64, UInt8
+from imutool.errors import LogError
+from imutool.geometry import quaternion
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.codec.formats import Path as Field
+from imutool.mcap_io.codec.reflection import Sample
+from imutool.mcap_io.codec.ros2_definition import DescribedCdr, parse
+from imutool.recording.message_log import MessageTopic, named_kind
+
+PACKAGE = "px4_msgs/msg/"
+PATH = "nav_msgs/msg/Path"
+FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
+ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+Q_ENU_FROM_NED_WXYZ = quaternion.of_matrix(ENU_FROM_NED)
+Q_FRD_FROM_FLU_WXYZ = np.array([[0.0, 1.0, 0.0, 0.0]])
+US, BODY, WORLD = 1000, "base_link", "map"  # ns; frames of ROS
+KNOWN_FRAMES = 1, 2  # of VehicleOdometry's poses: NED, and FRD with any heading
+NUMBERS = 7  # of a pose: position, then xyzw
+
+
+def _row(name: str, count: int = 3) -> tuple[Field, ...]:
+    return tuple((name, place) for place in range(count))
+
+
+@dataclass(frozen=True)
+class Px4:
+    """IMU or poses in the messages of a topic of PX4."""
+
+    schema_name: str
+    ending: str  # of the topic that is made
+    format: DescribedCdr
+    kind: str
+
+    def sample(self, raw: bytes, log_time: int) -> Sample:
+        """Sample in a message, in FLU and ENU.
+
+        Raises:
+            ValueError: the message holds no sample.
+        """
+        try:
+            return self._read(raw)
+        except KeyError as error:
+            raise ValueError(f"the message lacks {error}") from error
+
+    def _read(self, raw: bytes) -> Sample:
+        message, at = self.format.parse(raw), self.format.at
+
+        def number(name: str) -> int:
+            return int(at(message, (name,)))
+
+        def vector(name: str, count: int = 3) -> Float64[np.ndarray, " k"]:
+            return np.array([at(message, field) for field in _row(name, count)], np.float64)
+
+        if self.kind == "VehicleOdometry":
+            if number("pose_frame") not in KNOWN_FRAMES:
+                raise ValueError("the frame of the pose is not known")
+            q_wxyz = quaternion.multiply(Q_ENU_FROM_NED_WXYZ, vector("q", 4)[None])
+            turn = quaternion.multiply(q_wxyz, Q_FRD_FROM_FLU_WXYZ)[0]
+            values = np.concatenate([ENU_FROM_NED @ vector("position"), turn])
+            return Sample((number("timestamp_sample") or number("timestamp")) * US, WORLD, values.tolist())
+        if self.kind == "VehicleImu":  # the middle of what it integrates
+            spans = np.array([number("delta_angle_dt"), number("delta_velocity_dt")]) * US
+            if not spans.all():
+                raise ValueError("it integrates over no time")
+            rates, forces = (
+                vector(f"delta_{of}") / (span * 1e-9) for of, span in zip(("angle", "velocity"), spans, strict=True)
+            )
+            stamp_ns = number("timestamp_sample") * US - int(spans[0]) // 2
+        else:
+            rates, forces, stamp_ns = vector("gyro_rad"), vector("accelerometer_m_s2"), number("timestamp") * US
+        return Sample(stamp_ns, BODY, [*(FLU_FROM_FRD * rates).tolist(), *(FLU_FROM_FRD * forces).tolist()])
+
+    def encode(self, samples: Sequence[Sample]) -> UInt8[np.ndarray, "n L"]:
+        """Samples of one frame as CDR."""
+        values, stamps = np.array([sample.values for sample in samples]), np.array([s.stamp_ns for s in samples], np.int64)
+        encode = encode_imu if self.schema_name == schemas.IMU else encode_pose
+        return encode(stamps, values[:, :3], values[:, 3:], samples[0].frame_id)
+
+
+def px4_of(topic: MessageTopic, *, has_imu: bool) -> Px4 | None:
+    """IMU or poses that a topic of PX4 holds; None of any other.
+
+    No IMU where the log has one of ROS.
+    """
+    name = schemas.canonical(topic.schema_name)
+    kind = name.removeprefix(PACKAGE)
+    is_pose = kind == "VehicleOdometry"
+    if name == kind or kind not in ("SensorCombined", "VehicleImu", "VehicleOdometry") or (has_imu and not is_pose):
+        return None
+    try:
+        form = DescribedCdr(parse(name, topic.schema))
+    except LogError:
+        return None
+    return Px4(schemas.POSE if is_pose else schemas.IMU, "pose" if is_pose else "imu", form, kind)
+
+
+def pose_kind(topic: str) -> str:
+    """Kind of the poses of PX4 or of a path: by the topic's name, else an estimate."""
+    kind = named_kind(re.sub(r"/fmu/out/vehicle_odometry$", "", topic), "")  # which is the EKF's
+    return "estimate" if kind == "unknown" else kind
+
+
+class Trajectory(NamedTuple):
+    """Poses of a path, in order."""
+
+    t_ns: Int64[np.ndarray, " n"]
+    numbers: Float64[np.ndarray, "n 7"]  # position, then xyzw
+    frame_id: str
+
+
+class Paths:
+    """Trajectories that paths leave behind, by topic.
+
+    A plan, whose poses have no past times of their own, leaves none.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[str, Trajectory | None] = {}
+        self.messages: dict[str, int] = defaultdict(int)
+
+    def take(self, topic: MessageTopic, payload: bytes | memoryview) -> None:
+        """Take in a message, if it is a path."""
+        if schemas.canonical(topic.schema_name) != PATH or topic.message_encoding != "cdr":
+            return
+        before = self._found.get(topic.name, Trajectory(np.zeros(0, np.int64), np.zeros((0, NUMBERS)), ""))
+        try:
+            stamp_ns, path = _path(bytes(payload))
+        except LogError:
+            path, stamp_ns = None, 0
+        if path is not None and not len(path.t_ns):
+            return
+        self.messages[topic.name] += 1
+        rises = path is not None and path.t_ns[0] > 0 and bool((np.diff(path.t_ns) > 0).all())
+        if before is None or path is None or not rises or (stamp_ns and path.t_ns[-1] > stamp_ns):
+            self._found[topic.name] = None
+            return
+        kept = before.t_ns < path.t_ns[0]
+        t_ns, numbers = np.concatenate([before.t_ns[kept], path.t_ns]), np.concatenate([before.numbers[kept], path.numbers])
+        self._found[topic.name] = Trajectory(t_ns, numbers, path.frame_id)
+
+    def trajectories(self) -> Iterator[tuple[str, Trajectory]]:
+        """Topics with their trajectories of two poses at least."""
+        for topic, found in self._found.items():
+            if found is not None and len(found.t_ns) > 1:
+                yield topic, found
+
+
+def _path(payload: bytes) -> tuple[int, Trajectory]:
+    """Stamp and poses of a path; rows of one length are read at once.
+
+    Raises:
+        LogError: the bytes are no path.
+    """
+    walk = _Walk("cdr", payload)
+    stamp_ns, frame_id = walk.header()
+    count = walk.word()
+    if count > len(payload) // (8 * NUMBERS):
+        raise LogError(f"a path of {count} poses in {len(payload)} bytes")
+    stamps, numbers, frames = [], [], {frame_id}
+    starts = []
+    for done in range(count):
+        starts.append(walk.position)
+        stamp, frame = walk.header()
+        walk.align(8)
+        stamps.append(np.array([stamp], np.int64))
+        numbers.append(np.frombuffer(payload, walk.order + "f8", NUMBERS, walk.skip(8 * NUMBERS))[None].astype(np.float64))
+        frames.add(frame)
+        if done == 1 and (rest := _rows(payload, starts[1], walk.position, count - 2, walk.order)) is not None:
+            stamps.append(rest[0])
+            numbers.append(rest[1])
+            break
+    if not count:
+        return stamp_ns, Trajectory(np.zeros(0, np.int64), np.zeros((0, NUMBERS)), frame_id)
+    return stamp_ns, Trajectory(np.concatenate(stamps), np.concatenate(numbers), frame)
+
+
+class _Walk(schemas.ByteWalk):
+    """Walk over stamps and frames."""
+
+    def header(self) -> tuple[int, str]:
+        """Stamp (ns) and frame."""
+        assert self.message is not None
+        self.align(4)
+        at = self.skip(8)
+        sec, nanosec = (int(np.frombuffer(self.message, self.order + kind, 1, at + k)[0]) for k, kind in ((0, "i4"), (4, "u4")))
+        length = self.word()
+        at = self.skip(length)
+        return sec * schemas.NS_PER_S + nanosec, self.message[at : at + length].rstrip(b"\0").decode(errors="replace")
+
+
+def _rows(
+    payload: bytes, first: int, second: int, count: int, order: str
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"]] | None:
+    """Poses behind the second, where all have its length and frame."""
+    size = second - first
+    if len(payload) < second + count * size:
+        return None
+    rows = np.frombuffer(payload, np.uint8, count * size, second).reshape(count, size)
+    model = np.frombuffer(payload, np.uint8, size, first)
+    text = slice(8, size - 8 * NUMBERS)
+    if (rows[:, text] != model[text]).any():
+        return None
+    seconds, nanoseconds = (
+        np.ascontiguousarray(rows[:, at : at + 4]).view(order + kind)[:, 0] for at, kind in ((0, "i4"), (4, "u4"))
+    )
+    numbers = np.ascontiguousarray(rows[:, size - 8 * NUMBERS :]).view(order + "f8").astype(np.float64)
+    return seconds.astype(np.int64) * schemas.NS_PER_S + nanoseconds.astype(np.int64), numbers

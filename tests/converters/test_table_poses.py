@@ -1,0 +1,196 @@
+"""Poses beside an IMU's table: exports of motion captures, trajectories, and files that give none; and packed tables."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from scipy.spatial.transform import Rotation
+
+from imutool.converters import table
+from imutool.errors import DataError
+from imutool.recording.message_log import MessageLog
+
+COUNT = 1500
+T_S = np.arange(COUNT) / 100.0
+ANGLES = 0.6 * np.sin(T_S[:, None] * [0.9, 1.3, 0.7])
+TURN = Rotation.from_euler("ZYX", ANGLES)
+XYZW, MATRICES = TURN.as_quat(), TURN.as_matrix()
+P_M = np.sin(T_S[:, None] * [0.5, 0.8, 1.1])
+GYRO = np.vstack([(TURN[:-1].inv() * TURN[1:]).as_rotvec() * 100.0, np.zeros(3)])
+ACCEL = TURN.inv().apply([0.0, 0.0, 9.80665])
+EPOCH_S = 1_700_000_000
+IMU_HEADER = "timestamp [ns],gyro_x (rad/s),gyro_y (rad/s),gyro_z (rad/s),acc_x (m/s^2),acc_y (m/s^2),acc_z (m/s^2)\n"
+
+
+def rows(*columns: np.ndarray, mark: str = ",", end: str = "") -> str:
+    return "".join(mark.join(f"{value:.9g}" for value in row) + end + "\n" for row in np.column_stack(columns).tolist())
+
+
+def imu_text(epoch_s: int = 0) -> str:
+    lines = rows(GYRO, ACCEL).splitlines()
+    return IMU_HEADER + "".join(f"{epoch_s * 10**9 + n * 10_000_000},{line}\n" for n, line in enumerate(lines))
+
+
+def motive(unit: str, size: float) -> str:
+    """A rigid body and one of its markers; the body is out of sight in the third row."""
+    stated = "Format Version,1.23,Take Name,Take 1,Take Notes,,Export Frame Rate,100.000000,Rotation Type,Quaternion"
+    stated += f",Length Units,{unit}"
+    names, axes = ",".join(["drone"] * 8), ",".join(["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"])
+    header = [
+        f",Type,{names.replace('drone', 'Rigid Body')},Marker,Marker,Marker",
+        f",Name,{names},m,m,m",
+        f",ID,{names},m,m,m",
+    ]
+    header += [f",,{axes},Position,Position,Position", "Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,X,Y,Z"]
+    lines = rows(np.arange(COUNT), T_S, XYZW, size * P_M, 0.0 * T_S, size * P_M + 1.0).splitlines()
+    lines[2] = "2,0.02" + "," * 11
+    return "\n".join([stated + "\n", *header, *lines]) + "\n"
+
+
+def vicon() -> str:
+    header = "Objects\n100\n,,Global Angle drone:drone,,,,,,\nFrame,Sub Frame,RX,RY,RZ,RW,TX,TY,TZ\n,,,,,,mm,mm,mm\n"
+    return header + rows(np.arange(1, COUNT + 1), 0 * T_S, XYZW, 1000.0 * P_M)
+
+
+def qualisys() -> str:
+    header = f"NO_OF_FRAMES\t{COUNT}\nFREQUENCY\t100\nDATA_INCLUDED\t6D\nBODY_NAMES\tdrone\n"
+    header += "Frame\tTime\tdrone X\tY\tZ\tRoll\tPitch\tYaw\tResidual\t" + "\t".join(f"Rot[{n}]" for n in range(9)) + "\t\n"
+    columns = np.arange(1, COUNT + 1), T_S, 1000.0 * P_M, 0.0 * P_M, 0 * T_S, MATRICES.transpose(0, 2, 1).reshape(-1, 9)
+    return header + rows(*columns, mark="\t", end="\t")
+
+
+EXPORTS = {
+    "Take 2026-11-23 01.02.03 PM.csv": motive("Millimeters", 1000.0),
+    "Take 1.csv": motive("Meters", 1.0),
+    "objects.csv": vicon(),
+    "6D.tsv": qualisys(),
+}
+
+
+def read(folder: Path) -> MessageLog:
+    return table.read_sequence(table.sequences(folder)[0])
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_export_of_a_motion_capture_beside_an_imu_is_its_truth_in_metres(tmp_path, name):
+    (tmp_path / name).write_text(EXPORTS[name])
+    (tmp_path / "phone.csv").write_text(imu_text())
+    log = read(tmp_path)
+    poses = log.poses["/ground_truth/pose"]
+    seen = np.arange(COUNT) != 2 if "Take" in name else np.full(COUNT, True)
+    np.testing.assert_allclose(poses.p_wb, P_M[seen], atol=1e-6)
+    np.testing.assert_allclose(np.abs((poses.q_wb_wxyz * XYZW[seen][:, [3, 0, 1, 2]]).sum(axis=1)), 1.0, atol=1e-7)
+    np.testing.assert_allclose(poses.t_ns, 1e9 * T_S[seen], atol=1.0)
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    assert log.remarks.losses == []
+
+
+@pytest.mark.parametrize("rotation", ["angles of Vicon", "angles of Motive"])
+def test_angles_of_no_certain_convention_are_no_poses_and_a_loss(tmp_path, rotation):
+    without = vicon().replace("RX,RY,RZ,RW,", "RX,RY,RZ,,")
+    text = without if "Vicon" in rotation else motive("Meters", 1.0).replace("Rotation Type,Quaternion", "Rotation Type,XYZ")
+    (tmp_path / "mocap.csv").write_text(text)
+    (tmp_path / "imu.csv").write_text(imu_text())
+    log = read(tmp_path)
+    assert log.poses == {}
+    assert any("export the rotation as a quaternion" in loss for loss in log.remarks.losses)
+
+
+def test_the_imu_keeps_its_own_clock_beside_a_truth_of_as_many_rows(tmp_path):
+    (tmp_path / "imu.csv").write_text(imu_text(EPOCH_S))
+    late = rows(P_M, XYZW, mark=" ").splitlines()
+    (tmp_path / "gt.txt").write_text(
+        "# timestamp tx ty tz qx qy qz qw\n"
+        + "".join(f"{EPOCH_S + 3 + t:.6f} {line}\n" for t, line in zip(T_S, late, strict=True))
+    )
+    log = read(tmp_path)
+    assert log.imus["/imu0"].t_ns[0] == EPOCH_S * 10**9
+    assert log.poses["/ground_truth/pose"].t_ns[0] == (EPOCH_S + 3) * 10**9
+
+
+def test_the_biases_beside_a_true_state_are_no_imu(tmp_path):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    names = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+    biases = [f"b_{sensor}_RS_S_{axis} [{unit}]" for sensor, unit in (("w", "rad s^-1"), ("a", "m s^-2")) for axis in "xyz"]
+    state = rows(1e9 * T_S, P_M, XYZW[:, [3, 0, 1, 2]], 0.0 * GYRO, 0.0 * ACCEL)
+    (tmp_path / "gt.csv").write_text(", ".join([names, *biases]) + "\n" + state)
+    log = read(tmp_path)
+    assert [*log.imus] == ["/imu0"]
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL, atol=1e-6)
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].p_wb, P_M, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "trajectory.tum"])
+def test_a_trajectory_of_another_name_is_an_estimate(tmp_path, name):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / name).write_text(rows(T_S, P_M, XYZW, mark=" "))
+    log = read(tmp_path)
+    assert log.kinds == {"/estimate/pose": "estimate"}
+    np.testing.assert_allclose(log.poses["/estimate/pose"].p_wb, P_M, atol=1e-6)
+
+
+def test_a_truth_that_gives_no_poses_is_a_loss(tmp_path):
+    """KITTI's poses are twelve numbers a row, without a time."""
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / "poses_gt.txt").write_text(rows(np.concatenate([MATRICES, P_M[:, :, None]], axis=2).reshape(-1, 12), mark=" "))
+    log = read(tmp_path)
+    assert log.poses == {}
+    assert any("poses_gt.txt gives no poses" in loss for loss in log.remarks.losses)
+
+
+def zipped(content: bytes, path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("inside.csv", content)
+
+
+def in_frames(content: bytes, path: Path) -> None:
+    path.write_bytes(zstandard.compress(content[:9_000]) + zstandard.compress(content[9_000:]))
+
+
+PACKINGS: dict[str, Callable[[bytes, Path], object]] = {
+    ".csv.gz": lambda content, path: path.write_bytes(gzip.compress(content)),
+    ".csv.xz": lambda content, path: path.write_bytes(lzma.compress(content)),
+    ".csv.bz2": lambda content, path: path.write_bytes(bz2.compress(content)),
+    ".csv.zst": lambda content, path: path.write_bytes(zstandard.compress(content)),
+    ".zip": zipped,
+    ".zst": in_frames,
+}
+
+
+@pytest.mark.parametrize("ending", PACKINGS)
+def test_a_packed_table_reads_as_the_table(convert, tmp_path, ending):
+    path = tmp_path / f"walk{ending}"
+    PACKINGS[ending](imu_text().encode(), path)
+    before = path.read_bytes()
+    (log,) = table.read(path)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-8)
+    assert log.name == "walk"
+    assert path.read_bytes() == before
+    assert convert(path, tmp_path / "out.mcap").returncode == 0
+
+
+@pytest.mark.parametrize("ending", [".csv.gz", ".csv.xz", ".csv.bz2", ".csv.zst"])
+def test_a_packed_table_that_is_cut_or_too_large_is_refused_in_one_sentence(convert, tmp_path, ending):
+    PACKINGS[ending](imu_text().encode(), tmp_path / f"cut{ending}")
+    content = (tmp_path / f"cut{ending}").read_bytes()
+    (tmp_path / f"cut{ending}").write_bytes(content[: len(content) // 2])
+    done = convert(tmp_path / f"cut{ending}", tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "cannot be" in done.stderr or "it is compressed with" in done.stderr
+    PACKINGS[ending](b"t,ax,ay,az,gx,gy,gz\n" + b"1,2,3,4,5,6,7\n" * 10 + b"\n" * (1 << 25), tmp_path / f"bomb{ending}")
+    with pytest.raises(DataError, match="unpacks to more than"):
+        list(table.read(tmp_path / f"bomb{ending}"))
+
+
+def test_a_folder_may_hold_packed_tables(tmp_path):
+    (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(imu_text().encode()))
+    (tmp_path / "groundtruth.txt.gz").write_bytes(gzip.compress(rows(T_S, P_M, XYZW, mark=" ").encode()))
+    np.testing.assert_allclose(read(tmp_path).poses["/ground_truth/pose"].p_wb, P_M, atol=1e-6)
