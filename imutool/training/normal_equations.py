@@ -2,7 +2,7 @@
 
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
 (`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
-the same form as a nuisance is what the logs have in common. The unknowns of a log are eliminated log by log (Schur's complement),
+the same form as a nuisance is what logs have in common. The unknowns of a log are eliminated one by one (Schur's complement),
 so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the parameters: with a
 window's residual and Jacobian (`imutool.inertial.windows`), the rest is a product of matrices.
 """
