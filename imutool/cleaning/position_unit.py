@@ -30,7 +30,7 @@ def position_unit(
     misfit is of the accelerometer's scale and bias, and counts for nothing.
     """
     still, metres = (_best(partial(residuals, factor), readings, blocks) for factor in (0.0, 1.0))
-    if still is None or metres is None or np.median(metres) < np.median(still):
+    if still is None or metres is None or median(metres) < median(still):
         return "m"
     found = {"": still, "m": metres}
     for unit in ("cm", "mm"):
@@ -39,7 +39,10 @@ def position_unit(
         if scales is not None and RIVALS[scales.best] == 1.0 and (row := rivals[scales.best]) is not None:
             found[unit] = row
     choice = choose(np.stack([*found.values()]), blocks)
-    if choice is None or choice.certain < SURE or 1.0 - (choice.misfit[choice.best] / choice.misfit[0]) ** 2 < LEAST_SHARE:
+    if choice is None or choice.certain < SURE:
+        return "m"
+    of_still, left = choice.misfit[0] ** 2, choice.misfit[choice.best] ** 2
+    if of_still - left <= LEAST_SHARE * of_still:
         return "m"
     return [*found][choice.best] or "m"
 
