@@ -169,7 +169,7 @@ def innovations(blocks: Sequence[FilteredBlock]) -> Innovations:
     return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
 
 
-def stops(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
+def stops_of(blocks: Sequence[FilteredBlock]) -> tuple[tuple[float, float], ...]:
     """Beginning and end of each row of blocks at rest."""
     rows = [list(row) for resting, row in itertools.groupby(blocks, lambda block: block.resting) if resting]
     return tuple((row[0].start_s, row[-1].end_s) for row in rows)

@@ -28,7 +28,7 @@ from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
-from imutool.bias_start.bias_tracking import BiasFilter, Samples, innovations, stops
+from imutool.bias_start.bias_tracking import BiasFilter, Samples, innovations, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
@@ -175,7 +175,7 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     difference = np.where(shown, (last.bias - prior.mean) / gain, 0.0)
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((found.chi_square > SURPRISING).mean())
-    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops(blocks), found)
+    return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops_of(blocks), found)
 
 
 def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
@@ -197,7 +197,7 @@ def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], pri
 
 
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
-    """Sentence on a bias of the gyro that the log shows less than the start did, and that is less known than it is large."""
+    """Sentence on a bias of the gyro that the log shows less well than its start, and whose deviation exceeds it."""
     before, shown = start.std[:3], DEPENDENT * np.sqrt(found.variance[:3])
     std = 1.0 / np.sqrt(1.0 / np.maximum(before, LEAST_STD[:3]) ** 2 + 1.0 / shown**2)
     unknown = np.where((shown > before) & (std > np.abs(start.rest[:3])), std, 0.0)

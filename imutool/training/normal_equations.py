@@ -2,7 +2,7 @@
 
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
 (`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
-the same form as a nuisance is what logs have in common. The unknowns of a log are eliminated one by one (Schur's complement),
+the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's complement),
 so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the parameters: with a
 window's residual and Jacobian (`imutool.inertial.windows`), the rest is a product of matrices.
 """
@@ -33,11 +33,11 @@ from imutool.units import Sensor
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
 FREE: Mapping[Sensor, int] = {"gyro": 3, "accel": 5}  # a log's own unknowns that its prediction leaves free: rest bias, tilt
-MAX_SAMPLES = 150_000  # of one window length
-CHUNK = 20_000  # samples at a time
+MAX_SAMPLES, CHUNK = 150_000, 20_000  # samples of one window length, and at a time
 REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
-SETTLED, MOST_STEPS, WEAK = 0.2, 40, 0.01  # deviations a parameter moves; steps of all lengths; of a prior's precision
+SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
+WEAK = 0.01  # of a prior's precision, that of the prior at first
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -191,8 +191,8 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
             width = shown_by_logs(seen.sensor, fit.H, fit.g, theta, own, prior)
-        now = prior * (1.0 if step >= len(sets) else WEAK)
-        problem = Problem(theta, own, now, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
+        held = prior * (1.0 if step >= len(sets) else WEAK)
+        problem = Problem(theta, own, held, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
         if step > len(sets) and settled:
             break
         found = problem.solve(range(len(prior)))
