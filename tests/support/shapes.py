@@ -1,7 +1,8 @@
-"""Shapes and types in annotations, checked once for each combination of shapes and types that a function meets.
+"""Shapes of arrays and words in annotations, checked once for each combination of shapes and types that a function meets.
 
 jaxtyping and beartype check every call, at 0.1 to 0.3 ms each: two thirds of the time of the tests of `diagnose`.
 What they check depends on types, dtypes and shapes alone, so a combination that has passed passes again.
+A function without an array or a Literal in its annotations is left as it is: mypy checks all other types.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import re
 import sys
 import types
+import typing
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
@@ -35,11 +38,24 @@ def _check_new_combinations(checked: Any = None, *, typechecker: Any) -> Any:
         return functools.partial(_check_new_combinations, typechecker=typechecker)
     if inspect.isclass(checked):
         if dataclasses.is_dataclass(checked) and isinstance(init := vars(checked).get("__init__"), types.FunctionType):
-            checked.__init__ = _check_function(init, typechecker)  # type: ignore[misc]
+            names = vars(sys.modules[checked.__module__])
+            if _any_to_check(init, names):
+                checked.__init__ = _check_function(init, typechecker)  # type: ignore[misc]
         return checked
     if not isinstance(checked, types.FunctionType):
         return _CHECK_EACH_CALL(checked, typechecker=typechecker)
-    return _check_function(checked, typechecker)
+    return _check_function(checked, typechecker) if _any_to_check(checked, checked.__globals__) else checked
+
+
+def _any_to_check(function: types.FunctionType, names: dict[str, Any]) -> bool:
+    """Whether an annotation (a text, by `from __future__ import annotations`) names an array or a Literal."""
+    words = {word for annotation in function.__annotations__.values() for word in re.findall(r"\w+", str(annotation))}
+    return any(_is_checked(names.get(word)) for word in words)
+
+
+def _is_checked(kind: Any) -> bool:
+    module = str(getattr(kind, "__module__", None))
+    return kind is typing.Literal or module.startswith("jaxtyping") or any(map(_is_checked, typing.get_args(kind)))
 
 
 def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[..., Any]:
