@@ -81,6 +81,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Leaves what is collected and imported out of every later collection of garbage."""
+    from support.outlines import draw_outlines
+
+    draw_outlines()
     gc.freeze()
 
 

@@ -59,7 +59,7 @@ WRITERS: dict[str, tuple[Sequence[str], str]] = {
     "train": (["train", "in.mcap", "--method", "linear", "-o", "out.safetensors"], "out.safetensors"),
     "trajectories": (["evaluate", "in.mcap", "--trajectories", "out"], "out"),
     "pictures": (["view", "in.mcap", "--png", "out"], "out"),
-    "diagnose": (["diagnose", "in.mcap", "-o", "out"], "out"),
+    "diagnose": (["diagnose", "in.mcap", "-o", "out", "--set", "search.rounds=1"], "out"),
     "conceal": (["conceal", "in.mcap", "out"], "out"),
     "live": (["live", "--from", "in.mcap", "--speed", "100", "--save", "out.rrd"], "out.rrd"),
 }

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
+from support.outlines import in_full
 
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, flight
 from imutool.viewing.model.load_view import build
 from imutool.viewing.model.run_data import Run, RunData
+
+
+@pytest.fixture(scope="module", autouse=True)
+def drawings() -> Iterator[None]:
+    """Every drawing in full: these tests look at them."""
+    with in_full():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -95,12 +95,9 @@ def svg(draw: Callable[[Any], None], height_inch: float, name: str, *, width_inc
 
         figure = Figure(figsize=(width_inch, height_inch), dpi=SVG_DOTS_PER_INCH)
         FigureCanvasSVG(figure)
-        buffer = io.StringIO()
         draw(figure)
         titles = _curves(figure)
-        _lay_out(figure)
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
-    drawn = buffer.getvalue()
+        drawn = _content(figure, format="svg", transparent=True, metadata={"Date": None}).decode()
     drawn = drawn[drawn.index("<svg") :]
     drawn = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", drawn, flags=re.DOTALL)
     drawn = re.sub(r' (?:width|height)="[\d.]+pt"', "", drawn, count=2)
@@ -132,10 +129,7 @@ def png(picture: Picture, heading: str) -> bytes:
             alone = part.subfigures(1, 1 if row[0].wide else columns, squeeze=False)[0]
             for place, panel in zip(alone, row, strict=False):
                 panel.draw(place)
-        _lay_out(figure)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+        return _content(figure, format="png", metadata={"Software": None})
 
 
 def prefix_ids(drawn: str, prefix: str) -> str:
@@ -212,6 +206,14 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
         finally:
             for name in colors:
                 del known[name]
+
+
+def _content(figure: Any, **saving: Any) -> bytes:
+    """Content of the file of a figure."""
+    _lay_out(figure)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, **saving)
+    return buffer.getvalue()
 
 
 def _lay_out(figure: Any) -> None:
