@@ -142,9 +142,10 @@ def test_a_recording_that_contradicts_the_others_is_named(tmp_path: Path) -> Non
     of_one_unit = [log(tmp_path, f"log{seed}", seed, {"gyro_scale": SCALE}) for seed in (3, 7)]
     of_another = log(tmp_path, "stranger", 11, {"gyro_scale": [-0.02, 0.01, 0.03]})
     assert contradicting(diagnose(of_one_unit)) == []
-    (remark,) = contradicting(diagnose([*of_one_unit, of_another]))
+    found = diagnose([*of_one_unit, of_another])
+    (remark,) = contradicting(found)
     assert remark.startswith("stranger contradicts the other logs: its gyro scale is ")
-    assert remark == diagnose([*of_one_unit, of_another]).remarks[0]
+    assert remark == found.remarks[0]
 
 
 def test_logs_that_state_different_sensors_are_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from support import planted
 
 from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
 
@@ -18,6 +19,7 @@ FIRST, OTHER, POSES = "/camera/imu/data_raw", "/rear_unit/imu", "/mocap/base/pos
 TURNED = Rotation.from_euler("zyx", [92.0, -8.0, 5.0], degrees=True)  # takes vectors of the other to the first
 ARM, CLOCK_S, OTHER_S = np.array([-0.3, 0.12, 0.05]), 0.006, 1.0 / 160.0
 SURE = 4.0
+BRIEFLY = DiagnoseSettings(search=SearchSettings(rounds=1))  # the comparison of IMUs is beside the search
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["poses", "no poses"])
@@ -50,7 +52,7 @@ def log(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 
 @pytest.mark.parametrize("first", [None, OTHER])
 def test_the_imus_of_a_log_are_compared_with_each_other(log: Path, first: str | None) -> None:
-    d = diagnose([log], imu=first)
+    d = diagnose([log], imu=first, settings=BRIEFLY)
     topic, R, arm, clock = (
         (OTHER, TURNED, ARM, CLOCK_S) if first is None else (FIRST, TURNED.inv(), -TURNED.inv().apply(ARM), -CLOCK_S)
     )
