@@ -119,7 +119,9 @@ def test_a_bag_without_its_index_gets_one(made: Made, tmp_path: Path) -> None:
 def test_of_a_bag_cut_at_any_byte_every_message_that_is_there_is_found(made: Made, tmp_path: Path) -> None:
     path = tmp_path / "cut.bag"
     path.write_bytes(made.raw)
-    for size in range(len(made.raw) - 1, made.spans[0][0] - 1, -1):
+    ends = {end + off for _, end in made.spans for off in (-1, 0, 1)}
+    first, last = made.spans[0][0], len(made.raw) - 1
+    for size in sorted({*range(first, last, 5), *(ends & set(range(first, last))), last}, reverse=True):
         os.truncate(path, size)
         found, bag = walked(path)
         there = [message for message, (_, end) in zip(made.messages, made.spans, strict=True) if end <= size]
@@ -179,7 +181,7 @@ def test_only_what_damage_touches_is_lost(made: Made, tmp_path: Path, data: st.D
         assert bag.lost
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(flips=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=6))
 def test_whatever_was_spoiled_what_is_repaired_is_a_bag_for_others(
     made: Made, tmp_path: Path, flips: list[tuple[float, int]]

@@ -40,7 +40,7 @@ CASES = {
     "settings": 330,
     "tables": 550,
 }
-SHARE = 2 if os.environ.get("CI") else 4
+SHARE = 4
 SEED = os.environ.get("IMUTOOL_FUZZ_SEED", datetime.datetime.now(datetime.UTC).date().isoformat())
 BENCH = Path(__file__).parents[1] / "bench" / "fuzz.py"
 

@@ -22,7 +22,20 @@ def draw_outlines() -> None:
 @contextmanager
 def in_full() -> Iterator[None]:
     """Draw in full inside it."""
-    drawing._content, before = _IN_FULL, drawing._content
+    with _by(_IN_FULL):
+        yield
+
+
+@contextmanager
+def in_outline() -> Iterator[None]:
+    """Draw in outline inside it."""
+    with _by(_outline):
+        yield
+
+
+@contextmanager
+def _by(content: Any) -> Iterator[None]:
+    before, drawing._content = drawing._content, content
     try:
         yield
     finally:

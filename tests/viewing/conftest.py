@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from support.outlines import in_full
+from support.outlines import in_full, in_outline
 
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, flight
@@ -18,6 +18,13 @@ from imutool.viewing.model.run_data import Run, RunData
 def drawings() -> Iterator[None]:
     """Every drawing in full: these tests look at them."""
     with in_full():
+        yield
+
+
+@pytest.fixture
+def words_alone() -> Iterator[None]:
+    """Drawings in outline, for a test of what a page says."""
+    with in_outline():
         yield
 
 

@@ -163,6 +163,7 @@ def test_the_same_diagnosis_gives_the_same_page(nothing: str) -> None:
     assert html(diagnoses.NOTHING) == nothing
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_ten_logs_draw_the_first_four_and_say_so() -> None:
     many = tuple(diagnoses.traces(f"log {k}", late=True, seed=k, duration_s=20.0) for k in range(10))
     d = replace(diagnoses.LATE, real=("x.mcap",) * 10, bias=np.zeros((10, 6)), traces=many)
@@ -264,6 +265,7 @@ def test_what_a_finding_of_a_topic_removes_is_drawn_and_first(of: str, drawn: bo
     assert asked == [drawn, False]
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
     (trace,) = diagnoses.LATE.traces
     held_out = np.arange(len(trace.t_s)) % 100 < 20  # a tenth of a second at a time
@@ -274,6 +276,7 @@ def test_without_attitude_or_a_long_enough_stretch_it_says_so() -> None:
     assert "Against turning rate" in said
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_where_nothing_was_held_out_all_time_is_drawn_and_said() -> None:
     (trace,) = diagnoses.LATE.traces
     d = replace(diagnoses.LATE, traces=(replace(trace, held_out=np.zeros_like(trace.held_out)),))

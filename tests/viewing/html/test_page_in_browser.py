@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import diagnoses, image_difference, viewers
+from support.made_once import made_once
 
 from imutool.viewing.html import diagnosis_page, report
 from imutool.viewing.model.load_view import build
@@ -35,7 +36,10 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Each page as NAME.html."""
-    folder = tmp_path_factory.mktemp("pages")
+    return made_once(tmp_path_factory, "pages", write_pages)
+
+
+def write_pages(folder: Path) -> None:
     flights = [image_difference.recording(seed) for seed in (3, 4)]
     hostile = replace(flights[1], name=HOSTILE)
     logs = {
@@ -46,7 +50,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, shown in logs.items():
         report.write_page(shown, folder / f"{name}.html")
     diagnosis_page.write(diagnoses.LATE, folder / "diagnosis.html")
-    return folder
 
 
 @dataclass

@@ -69,6 +69,7 @@ def page(seen: RunData) -> str:
     return report.page([seen])
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_a_truth_of_orientations_alone_is_compared_in_orientation_alone(flown: Recording) -> None:
     turned = {topic: Poses(p.t_ns, np.zeros_like(p.p_wb), p.q_wb_wxyz) for topic, p in flown.truths.items()}
     data = build(replace(flown, truths=turned), [Run.raw(flown.imu), subtract(flown, "half", np.full(6, 1e-3))])
@@ -148,6 +149,7 @@ def drawing_only(*makes: object) -> object:
     return mock.patch.object(report, "PICTURES", makes)
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_several_logs_are_compared_first_and_each_has_its_part(seen: RunData) -> None:
     with drawing_only(report_paths.paths, report_errors.event_lanes):
         both = report.page([seen, replace(seen, name="other")])
@@ -382,6 +384,7 @@ def titles(content: str) -> list[str]:
     return re.findall(r"<h3>([^<]*)</h3>", content)
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_without_truth_there_are_no_errors_and_it_is_said(flown: Recording) -> None:
     data = build(replace(flown, truths={}, scalars={}), [Run.raw(flown.imu), subtract(flown, "model", np.full(6, 0.01))])
     content = report.page([data])
@@ -397,6 +400,7 @@ def test_a_sensor_that_reads_zero_is_drawn(flown: Recording) -> None:
     assert not re.search(r"\bnan\b", Page(report.page([build(dead, [Run.raw(dead.imu)])])).text, re.IGNORECASE)
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_a_bare_log_has_no_empty_section(flown: Recording) -> None:
     data = build(replace(flown, truths={}, scalars={}), [Run.raw(flown.imu)])
     (trace,) = data.traces
@@ -406,6 +410,7 @@ def test_a_bare_log_has_no_empty_section(flown: Recording) -> None:
     assert report_signals.allan_deviation(build(replace(flown, imu=moving), [Run.raw(moving)])) is None
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
     with drawing_only(report_signals.biases, report_signals.zoom):
         content = report.page([replace(seen, traces=seen.traces[:1])])
@@ -414,6 +419,7 @@ def test_truth_without_a_model_is_scored_alone(seen: RunData) -> None:
     assert 'class="number best"' not in content  # there is nothing to choose from
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_without_allantools_the_page_says_what_is_left_out(seen: RunData, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_signals, "find_spec", lambda name: None)
     with drawing_only(report_signals.allan_deviation):
@@ -501,6 +507,7 @@ def test_an_hour_stays_small() -> None:
 # ── files ──
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_a_page_is_written_whole_and_an_existing_file_is_kept(seen: RunData, tmp_path: Path) -> None:
     target = tmp_path / "report.html"
     report.check_target(target)
