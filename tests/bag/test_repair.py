@@ -116,7 +116,7 @@ def test_a_bag_without_its_index_gets_one(made: Made, tmp_path: Path) -> None:
     assert told(tmp_path / "out.bag") == made.messages
 
 
-def test_of_a_bag_cut_at_any_byte_every_message_that_is_there_is_found(made: Made, tmp_path: Path) -> None:
+def test_of_a_bag_cut_anywhere_every_message_that_is_there_is_found(made: Made, tmp_path: Path) -> None:
     path = tmp_path / "cut.bag"
     path.write_bytes(made.raw)
     ends = {end + off for _, end in made.spans for off in (-1, 0, 1)}

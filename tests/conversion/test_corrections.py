@@ -107,7 +107,7 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
 @pytest.mark.parametrize("late_s", [1.2, -1_600_000_000.0])
 def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_path: Path, late_s: float) -> None:
     """As a motion capture gives them: a clock of its own, markers mounted askew, y up. Each error hides the next."""
-    made = flight(3, duration_s=60.0, rate_hz=50.0, truth_rate_hz=25.0)
+    made = flight(3, duration_s=40.0, rate_hz=50.0, truth_rate_hz=25.0)
     turn = Rotation.from_rotvec([42.0, 20.0, 110.0], degrees=True)
     y_up = Rotation.from_euler("x", -90.0, degrees=True)
     true = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True)
@@ -121,7 +121,7 @@ def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_
     with Log(tmp_path / "right.mcap") as log:
         said = log.metadata()[RECORD]["/vicon/pose"]
         times_ns = np.concatenate([part for topic in ("/imu0", "/vicon/pose") for part in log.stamps(topic)])
-    assert np.ptp(times_ns) < 61e9  # log times have moved with the stamps
+    assert np.ptp(times_ns) < 41e9  # log times have moved with the stamps
     assert all(
         part in said
         for part in (
