@@ -5,8 +5,9 @@ DEMO ?= demo-out
 # one more than the cores: a test often waits for a process of its own
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(min(4, (os.cpu_count() or 1) + 1))')
 BIN := $(VENV)/bin
-# bytecode is compiled as modules are imported: pip would take half of its time to compile all of them
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
+# half of the time of an installation, which pip spends on one core; files of other versions of Python do not compile
+COMPILE := $(BIN)/python -m compileall -qq -j 0 $(VENV)/lib
 READY_DEMO := $(VENV)/.ready-demo
 READY_TEST := $(VENV)/.ready-test
 
@@ -65,9 +66,11 @@ $(BIN)/python:
 $(READY_TEST): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "set-up: imutool and what its tests need, into $(VENV) (some minutes the first time: torch is large)"
 	@$(PIP) -e '.[dev]'
+	@$(COMPILE) || true
 	@touch $(READY_DEMO) $@  # what the demo needs is part of it
 
 $(READY_DEMO): pyproject.toml constraints.txt | $(BIN)/python
 	@echo "set-up: imutool with viewer and report, into $(VENV) (some minutes the first time: torch is large)"
 	@$(PIP) -e '.[train,view,report]'
+	@$(COMPILE) || true
 	@touch $@
