@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,7 @@ from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
 from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
+from imutool.diagnosis.reference.another_motion import with_common_description, with_twins
 from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
@@ -45,12 +45,11 @@ from imutool.diagnosis.reference_coverage import (
 from imutool.diagnosis.reference_errors import SMOOTHED, reference_caveat, reference_errors, turned_reference
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, Located
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals import with_signals
+from imutool.diagnosis.signals import check_signals, with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import ImutoolError
 from imutool.file_location import Location
 from imutool.log_info.convention_report import check_one_sensor, warn_of_recordings
-from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
@@ -89,7 +88,7 @@ def diagnose(
     """
     report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     report(0, 4, "reading")
-    _check_signals(signals, reals, sim)
+    check_signals(signals, reals, sim)
     topics = _imu_topics(reals[0])
     if sim is not None and not (topics and _imu_topics(sim)):
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
@@ -103,7 +102,7 @@ def diagnose(
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
         told = [log.remark for log in logs_read if log.remark]
-        diagnosis = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
+        diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
     report(4, 4, "")
@@ -121,18 +120,23 @@ def _beside_reference(
     report: Tell,
     settings: DiagnoseSettings,
     begin: Sequence[Finding],
-) -> Diagnosis:
-    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read."""
+) -> tuple[Diagnosis, Selection | None]:
+    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read.
+
+    The selection of effects comes with it; none without a reference.
+    """
     simulated = None if sim is None else read_simulation(sim, imu=imu)[0]
-    sim_findings, another = tuple[Finding, ...](), list[str]()
+    of_sim, sim_selection, another = tuple[Finding, ...](), None, list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
-        by_itself = diagnose([sim], imu=imu, truth=next(iter(simulated.truths), None), settings=settings)
-        sim_findings, simulated = by_itself.findings, None
+        own, quiet = next(iter(simulated.truths)), lambda done, total, text: None
+        alone = [with_channels(read_log(sim, imu=imu, truth=own), sim).recording]
+        by_itself, sim_selection = _beside_reference(alone, [sim], None, imu, own, (), (), quiet, settings, ())
+        of_sim, simulated = by_itself.findings, None
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
-        return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
+        return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings), None
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
     logs = [whitened(pair, (*without_second_orders(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]
@@ -144,10 +148,13 @@ def _beside_reference(
     first, trying = start_values(begin, named), lambda word: report(2, 4, f"trying {word}")
     selection = select_effects(logs, named, unnamed_groups, trying, always=always, begin=first)
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
+    if sim_selection is not None:
+        selection = with_common_description(selection, sim_selection)
+        of_sim = with_twins(of_sim, sim_selection, selection)
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     similar, hidden = Forked(selection.similar), unobservable(logs, candidates, settings.search)
-    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), sim_findings, hidden, settings)
+    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), of_sim, hidden, settings)
     if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
@@ -158,7 +165,7 @@ def _beside_reference(
     diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, reference_caveat(recordings) if poses else "")
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
-    return diagnosis
+    return diagnosis, selection
 
 
 def _with_other_imus(
@@ -190,15 +197,6 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         why = f"How much closer it comes is computed, not simulated again: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
-
-
-def _check_signals(signals: Sequence[str], reals: Sequence[Location], sim: Location | None) -> None:
-    """Refuse signals without a simulation, and names that a log lacks, before the search."""
-    if signals and (sim is None or len(reals) != 1):
-        raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
-    for name, place in product(signals, (reals[0], sim)):
-        if place is not None:
-            read_field(place, name)
 
 
 def _imu_topics(path: Location) -> list[str]:
