@@ -30,7 +30,7 @@ from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
 from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
-from imutool.diagnosis.reference.another_motion import with_common_description, with_twins
+from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
@@ -149,8 +149,8 @@ def _beside_reference(
     selection = select_effects(logs, named, unnamed_groups, trying, always=always, begin=first)
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
     if sim_selection is not None:
-        selection = with_common_description(selection, sim_selection)
-        of_sim = with_twins(of_sim, sim_selection, selection)
+        selection, of_sim, small = compared(selection, sim_selection, of_sim)
+        another += small
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     similar, hidden = Forked(selection.similar), unobservable(logs, candidates, settings.search)

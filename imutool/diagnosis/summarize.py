@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -36,7 +36,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
-from imutool.sensor.effects.vibration import IN_POSES, line_p_value, line_power
+from imutool.sensor.effects.vibration import IN_POSES, line_p_value, line_power, steady_p_value
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS
 
@@ -125,7 +125,8 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
     own = [one for one in faster if IN_POSES * power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
     clear = [one for one in own if line_p_value(residual, 1.0 / pair.period_s, one.theta[0]) < chance]
-    return [finding_of([log], found, one, noise_floor([log])) for one in clear]
+    steady = [one for one in clear if steady_p_value(pair.stamp_s, residual, one.theta[0]) < chance]
+    return [finding_of([log], found, one, noise_floor([log])) for one in steady]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
@@ -169,16 +170,20 @@ def _worthwhile(
         least = min(weak, key=lambda k: named[k].share)
         idle += [named[least].effect] if named[least].share <= 0.0 else []
         name = selection.selected[least].effect.key
-        fitted, whole = (
-            fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key != name), part=before.part, near=before)
-            for before in (selection.fitted, selection.whole)
-        )
-        theta = {effect.key: value for effect, value in whole.chosen}
-        rest = (selected for selected in selection.selected if selected.effect.key != name)
-        kept = tuple(replace(selected, theta=theta[selected.effect.key]) for selected in rest)
-        selection = replace(selection, selected=kept, fitted=fitted, whole=whole)
+        selection = without(selection, {name})
         named = [finding_of(logs, selection, selected, noise) for selected in selection.selected]
     return selection, named, idle
+
+
+def without(found: Selection, keys: Collection[str]) -> Selection:
+    """Selection without some effects, by key; the others are fitted again."""
+    fitted, whole = (
+        fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key not in keys), part=before.part, near=before)
+        for before in (found.fitted, found.whole)
+    )
+    theta = {effect.key: value for effect, value in whole.chosen}
+    kept = (replace(one, theta=theta[one.effect.key]) for one in found.selected if one.effect.key not in keys)
+    return replace(found, selected=tuple(kept), fitted=fitted, whole=whole)
 
 
 def _not_identifiable(selection: Selection, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:

@@ -12,18 +12,54 @@ from dataclasses import replace
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.diagnosis.compare_findings import ALIKE_SHARE
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.observability import FOLLOWING, exclude_each_other
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import noise_floor
 from imutool.diagnosis.result import Finding
-from imutool.diagnosis.summarize import finding_of
+from imutool.diagnosis.summarize import finding_of, without
 from imutool.sensor.effect import Effect, Stage, Theta
+from imutool.sensor.effects import vibration
+
+
+def compared(found: Selection, sim: Selection, of_sim: Sequence[Finding]) -> tuple[Selection, tuple[Finding, ...], list[str]]:
+    """Selection in the simulation's words, findings of the simulation in those of the recording, and remarks."""
+    below = [within_model_error(one) for one in (found, sim)]
+    clear = [[one for one in each.selected if one not in small] for each, small in zip((found, sim), below, strict=True)]
+    both = [
+        [one for one in small if not any(_is_rival(one.effect, other.effect) for other in others)]
+        for small, others in zip(below, clear[::-1], strict=True)
+    ]
+    found, sim = (without(one, {small.effect.key for small in each}) for one, each in zip((found, sim), both, strict=True))
+    left_out = {(one.effect.name, one.effect.equation) for one in both[1]}
+    found = with_common_description(found, sim)
+    known = with_twins([one for one in of_sim if (one.effect, one.equation) not in left_out], sim, found)
+    names = ", ".join(dict.fromkeys(one.effect.name.replace("_", " ") for one in both[0]))
+    return found, known, [f"{names}: less than poses know of a motion, so not among the findings"] if names else []
+
+
+def within_model_error(found: Selection) -> list[SelectedEffect]:
+    """Selected effects that are smaller than what a curve through poses errs by.
+
+    The motion is the largest effect of all, and its model errs by a share of it (`model_error`, 0.3 % of its size). A sensor
+    with less noise shows such an error as scale, arm or curve, with certainty. Drifts and lines do not follow the motion.
+    """
+    logs, allowed = found.whole.logs, found.whole.logs[0].pair.settings.search.model_error
+    squares = sum(_motion_squares(log) for log in logs)
+    signals = logs[0].pair.signals
+    return [
+        one
+        for one in found.selected
+        if not one.effect.of_time
+        and one.effect.name != vibration.EFFECT.name
+        and one.gain < allowed * min(squares[signals[sensor]].sum() for sensor in one.effect.sensors)
+    ]
 
 
 def with_common_description(found: Selection, sim: Selection) -> Selection:
@@ -37,8 +73,8 @@ def with_common_description(found: Selection, sim: Selection) -> Selection:
     if not all(_is_comparable(effect, found.whole.logs) for effect, _ in theirs):
         return found
     rest = tuple(entry for entry in found.whole.chosen if entry not in mine)
-    without, trial = (fit(found.whole.logs, (*rest, *more), part="all") for more in ((), theirs))
-    if trial.objective > found.whole.objective + ALIKE_SHARE**2 * (without.objective - found.whole.objective):
+    alone, trial = (fit(found.whole.logs, (*rest, *more), part="all") for more in ((), theirs))
+    if trial.objective > found.whole.objective + ALIKE_SHARE**2 * (alone.objective - found.whole.objective):
         return found
     first = max((one for one in found.selected if one.effect.name in FOLLOWING), key=lambda one: one.gain)
     kept = [one for one in found.selected if one.effect.name not in FOLLOWING]
@@ -66,6 +102,14 @@ def with_twins(known: Sequence[Finding], sim: Selection, real: Selection) -> tup
     twins = [finding_of(logs, selection, one, floor) for one in new]
     replaced = {(e.name, e.equation) for e, _ in chosen if e.key in rivals}
     return (*(one for one in known if (one.effect, one.equation) not in replaced), *twins)
+
+
+def _motion_squares(log: WhitenedLog) -> Float64[np.ndarray, " k"]:
+    """Squares of the motion by column, white as its noise, but for a constant."""
+    rows = log.rows("all")
+    white, constant = log.whiten(expected(log.pair, ()))[rows], log.constants[rows]
+    size = np.maximum((constant**2).sum(axis=0), np.finfo(np.float64).tiny)
+    return np.asarray(((white - constant * ((constant * white).sum(axis=0) / size)) ** 2).sum(axis=0))
 
 
 def _following(chosen: Chosen, always: int) -> Chosen:
