@@ -154,7 +154,17 @@ def _key(finding: Finding) -> tuple[str, ...]:
 def _alike(real: Finding, sim: Finding) -> bool:
     if real.curve is not None and sim.curve is not None:
         return _same_curve(real.curve, sim.curve)
-    return _same_numbers(*(_without_phase(one.parameters) for one in (real, sim)))
+    return _same_numbers(*(_inverted(one.effect, _without_phase(one.parameters)) for one in (real, sim)))
+
+
+def _inverted(name: str, parameters: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Parameters with the inverse of each that is infinite without the effect: no filter is one of a period of zero."""
+    of_effect = (each for effect in catalogue.diagnosed() if effect.name == name for each in effect.parameters)
+    endless = {each.name for each in of_effect if np.isinf(each.null_value) and not each.begins}
+    return {
+        key: Estimate(1.0 / one.value, one.std / one.value**2, f"1/({one.unit})") if key in endless else one
+        for key, one in parameters.items()
+    }
 
 
 def _without_phase(parameters: Mapping[str, Estimate]) -> dict[str, Estimate]:

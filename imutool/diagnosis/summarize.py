@@ -71,8 +71,7 @@ def summarize(
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
-    findings = [finding for finding in all_findings if not shared(finding, sim_findings)]
-    both_have = remarks(all_findings, sim_findings)
+    findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
     both = zip(selection.selected, named, strict=True)
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
     chosen = selection.fitted.chosen

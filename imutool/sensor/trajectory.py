@@ -136,45 +136,44 @@ class SmoothMotion:
     def _ideal(self, stretch: Stretch, t_s: Times) -> IdealMotion:
         from scipy.spatial.transform import Rotation
 
-        motion = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
-        R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
-        return IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, np.ascontiguousarray(R_wb))
+        at = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
+        R_wb = np.ascontiguousarray(Rotation.from_quat(at.q_wb_wxyz, scalar_first=True).as_matrix())
+        return IdealMotion(t_s, at.omega_b, at.specific_force(), at.alpha_b, R_wb)
 
 
 def smooth_motion(poses: Poses, *, robust: bool = True) -> SmoothMotion:
-    """Smooth motion behind some poses, and where it can be trusted; all of them count alike if not `robust`.
+    """Smooth motion behind some poses, and where it can be trusted.
 
     Position and quaternion are quintic splines, so that rate, angular acceleration and specific force follow in closed form
     (`kinematics.Trajectory`). A stretch ends at a hole of more than 0.1 s; glitches are dropped, and where that leaves such a
-    hole the stretch ends too. Trusted is the part so far from the ends that the rate and the acceleration
-    err at most a seventh more than amid the data (at most half as much again, measured on synthetic flights).
+    hole the stretch ends too. If not `robust`, all poses count alike. Trusted is the part so far from the ends that rate and
+    acceleration err at most a seventh more than amid the data (half as much again at most on synthetic flights).
 
     Raises:
         DataError: no stretch of at least half a second and 25 poses can be trusted.
         NumericsError: stamps so uneven that no curve is defined.
     """
-    known = {way: motion for of, way, motion in _Last.motions if of is poses}
-    if robust not in known:
-        known[robust] = _smoothed(poses, robust)
-        _Last.motions = tuple((poses, way, motion) for way, motion in known.items())
-    return known[robust]
+    motions = _Last.motions[1] if _Last.motions[0] is poses else {}
+    motions[robust] = motions.get(robust) or _smoothed(poses, PASSES if robust else 1)
+    _Last.motions = poses, motions
+    return motions[robust]
 
 
 class _Last:
-    motions: ClassVar[tuple[tuple[Poses, bool, SmoothMotion], ...]] = ()  # second simulation and audit ask for the same
+    motions: ClassVar[tuple[Poses | None, dict[bool, SmoothMotion]]] = (
+        None,
+        {},
+    )  # second simulation and audit ask for the same
 
 
-def _smoothed(poses: Poses, robust: bool) -> SmoothMotion:
+def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
     t_s = seconds(poses.t_ns, int(poses.t_ns[0])) if len(poses) else np.zeros(0)
-    columns = (poses.p_wb, continuous(poses.q_wb_wxyz))
-    stretches: list[Stretch] = []
-    glitches, steps = 0, 0
+    columns, stretches, glitches, steps = (poses.p_wb, continuous(poses.q_wb_wxyz)), list[Stretch](), 0, 0
     waiting = [np.arange(a, b) for a, b in _unbroken(t_s)][::-1]
     while waiting:
         rows = waiting.pop()
-        if not _long_enough(t_s[rows]):
+        if len(rows) < LEAST_POSES or t_s[rows[-1]] - t_s[rows[0]] < LEAST_S:
             continue
-        passes = PASSES if robust else 1
         rotation = Forked(partial(_fitted, t_s[rows], columns[1][rows], passes))
         position, count = _levelled(t_s[rows], columns[0][rows])
         fits = [_fitted(t_s[rows], position, passes), rotation.result()]
@@ -203,10 +202,6 @@ def _unbroken(t_s: Times) -> list[tuple[int, int]]:
     edges = np.flatnonzero(np.diff(t_s) > MAX_GAP_S) + 1
     ends = [0, *edges.tolist(), len(t_s)]
     return [(a, b) for a, b in pairwise(ends) if b > a]
-
-
-def _long_enough(t_s: Times) -> bool:
-    return len(t_s) >= LEAST_POSES and float(t_s[-1] - t_s[0]) >= LEAST_S
 
 
 def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:

@@ -1,4 +1,4 @@
-"""Comparison with a simulation of another motion: one description of both logs, fitted to each.
+"""Comparison with a simulation of another motion: one description, fitted to both logs.
 
 That one log shows an effect and the other does not is no difference between the two: it may move too little, or one cause may
 go by another name there (a filter is a delay of slow motion). So the effects of the recording are fitted to the simulation,
@@ -28,8 +28,8 @@ from imutool.sensor.effect import Effect, Stage, Theta
 from imutool.sensor.effects import vibration
 
 
-def compared(found: Selection, sim: Selection, of_sim: Sequence[Finding]) -> tuple[Selection, tuple[Finding, ...], list[str]]:
-    """Selection in the simulation's words, findings of the simulation in those of the recording, and remarks."""
+def compared(found: Selection, sim: Selection, of_sim: Sequence[Finding]) -> tuple[Selection, tuple[Finding, ...], str]:
+    """Selection, findings of the simulation, and a remark; both logs in the same words."""
     below = [within_model_error(one) for one in (found, sim)]
     clear = [[one for one in each.selected if one not in small] for each, small in zip((found, sim), below, strict=True)]
     both = [
@@ -41,17 +41,17 @@ def compared(found: Selection, sim: Selection, of_sim: Sequence[Finding]) -> tup
     found = with_common_description(found, sim)
     known = with_twins([one for one in of_sim if (one.effect, one.equation) not in left_out], sim, found)
     names = ", ".join(dict.fromkeys(one.effect.name.replace("_", " ") for one in both[0]))
-    return found, known, [f"{names}: less than poses know of a motion, so not among the findings"] if names else []
+    return found, known, f"{names}: less than poses know of a motion, so not among the findings" if names else ""
 
 
 def within_model_error(found: Selection) -> list[SelectedEffect]:
-    """Selected effects that are smaller than what a curve through poses errs by.
+    """Selected effects that are smaller than the model error of a curve through poses.
 
     The motion is the largest effect of all, and its model errs by a share of it (`model_error`, 0.3 % of its size). A sensor
     with less noise shows such an error as scale, arm or curve, with certainty. Drifts and lines do not follow the motion.
     """
     logs, allowed = found.whole.logs, found.whole.logs[0].pair.settings.search.model_error
-    squares = sum(_motion_squares(log) for log in logs)
+    squares = np.sum([_motion_squares(log) for log in logs], axis=0)
     signals = logs[0].pair.signals
     return [
         one
@@ -63,7 +63,7 @@ def within_model_error(found: Selection) -> list[SelectedEffect]:
 
 
 def with_common_description(found: Selection, sim: Selection) -> Selection:
-    """Selection of a recording in the simulation's words for how a sensor follows its motion, where they fit as well.
+    """Selection with the simulation's filter or clock effects, where they fit as well.
 
     They may leave more by `ALIKE_SHARE` of the size, as numbers may that are alike.
     """
@@ -85,7 +85,7 @@ def with_common_description(found: Selection, sim: Selection) -> Selection:
 
 
 def with_twins(known: Sequence[Finding], sim: Selection, real: Selection) -> tuple[Finding, ...]:
-    """Findings of a simulation, and what it says of the recording's other effects, in place of their rivals."""
+    """Findings of a simulation, with the recording's effects in place of their rivals."""
     chosen, always, logs = sim.whole.chosen, sim.always, sim.whole.logs
     keys = {effect.key for effect, _ in chosen}
     asked = [one for one in real.selected if _is_comparable(one.effect, logs)]

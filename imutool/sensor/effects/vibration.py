@@ -55,10 +55,10 @@ def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: floa
 
 
 def steady_p_value(stamp_s: Float64[np.ndarray, " n"], samples: Float64[np.ndarray, "n k"], f_hz: float) -> float:
-    """p-value of a line by its amplitude and phase in each eighth of the log, in its clearest column, at any frequency.
+    """p-value of a line by its amplitude and phase in each eighth of a log.
 
     A vibration keeps both, so that their mean stands out from their scatter (F of 2 and 14). A gait and its impacts are as
-    loud there, but wander, in all columns together.
+    loud there, but wander, in all columns together: the clearest column counts, at any frequency.
     """
     from scipy.stats import f as fisher
 
