@@ -30,6 +30,7 @@ from imutool.diagnosis.held_out import (
     with_effects,
 )
 from imutool.diagnosis.localization import locate_findings, locate_residual
+from imutool.diagnosis.reference.own_poses import is_in_raw_poses
 from imutool.diagnosis.reference_coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -107,25 +108,25 @@ def summarize(
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    A line that stands out from the colour of what the body does there needs no reference. One that the poses have, too, is the
-    body's motion, of which their smoothing leaves a part, or their own, as at a camera's rate.
+    A line that stands out from the colour of what the body does needs no reference. One that the poses have, too, smoothed
+    or not, is the body's motion, or their own, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
-    by_poses, residual = expected(pair, ()), pair.real - expected(pair, chosen)
-    noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
-    white = level(residual, pair.usable, 1.0 / pair.period_s, noise)
+    by_poses, residual, rate_hz = expected(pair, ()), pair.real - expected(pair, chosen), 1.0 / pair.period_s
+    white = level(residual, pair.usable, rate_hz, msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz))
     log = WhitenedImu(replace(pair, real=residual + by_poses, band_hz=None), white)
     found = select_effects([log], [vibration])
     chance, power = pair.settings.search.false_discovery_rate, partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
     own = [one for one in faster if IN_POSES * power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
-    clear = [one for one in own if line_p_value(residual, 1.0 / pair.period_s, one.theta[0]) < chance]
-    steady = [one for one in clear if steady_p_value(pair.stamp_s, residual, one.theta[0]) < chance]
-    return [finding_of([log], found, one, noise_floor([log])) for one in steady]
+    tests = partial(line_p_value, residual, rate_hz), partial(steady_p_value, pair.stamp_s, residual)
+    clear = [one for one in own if all(p_value(one.theta[0]) < chance for p_value in tests)]
+    alone = [one for one in clear if not is_in_raw_poses(pair, residual, one.theta[0])]
+    return [finding_of([log], found, one, noise_floor([log])) for one in alone]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
@@ -281,8 +282,7 @@ def _curve(selected: SelectedEffect, fitted: Fit) -> Curve | None:
 def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
     """Remark that nothing moves, where not even a clock offset could be seen."""
     if "clock_offset" in hidden:
-        names = ", ".join(dict.fromkeys(pair.name for pair in pairs))
-        yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
+        yield f"{', '.join(dict.fromkeys(pair.name for pair in pairs))}: too little motion for anything but a bias, its drift, noise, digits and vibration"
 
 
 def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:

@@ -16,6 +16,7 @@ from scipy.fft import dct, idct
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
+from imutool.diagnosis.audit.spectral_lines import by_differences
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.time_alignment import with_truth
@@ -23,6 +24,7 @@ from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.settings import DiagnoseSettings, ReferenceSettings
 from imutool.errors import DataError
 from imutool.recording import Recording
+from imutool.sensor.effects.vibration import is_motion
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.trajectory import SmoothMotion, Stretch, smooth_motion
 
@@ -53,6 +55,14 @@ def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pa
 def band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
     """Frequency up to which the motion of a stretch of poses is known."""
     return max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz)
+
+
+def is_in_raw_poses(pair: Pair, line: Float64[np.ndarray, "n 6"], f_hz: float) -> bool:
+    """Whether the poses have a spectral line before smoothing: it is motion of the body."""
+    if pair.truth is None or not pair.truth.has_positions:
+        return False
+    shown, _ = by_differences(pair.truth, np.zeros(3))
+    return is_motion(pair.stamp_s[1:-1], shown, line[1:-1], f_hz, pair.settings.search.false_discovery_rate)
 
 
 def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) -> Iterator[Pair]:

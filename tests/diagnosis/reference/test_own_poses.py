@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.whitening import Band
-from imutool.diagnosis.reference.own_poses import align_with_poses
+from imutool.diagnosis.reference.own_poses import align_with_poses, is_in_raw_poses
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.recording import GRAVITY_M_S2, Imu, Poses, Recording
+from imutool.sensor.effects.vibration import line_p_value, steady_p_value
 from imutool.sensor.simulate import TRUTH_TOPIC
 from imutool.sensor.trajectory import smooth_motion
 
 DURATION_S, RATE_HZ, POSE_HZ = 14.0, 200.0, 200.0
 WIDTH_S, SIZE = 0.008, (2e-3, 2e-4)  # of an impact, as a bump of the heading (rad) and of the height (m)
 NOISE = (3e-4, 5e-3)  # of a sample, rad/s and m/s²
+LINE_HZ = 17.0
 START_NS = 1_700_000_000_000_000_000
 ALMOST = 1.3  # times the noise in the band
 
@@ -61,6 +65,28 @@ def test_glitches_are_left_out() -> None:
     )
     both = [one.ideal.accel[100:-100, 2] for one in (clean, dirty)]
     assert both[1] == pytest.approx(both[0], abs=0.05)  # 2 cm in 5 ms would be 800 m/s²
+
+
+def test_a_vibration_keeps_its_phase_and_a_gait_wanders() -> None:
+    t, rng = np.arange(4000) / RATE_HZ, np.random.default_rng(2)
+    noise, wander = rng.normal(size=(len(t), 6)), np.cumsum(rng.normal(size=len(t))) * 0.05
+    for phase, steady in ((np.zeros_like(t), True), (wander, False)):
+        line = np.sin(2.0 * np.pi * LINE_HZ * t + phase)[:, None] * [0.0, 0.3, 0.0, 1.0, 0.0, 1.0]
+        assert (steady_p_value(t, noise + line, LINE_HZ) < 1e-6) is steady
+        assert line_p_value(noise + line, RATE_HZ, LINE_HZ) < 1e-3  # both stand out from their neighbours
+
+
+def test_a_line_that_poses_show_before_smoothing_is_motion() -> None:
+    real, _ = walking(np.zeros(0))
+    (pair,) = align_with_poses(real, DiagnoseSettings())
+    poses, omega = pair.truth, 2.0 * np.pi * LINE_HZ
+    assert poses is not None
+    up = 1e-4 * np.sin(omega * pair.stamp_s)[:, None] * [0.0, 0.0, 1.0]
+    line = np.concatenate([np.zeros_like(up), -(omega**2) * up], axis=1)
+    noisy = line + np.repeat(NOISE, 3) * np.random.default_rng(3).normal(size=line.shape)
+    moved = Poses(poses.t_ns, poses.p_wb + up, poses.q_wb_wxyz)
+    assert not is_in_raw_poses(pair, noisy, LINE_HZ)
+    assert is_in_raw_poses(replace(pair, truth=moved), noisy, LINE_HZ)
 
 
 def slow(x: np.ndarray) -> float:
