@@ -282,7 +282,8 @@ def _curve(selected: SelectedEffect, fitted: Fit) -> Curve | None:
 def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
     """Remark that nothing moves, where not even a clock offset could be seen."""
     if "clock_offset" in hidden:
-        yield f"{', '.join(dict.fromkeys(pair.name for pair in pairs))}: too little motion for anything but a bias, its drift, noise, digits and vibration"
+        names = ", ".join({pair.name: None for pair in pairs})
+        yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
 
 
 def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
@@ -292,9 +293,7 @@ def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
         if not pair.exact and pair.truth is not None and not pair.truth.has_positions:
             yield f"{pair.name}: the true poses have no positions, so the accelerometer was not compared with them"
         if pair.aligned_s:
-            yield (
-                f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "
-                "so that a constant offset between them cannot be seen"
-            )
+            unseen = "so that a constant offset between them cannot be seen"
+            yield f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), {unseen}"
         if pair.ideal.R_wb is None:
             yield f"{pair.name}: no attitude is known, so gravity and the earth's rotation were not tried"
