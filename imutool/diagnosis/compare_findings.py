@@ -22,7 +22,9 @@ from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.sensor import catalogue
 
-ALIKE_STD = 3.0  # parameters this many joint standard deviations apart are two values,
+ALIKE_STD = (
+    4.5  # joint deviations: 0.5 % for the largest of nine numbers by Student's t of ten blocks; further apart are two values,
+)
 ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
 CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
@@ -142,7 +144,7 @@ def _key(finding: Finding) -> tuple[str, ...]:
     variable = "" if finding.curve is None else finding.curve.variable
     return (
         finding.effect,
-        finding.signal,
+        "" if finding.effect == "quantization" else finding.signal,  # digits of either sensor, as far as its noise shows them
         finding.driver,
         variable,
         finding.equation if finding.effect == "unknown" and not variable else "",
@@ -152,7 +154,27 @@ def _key(finding: Finding) -> tuple[str, ...]:
 def _alike(real: Finding, sim: Finding) -> bool:
     if real.curve is not None and sim.curve is not None:
         return _same_curve(real.curve, sim.curve)
-    return _same_numbers(real.parameters, sim.parameters)
+    return _same_numbers(*(_inverted(one.effect, _without_phase(one.parameters)) for one in (real, sim)))
+
+
+def _inverted(name: str, parameters: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Parameters with the inverse of each that is infinite without the effect: no filter is one of a period of zero."""
+    of_effect = (each for effect in catalogue.diagnosed() if effect.name == name for each in effect.parameters)
+    endless = {each.name for each in of_effect if np.isinf(each.null_value) and not each.begins}
+    return {
+        key: Estimate(1.0 / one.value, one.std / one.value**2, f"1/({one.unit})") if key in endless else one
+        for key, one in parameters.items()
+    }
+
+
+def _without_phase(parameters: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Parameters with amplitudes for sines and cosines: two logs of one vibration begin at other phases."""
+    out = {name: one for name, one in parameters.items() if "_sin_" not in name and "_cos_" not in name}
+    for name, s in parameters.items():
+        if "_sin_" in name:
+            c = parameters[name.replace("_sin_", "_cos_")]
+            out[name.replace("_sin_", "_")] = Estimate(float(np.hypot(s.value, c.value)), max(s.std, c.std), s.unit)
+    return out
 
 
 def _same_numbers(real: Mapping[str, Estimate], sim: Mapping[str, Estimate]) -> bool:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,8 @@ from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.whitening import WhitenedImu
 from imutool.diagnosis.held_out import resimulate
 from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
+from imutool.diagnosis.reference.another_motion import compared
+from imutool.diagnosis.reference.conventions import with_common_conventions
 from imutool.diagnosis.reference_coverage import (
     align,
     align_all,
@@ -43,14 +44,13 @@ from imutool.diagnosis.reference_coverage import (
     without_unusable,
 )
 from imutool.diagnosis.reference_errors import SMOOTHED, reference_caveat, reference_errors, turned_reference
-from imutool.diagnosis.result import Diagnosis, Estimate, Finding, Located
+from imutool.diagnosis.result import Diagnosis, Estimate, Finding
 from imutool.diagnosis.settings import DiagnoseSettings
-from imutool.diagnosis.signals import with_signals
+from imutool.diagnosis.signals import check_signals, with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
-from imutool.errors import ConfigError, ImutoolError
+from imutool.errors import ImutoolError
 from imutool.file_location import Location
 from imutool.log_info.convention_report import check_one_sensor, warn_of_recordings
-from imutool.mcap_io.fields import read_field
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
@@ -89,7 +89,7 @@ def diagnose(
     """
     report, settings = tell or (lambda done, total, text: None), settings or DiagnoseSettings()
     report(0, 4, "reading")
-    _check_signals(signals, reals, sim)
+    check_signals(signals, reals, sim)
     topics = _imu_topics(reals[0])
     if sim is not None and not (topics and _imu_topics(sim)):
         return with_signals(Diagnosis.without_imu(reals, sim), reals[0], sim, signals, report, settings)
@@ -103,7 +103,7 @@ def diagnose(
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
         told = [log.remark for log in logs_read if log.remark]
-        diagnosis = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
+        diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)
     report(4, 4, "")
@@ -121,18 +121,22 @@ def _beside_reference(
     report: Tell,
     settings: DiagnoseSettings,
     begin: Sequence[Finding],
-) -> Diagnosis:
-    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read."""
+) -> tuple[Diagnosis, Selection | None]:
+    """Diagnosis of recordings beside a simulation or their own poses, with remarks that were `told` as they were read.
+
+    The selection of effects comes with it; none without a reference.
+    """
     simulated = None if sim is None else read_simulation(sim, imu=imu)[0]
-    sim_findings, another = tuple[Finding, ...](), list[str]()
+    of_sim, sim_selection, another = tuple[Finding, ...](), None, list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
-        by_itself = diagnose([sim], imu=imu, truth=next(iter(simulated.truths), None), settings=settings)
-        sim_findings, simulated = by_itself.findings, None
+        of_sim, sim_selection = _by_itself(sim, imu, next(iter(simulated.truths)), settings)
+        simulated = None
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
-        return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings)
+        return check_without_reference(recordings[0], str(reals[0]), left_out[0], settings), None
+    pairs, conventions = (pairs, list[Finding]()) if simulated is None else with_common_conventions(pairs)
     report(1, 4, "noise")
     candidates = candidates_for(pairs)
     logs = [whitened(pair, (*without_second_orders(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]
@@ -144,10 +148,13 @@ def _beside_reference(
     first, trying = start_values(begin, named), lambda word: report(2, 4, f"trying {word}")
     selection = select_effects(logs, named, unnamed_groups, trying, always=always, begin=first)
     wrong += turned_reference(logs, selection.whole.chosen, settings.reference)
+    if sim_selection is not None:
+        selection, of_sim, small = compared(selection, sim_selection, of_sim)
+        another += [small] if small else []
     report(3, 4, "locating")
     paths = {recording.name: str(real) for recording, real in zip(recordings, reals, strict=True)}
     similar, hidden = Forked(selection.similar), unobservable(logs, candidates, settings.search)
-    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), sim_findings, hidden, settings)
+    diagnosis = summarize.summarize(logs, selection, paths, None if sim is None else str(sim), of_sim, hidden, settings)
     if simulated is not None and any(finding.effect not in NO_EFFECT for finding in diagnosis.findings):
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
@@ -155,10 +162,21 @@ def _beside_reference(
     poses = any(not pair.exact for pair in pairs)
     follows = [own_poses_sentence(pairs)] if poses and simulated is not None else []
     remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
-    diagnosis = _with_reference(diagnosis, wrong, wrong_at, remarks, reference_caveat(recordings) if poses else "")
+    findings, located = (*conventions, *wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
+    caveat = reference_caveat(recordings) if poses else ""
+    diagnosis = replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
-    return diagnosis
+    return diagnosis, selection
+
+
+def _by_itself(
+    sim: Location, imu: str | None, truth: str, settings: DiagnoseSettings
+) -> tuple[tuple[Finding, ...], Selection | None]:
+    """Findings and selected effects of a simulation beside its own poses."""
+    alone = [with_channels(read_log(sim, imu=imu, truth=truth), sim).recording]
+    diagnosis, selection = _beside_reference(alone, [sim], None, imu, truth, (), (), lambda *_: None, settings, ())
+    return diagnosis.findings, selection
 
 
 def _with_other_imus(
@@ -192,26 +210,9 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
     return replace(diagnosis, closer=closer)
 
 
-def _check_signals(signals: Sequence[str], reals: Sequence[Location], sim: Location | None) -> None:
-    """Refuse signals without a simulation, and names that a log lacks, before the search."""
-    if signals and (sim is None or len(reals) != 1):
-        raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
-    for name, place in product(signals, (reals[0], sim)):
-        if place is not None:
-            read_field(place, name)
-
-
 def _imu_topics(path: Location) -> list[str]:
     with Log(path) as log:
         return log.imu_topics
-
-
-def _with_reference(
-    diagnosis: Diagnosis, wrong: Sequence[Finding], wrong_at: Sequence[Located], remarks: tuple[str, ...], caveat: str
-) -> Diagnosis:
-    """Adds errors of the reference, with the remarks on it."""
-    findings, located = (*wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
-    return replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
 
 
 def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
@@ -225,16 +226,10 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     exact = all(pair.exact for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     left_out = {*SHOWN_BY_SAMPLES, NEEDS_POSES if exact else NEEDS_SIMULATION}
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
-    effects = _until_the_end(effects, pairs)
+    effects = clock_wander.with_knots(effects, max(float(pair.stamp_s[-1]) for pair in pairs))
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     of_reference = timestamps.jitter(pairs) if exact else (SMOOTHED,)
     return (*effects, *of_reference, *timestamps.soft_limits(pairs, biases))
-
-
-def _until_the_end(effects: Sequence[Effect], pairs: Sequence[Pair]) -> list[Effect]:
-    """Effects with the knots that the longest log has."""
-    end_s, wander = max(float(pair.stamp_s[-1]) for pair in pairs), clock_wander.EFFECT.name
-    return [clock_wander.until(end_s) if effect.name == wander else effect for effect in effects]
 
 
 def unnamed_candidates(pairs: Sequence[Pair]) -> list[tuple[Effect, ...]]:
@@ -289,7 +284,10 @@ def effect_sizes(
     candidates = [effect for effect in candidates_for(pairs) if effect.name not in of_poses]
     logs = [whitened(pair, without_second_orders(candidates), settings.band) for pair in pairs]
     named = catalogue.diagnosed([name for name in effects if name != SMOOTHED.name])
-    wanted = [*_until_the_end(named, pairs), *((SMOOTHED,) if SMOOTHED.name in effects else ())]
+    wanted = [
+        *clock_wander.with_knots(named, max(float(pair.stamp_s[-1]) for pair in pairs)),
+        *((SMOOTHED,) if SMOOTHED.name in effects else ()),
+    ]
     hidden = set(unobservable(logs, wanted, settings.search))
     observable = []
     for effect in wanted:

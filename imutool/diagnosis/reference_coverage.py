@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from scipy.fft import dct, idct
-from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import ClockDifference, Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation, with_truth
+from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation
+from imutool.diagnosis.reference.own_poses import align_with_poses, band_hz
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
@@ -132,48 +130,7 @@ def align(real: Recording, sim: Recording | None, truth: str | None, settings: D
         return
     if not real.truths:
         raise real.no_truth("no simulation and no true poses", "`sim`, or poses in the log")
-    chosen = real if truth is not None else real.with_truth(next(iter(real.truths)))
-    motion, least_s = smooth_motion(chosen.truth), settings.alignment.least_s
-    parts = [ideal for ideal in motion.ideal_motions(1.0 / real.imu.period_s) if ideal.t_s[-1] - ideal.t_s[0] >= least_s]
-    if not parts:
-        raise DataError(
-            f"the true poses have no stretch of {least_s:g} s that can be differentiated",
-            where=real.name,
-            expected="poses at 40 Hz or more, without holes",
-            fix="Give a simulation with `sim`",
-        )
-    for ideal in parts:
-        stretch = next(part for part in motion.stretches if part.start_s <= ideal.t_s[0] <= part.end_s)
-        started_ns = int(chosen.imu.t_ns[0])  # times are told from the log's start, also where its poses begin later
-        since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
-        since = _with_lost_motion(since, stretch.cutoff_hz, settings.reference.band_share)
-        pair = with_truth(chosen, since, started_ns, _band_hz(stretch, settings.reference), settings)
-        of_gyro = np.tile(np.arange(6) < 3, (len(pair.stamp_s), 1))  # without positions nothing is known of the accelerometer
-        yield pair if chosen.truth.has_positions else replace(pair, known=of_gyro)
-
-
-def _with_lost_motion(ideal: IdealMotion, cutoffs_hz: tuple[float, float], share: float) -> IdealMotion:
-    """Motion with what the splines through its poses took of it, up to a share of each cut-off.
-
-    A spline with a penalty on its third derivative leaves 1 / (1 + (f / cutoff)^6) of a motion (position, rotation), in the
-    axes of the world. Uncorrected, the edge of the band shows it as a smoothing of the poses, or as a scale.
-    """
-    R_wb, n = ideal.R_wb, len(ideal.t_s)
-    assert R_wb is not None, "poses have an attitude"
-    to_world = functools.partial(np.einsum, "nij,nj->ni", R_wb)
-    f_hz = np.arange(n)[:, None] * ideal.rate_hz / (2.0 * n)
-    of_position, of_rotation = (np.minimum(f_hz / hz, share) ** 6 for hz in cutoffs_hz)
-
-    def lost(x: Float64[np.ndarray, "n 3"], part: Float64[np.ndarray, "n 1"]) -> Float64[np.ndarray, "n 3"]:
-        return np.asarray(idct(dct(x, axis=0) * part, axis=0))
-
-    force, turn = to_world(ideal.accel), lost(to_world(ideal.gyro), of_rotation)
-    angle = np.cumsum(turn, axis=0) / ideal.rate_hz
-    back = Rotation.from_rotvec(angle - angle.mean(axis=0)) * Rotation.from_matrix(R_wb)
-    force = force + lost(force, of_position)
-    alpha = to_world(ideal.alpha)
-    gyro, accel, alpha = (back.inv().apply(x) for x in (to_world(ideal.gyro) + turn, force, alpha + lost(alpha, of_rotation)))
-    return replace(ideal, gyro=gyro, accel=accel, alpha=alpha, R_wb=back.as_matrix())
+    yield from align_with_poses(real if truth is not None else real.with_truth(next(iter(real.truths))), settings)
 
 
 def _shared_stretches(real: Recording, sim: Recording) -> list[tuple[int, int, Stretch]]:
@@ -197,11 +154,7 @@ def _shared_band_hz(pair: Pair, stretches: Sequence[tuple[int, int, Stretch]]) -
     end_ns = pair.start_ns + 1e9 * (pair.stamp_s[-1] - pair.stamp_s[0])
     least_ns = 1e9 * pair.settings.alignment.least_s
     last = [stretch for a, b, stretch in stretches if min(b, end_ns) - max(a, pair.start_ns) >= least_ns]
-    return min(_band_hz(stretch, pair.settings.reference) for stretch in last or [stretch for _, _, stretch in stretches])
-
-
-def _band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
-    return max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz)
+    return min(band_hz(stretch, pair.settings.reference) for stretch in last or [stretch for _, _, stretch in stretches])
 
 
 def own_poses_sentence(pairs: Sequence[Pair]) -> str:

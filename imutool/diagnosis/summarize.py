@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -30,13 +30,14 @@ from imutool.diagnosis.held_out import (
     with_effects,
 )
 from imutool.diagnosis.localization import locate_findings, locate_residual
+from imutool.diagnosis.reference.own_poses import is_in_raw_poses
 from imutool.diagnosis.reference_coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
 from imutool.inertial.stationary import white_noise
 from imutool.sensor import catalogue
-from imutool.sensor.effects.vibration import IN_POSES, line_p_value, line_power
+from imutool.sensor.effects.vibration import IN_POSES, line_p_value, line_power, steady_p_value
 from imutool.sensor.physics_file import PhysicsFile
 from imutool.units import AXES, SENSORS
 
@@ -71,8 +72,7 @@ def summarize(
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
-    findings = [finding for finding in all_findings if not shared(finding, sim_findings)]
-    both_have = remarks(all_findings, sim_findings)
+    findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
     both = zip(selection.selected, named, strict=True)
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
     chosen = selection.fitted.chosen
@@ -108,24 +108,25 @@ def summarize(
 def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Finding]:
     """Vibration faster than the band of the poses, from the longest stretch of one log.
 
-    A line that stands out from the colour of what the body does there needs no reference. One that the poses have, too, is the
-    body's motion, of which their smoothing leaves a part, or their own, as at a camera's rate.
+    A line that stands out from the colour of what the body does needs no reference. One that the poses have, too, smoothed
+    or not, is the body's motion, or their own, as at a camera's rate.
     """
     (vibration,) = catalogue.diagnosed(["vibration"])
     pair = max((log.pair for log in logs), key=lambda one: len(one.stamp_s))
     several = len({log.pair.name for log in logs}) > 1
     if several or pair.band_hz is None or any(effect.key == vibration.key for effect, _ in chosen):
         return []
-    by_poses, residual = expected(pair, ()), pair.real - expected(pair, chosen)
-    noise = msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz)
-    white = level(residual, pair.usable, 1.0 / pair.period_s, noise)
+    by_poses, residual, rate_hz = expected(pair, ()), pair.real - expected(pair, chosen), 1.0 / pair.period_s
+    white = level(residual, pair.usable, rate_hz, msgspec.structs.replace(pair.settings.noise, motion_hz=pair.band_hz))
     log = WhitenedImu(replace(pair, real=residual + by_poses, band_hz=None), white)
     found = select_effects([log], [vibration])
     chance, power = pair.settings.search.false_discovery_rate, partial(line_power, pair.stamp_s, noise=white_noise(pair.real))
     faster = [one for one in found.selected if one.theta[0] > pair.band_hz]
     own = [one for one in faster if IN_POSES * power(pair.real, one.theta[0]) > power(by_poses, one.theta[0])]
-    clear = [one for one in own if line_p_value(residual, 1.0 / pair.period_s, one.theta[0]) < chance]
-    return [finding_of([log], found, one, noise_floor([log])) for one in clear]
+    tests = partial(line_p_value, residual, rate_hz), partial(steady_p_value, pair.stamp_s, residual)
+    clear = [one for one in own if all(p_value(one.theta[0]) < chance for p_value in tests)]
+    alone = [one for one in clear if not is_in_raw_poses(pair, residual, one.theta[0])]
+    return [finding_of([log], found, one, noise_floor([log])) for one in alone]
 
 
 def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
@@ -169,16 +170,20 @@ def _worthwhile(
         least = min(weak, key=lambda k: named[k].share)
         idle += [named[least].effect] if named[least].share <= 0.0 else []
         name = selection.selected[least].effect.key
-        fitted, whole = (
-            fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key != name), part=before.part, near=before)
-            for before in (selection.fitted, selection.whole)
-        )
-        theta = {effect.key: value for effect, value in whole.chosen}
-        rest = (selected for selected in selection.selected if selected.effect.key != name)
-        kept = tuple(replace(selected, theta=theta[selected.effect.key]) for selected in rest)
-        selection = replace(selection, selected=kept, fitted=fitted, whole=whole)
+        selection = without(selection, {name})
         named = [finding_of(logs, selection, selected, noise) for selected in selection.selected]
     return selection, named, idle
+
+
+def without(found: Selection, keys: Collection[str]) -> Selection:
+    """Selection without some effects, by key; the others are fitted again."""
+    fitted, whole = (
+        fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key not in keys), part=before.part, near=before)
+        for before in (found.fitted, found.whole)
+    )
+    theta = {effect.key: value for effect, value in whole.chosen}
+    kept = (replace(one, theta=theta[one.effect.key]) for one in found.selected if one.effect.key not in keys)
+    return replace(found, selected=tuple(kept), fitted=fitted, whole=whole)
 
 
 def _not_identifiable(selection: Selection, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:
@@ -277,7 +282,7 @@ def _curve(selected: SelectedEffect, fitted: Fit) -> Curve | None:
 def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
     """Remark that nothing moves, where not even a clock offset could be seen."""
     if "clock_offset" in hidden:
-        names = ", ".join(dict.fromkeys(pair.name for pair in pairs))
+        names = ", ".join({pair.name: None for pair in pairs})
         yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
 
 
@@ -288,9 +293,7 @@ def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
         if not pair.exact and pair.truth is not None and not pair.truth.has_positions:
             yield f"{pair.name}: the true poses have no positions, so the accelerometer was not compared with them"
         if pair.aligned_s:
-            yield (
-                f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), "
-                "so that a constant offset between them cannot be seen"
-            )
+            unseen = "so that a constant offset between them cannot be seen"
+            yield f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), {unseen}"
         if pair.ideal.R_wb is None:
             yield f"{pair.name}: no attitude is known, so gravity and the earth's rotation were not tried"

@@ -21,7 +21,8 @@ from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
-NO_EFFECT = frozenset({"dropped_samples", "timestamp_jitter", "reference_error", "reference_smoothing"})
+CONVENTIONS = frozenset({"wrong_unit", "permuted_axes", "left_handed"})
+NO_EFFECT = CONVENTIONS | {"dropped_samples", "timestamp_jitter", "reference_error", "reference_smoothing"}
 
 
 def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> Chosen:

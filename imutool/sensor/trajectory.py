@@ -136,45 +136,47 @@ class SmoothMotion:
     def _ideal(self, stretch: Stretch, t_s: Times) -> IdealMotion:
         from scipy.spatial.transform import Rotation
 
-        motion = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
-        R_wb = Rotation.from_quat(motion.q_wb_wxyz, scalar_first=True).as_matrix()
-        return IdealMotion(t_s, motion.omega_b, motion.specific_force(), motion.alpha_b, np.ascontiguousarray(R_wb))
+        at = stretch.trajectory.at(self.start_ns + np.round(t_s * 1e9).astype(np.int64))
+        R_wb = np.ascontiguousarray(Rotation.from_quat(at.q_wb_wxyz, scalar_first=True).as_matrix())
+        return IdealMotion(t_s, at.omega_b, at.specific_force(), at.alpha_b, R_wb)
 
 
-def smooth_motion(poses: Poses) -> SmoothMotion:
+def smooth_motion(poses: Poses, *, robust: bool = True) -> SmoothMotion:
     """Smooth motion behind some poses, and where it can be trusted.
 
     Position and quaternion are quintic splines, so that rate, angular acceleration and specific force follow in closed form
     (`kinematics.Trajectory`). A stretch ends at a hole of more than 0.1 s; glitches are dropped, and where that leaves such a
-    hole the stretch ends too. Trusted is the part so far from the ends that the rate and the acceleration
-    err at most a seventh more than amid the data (at most half as much again, measured on synthetic flights).
+    hole the stretch ends too. If not `robust`, all poses count alike. Trusted is the part so far from the ends that rate and
+    acceleration err at most a seventh more than amid the data (half as much again at most on synthetic flights).
 
     Raises:
         DataError: no stretch of at least half a second and 25 poses can be trusted.
         NumericsError: stamps so uneven that no curve is defined.
     """
-    motion = next((motion for known, motion in _Last.motions if known is poses), None) or _smoothed(poses)
-    _Last.motions = ((poses, motion),)
-    return motion
+    motions = _Last.motions[1] if _Last.motions[0] is poses else {}
+    motions[robust] = motions.get(robust) or _smoothed(poses, PASSES if robust else 1)
+    _Last.motions = poses, motions
+    return motions[robust]
 
 
 class _Last:
-    motions: ClassVar[tuple[tuple[Poses, SmoothMotion], ...]] = ()  # second simulation and audit ask for the same
+    motions: ClassVar[tuple[Poses | None, dict[bool, SmoothMotion]]] = (
+        None,
+        {},
+    )  # second simulation and audit ask for the same
 
 
-def _smoothed(poses: Poses) -> SmoothMotion:
+def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
     t_s = seconds(poses.t_ns, int(poses.t_ns[0])) if len(poses) else np.zeros(0)
-    columns = (poses.p_wb, continuous(poses.q_wb_wxyz))
-    stretches: list[Stretch] = []
-    glitches, steps = 0, 0
+    columns, stretches, glitches, steps = (poses.p_wb, continuous(poses.q_wb_wxyz)), list[Stretch](), 0, 0
     waiting = [np.arange(a, b) for a, b in _unbroken(t_s)][::-1]
     while waiting:
         rows = waiting.pop()
-        if not _long_enough(t_s[rows]):
+        if len(rows) < LEAST_POSES or t_s[rows[-1]] - t_s[rows[0]] < LEAST_S:
             continue
-        rotation = Forked(partial(_robust, t_s[rows], columns[1][rows]))
+        rotation = Forked(partial(_fitted, t_s[rows], columns[1][rows], passes))
         position, count = _levelled(t_s[rows], columns[0][rows])
-        fits = [_robust(t_s[rows], position), rotation.result()]
+        fits = [_fitted(t_s[rows], position, passes), rotation.result()]
         sound = np.all([weights > 0.0 for _, weights in fits], axis=0)
         if len(parts := _unbroken(t_s[rows][sound])) > 1:  # a glitch so long that it is a hole
             kept = rows[sound]
@@ -202,12 +204,8 @@ def _unbroken(t_s: Times) -> list[tuple[int, int]]:
     return [(a, b) for a, b in pairwise(ends) if b > a]
 
 
-def _long_enough(t_s: Times) -> bool:
-    return len(t_s) >= LEAST_POSES and float(t_s[-1] - t_s[0]) >= LEAST_S
-
-
-def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
-    """Robust fit, in which glitches count little and gross ones not at all; its last weights.
+def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
+    """Robust fit, in which glitches count little and gross ones not at all, or a plain one in one pass; its last weights.
 
     Weights 1 / (1 + (r / 3 sigma)²), those of heavy tails, so that a fit with a few wild samples still converges.
     """
@@ -215,16 +213,16 @@ def _robust(t_s: Times, y: Values) -> tuple[Penalised, Times]:
     knot_s = max(period_s, min(KNOT_PERIODS * period_s, MOST_KNOT_S), LEAST_KNOT_S)
     weights, window = np.ones(len(t_s)), min(2 * round(0.5 * USUAL_S / period_s), len(t_s)) + 1
     near_hz = None
-    for index in range(PASSES):
+    for index in range(passes):
         samples = Samples(t_s, y, weights, knot_s)
-        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if index == 0 else None, near_hz)
+        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if index == 0 < passes - 1 else None, near_hz)
         near_hz = fit.cutoff_hz if index else None
         size = np.linalg.norm(fit.residual(), axis=1)
         local = percentile_filter(size, USUAL_PERCENTILE, window, mode="nearest")
         usual = np.maximum(np.maximum(local, np.median(size)) / USUAL_NORM, LEAST_NOISE)
-        if index < PASSES - 1:
+        if index < passes - 1:
             weights = 1.0 / (1.0 + (size / (HUMP * usual)) ** 2)
-        if 0 < index < PASSES - 1:  # the first fit has an arbitrary cut-off: it drops nothing
+        if 0 < index < passes - 1:  # the first fit has an arbitrary cut-off: it drops nothing
             weights[size > GLITCH * usual] = 0.0
     return fit, weights
 

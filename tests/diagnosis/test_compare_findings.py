@@ -51,6 +51,19 @@ def test_another_effect_signal_or_driver_is_another_finding() -> None:
     assert shared(driven, [driven])
 
 
+def test_digits_are_alike_on_the_sensor_whose_noise_shows_them_and_vibrations_at_any_phase() -> None:
+    def vibration(sin: float, cos: float) -> Finding:
+        numbers = {"f": (30.0, "Hz"), "accel_sin_x": (sin, "m/s^2"), "accel_cos_x": (cos, "m/s^2")}
+        return finding("vibration", signal="both", parameters={k: Estimate(v, 1e-3, unit) for k, (v, unit) in numbers.items()})
+
+    gyro, accel = ({f"{sensor}_lsb": Estimate(1e-3, 1e-6, "-")} for sensor in ("gyro", "accel"))
+    both = finding("quantization", signal="both", parameters=gyro | accel)
+    assert shared(finding("quantization", parameters=gyro), [both])
+    assert not shared(finding("quantization", parameters={"gyro_lsb": Estimate(2e-3, 1e-6, "-")}), [both])
+    assert shared(vibration(0.3, 0.4), [vibration(-0.5, 0.0)])
+    assert not shared(vibration(0.3, 0.4), [vibration(0.3, 0.0)])
+
+
 @pytest.mark.parametrize(
     ("equation", "lsb", "sensor", "rounding"),
     [

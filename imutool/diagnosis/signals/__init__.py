@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
+from itertools import product
 
 import numpy as np
 
@@ -16,13 +17,26 @@ from imutool.diagnosis.signals.lag import on_recorded_clock
 from imutool.diagnosis.signals.log_fields import on_one_clock
 from imutool.diagnosis.signals.pairing import Pairing, paired
 from imutool.diagnosis.signals.signal_diagnosis import SignalDiagnosis, diagnose_signal
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location
 from imutool.mcap_io.fields import others, read_field
 
 BY_OTHERS = frozenset({"pressure", "magnetic", "gnss"})  # kinds whose own physics may be most of the signal
 
 ONE_CLOCK = "The motion of the IMU puts both logs on one clock, so a delay of another signal is relative to the IMU"
+
+
+def check_signals(named: Sequence[str], reals: Sequence[Location], sim: Location | None) -> None:
+    """Refuse signals without a simulation, and names that a log lacks, before the search.
+
+    Raises:
+        ConfigError, LogError: as said.
+    """
+    if named and (sim is None or len(reals) != 1):
+        raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")
+    for name, place in product(named, (reals[0], sim)):
+        if place is not None:
+            read_field(place, name)
 
 
 def with_signals(

@@ -87,6 +87,13 @@ CONVENTIONS = {  # gain of an axis that is off by nothing but a convention, by s
 OF_CONVENTION = 0.03  # of such a gain: the scale of an uncalibrated sensor
 
 
+def _wrong_unit(w: Words) -> str:
+    """The unit that a factor stands for."""
+    scale = w.finding.parameters["scale"].value
+    text = next(text for (signal, gain), text in CONVENTIONS.items() if signal == w.finding.signal and _near(scale, gain))
+    return f"{w.it} reads {w.main} of {w.other}, {text}"
+
+
 def _convention(finding: Finding) -> str:
     """Convention that explains a term of an axis' own reading, empty without one."""
     own = {"gyro": "omega", "accel": "f"}.get(finding.signal)
@@ -157,6 +164,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "timestamp_jitter": "samples are late by turns, {w.main.labelled}",
     "reference_error": _reference_error,
     "reference_smoothing": "the true poses are smoothed, and slower than the body, by {w.main.labelled}",
+    "wrong_unit": _wrong_unit,
     "gain": "its gain is {w.main} of that of {w.other}",
     "offset": "{w.it} reads a constant {w.main} too much",
     "delay": _delay,

@@ -20,6 +20,11 @@ def until(end_s: float) -> Effect:
     return _effect(KNOTS_S[: sum(t_s < end_s for t_s in KNOTS_S) + 1])
 
 
+def with_knots(effects: Sequence[Effect], end_s: float) -> list[Effect]:
+    """Effects with the knots that a log has which ends then."""
+    return [until(end_s) if effect.name == EFFECT.name else effect for effect in effects]
+
+
 def _effect(knots_s: Sequence[int]) -> Effect:
     def forward(taken_s: Times, offsets_s: Theta) -> Times:
         return np.asarray(taken_s + np.interp(taken_s, knots_s, offsets_s))

@@ -15,6 +15,7 @@ LEAST_HZ = 3.0  # slower is motion, drift or another effect, and no vibration
 LINES = 3  # starts: the strongest lines of the residual
 FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
 ABOUT = 401  # frequencies whose median tells what a line stands out from
+PARTS = 8  # of a log, in each of which a vibration has one amplitude and phase
 IN_POSES = 0.1  # of the power of a line, from which the poses have it, too
 
 
@@ -51,6 +52,23 @@ def line_p_value(samples: Float64[np.ndarray, "n k"], rate_hz: float, f_hz: floa
     at = int(np.argmin(np.abs(frequency - f_hz)))
     highest = (power[at - 1 : at + 2] / level[at - 1 : at + 2]).sum(axis=1).max()
     return float(min(1.0, len(frequency) * gamma.sf(highest, samples.shape[1])))
+
+
+def steady_p_value(stamp_s: Float64[np.ndarray, " n"], samples: Float64[np.ndarray, "n k"], f_hz: float) -> float:
+    """p-value of a line by its amplitude and phase in each eighth of a log.
+
+    A vibration keeps both, so that their mean stands out from their scatter (F of 2 and 14). A gait and its impacts are as
+    loud there, but wander, in all columns together: the clearest column counts, at any frequency.
+    """
+    from scipy.stats import f as fisher
+
+    wave = np.exp(-2j * np.pi * f_hz * stamp_s)[:, None]
+    parts = np.array_split(wave * (samples - samples.mean(axis=0)), PARTS)
+    each = np.stack([part.mean(axis=0) for part in parts])
+    middle = each.mean(axis=0)
+    scatter = (np.abs(each - middle) ** 2).sum(axis=0) / (PARTS - 1) + np.finfo(np.float64).tiny
+    log_p = fisher.logsf(PARTS * np.abs(middle) ** 2 / scatter, 2, 2 * (PARTS - 1))
+    return float(min(1.0, samples.shape[1] * len(stamp_s) / 2.0 * np.exp(log_p.min())))
 
 
 def is_motion(

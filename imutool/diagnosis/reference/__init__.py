@@ -1,0 +1,1 @@
+"""References of a recording that are its own: true poses."""

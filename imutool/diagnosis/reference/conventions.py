@@ -1,0 +1,101 @@
+"""Units and axes in which a recording and a simulation of its motion differ.
+
+A unit or an order of axes is a convention, not physics: no effect of the catalogue is as large, and each would stand for it
+badly (an accelerometer in g looks like a gravity that is too small). So both are looked for first, as `imutool audit` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.diagnosis.audit.axes import Hypotheses, Matrix
+from imutool.diagnosis.audit.motion import OTHER_UNIT
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.result import Estimate, Finding, HeldOut
+from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
+
+EXPLAINED = 0.03  # of the squares, that the right convention leaves: a mount that is turned by more than 10 degrees has its own
+Readings = Float64[np.ndarray, "n 3"]
+
+
+def with_common_conventions(pairs: Sequence[Pair]) -> tuple[list[Pair], list[Finding]]:
+    """Recordings in the units and axes of the simulation, and findings of those that differ."""
+    changes: dict[Sensor, tuple[float, Matrix]] = {}
+    for k, sensor in enumerate(SENSORS):
+        part = slice(3 * k, 3 * k + 3)
+        rows = [pair.usable[:, part].all(axis=1) for pair in pairs]
+        y, x = (
+            np.concatenate([values[:, part][row] for values, row in zip(each, rows, strict=True)])
+            for each in ([pair.real for pair in pairs], [expected(pair, ()) for pair in pairs])
+        )
+        changes[sensor] = _convention(sensor, y, x)
+    if all(factor == 1.0 and np.array_equal(P, np.eye(3)) for factor, P in changes.values()):
+        return list(pairs), []
+    after = [_converted(pair, changes) for pair in pairs]
+    return after, _findings(pairs, after, changes)
+
+
+def _convention(sensor: Sensor, y: Readings, x: Readings) -> tuple[float, Matrix]:
+    """Factor and axes P with factor y P = x, as far as the motion shows them."""
+    same = 1.0, np.eye(3)
+    if len(y) == 0 or not y.any():
+        return same
+    like = Hypotheses(x[:, :, None], x[:, :, None], free_bias=sensor == "gyro")
+    other = OTHER_UNIT[sensor]
+    factor = next((by for by in (other, 1.0 / other) if like.unit(y, by) != 1.0), 1.0)
+    _, P = like.frame(y * factor)
+    left = factor * y @ P - x
+    unexplained = float(left.var(axis=0).sum()) / max(float((x**2).mean(axis=0).sum()), np.finfo(np.float64).tiny)
+    return (factor, P) if unexplained < EXPLAINED else same
+
+
+def _converted(pair: Pair, changes: dict[Sensor, tuple[float, Matrix]]) -> Pair:
+    turn = np.zeros((6, 6))
+    for k, (factor, P) in enumerate(changes.values()):
+        turn[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = factor * P
+    known = None if pair.known is None else np.asarray(pair.known.astype(float) @ (turn != 0.0) > 0.5)
+    return replace(pair, real=np.asfortranarray(pair.real @ turn), known=known)
+
+
+def _findings(before: Sequence[Pair], after: Sequence[Pair], changes: dict[Sensor, tuple[float, Matrix]]) -> list[Finding]:
+    found = []
+    for sensor, (factor, _) in changes.items():
+        if factor != 1.0:
+            scale = {"scale": Estimate(1.0 / factor, 0.0, "-")}
+            found.append(_finding("wrong_unit", sensor, sensor, scale, "accel = x / 9.80665, gyro = 180 / pi x", before, after))
+    turned = {sensor: P for sensor, (_, P) in changes.items() if not np.array_equal(P, np.eye(3))}
+    alike = len({P.tobytes() for P in turned.values()}) == 1 and len(turned) == len(SENSORS)
+    for sensor, P in turned.items():
+        if not alike or sensor == SENSORS[0]:
+            name = "left_handed" if np.linalg.det(P) < 0.0 else "permuted_axes"
+            axes = ", ".join(("-" if row.sum() < 0.0 else "") + AXES[int(np.abs(row).argmax())] for row in P)
+            text = f"recorded x, y, z = {axes} of the simulation"
+            found.append(_finding(name, "both" if alike else sensor, sensor, {}, text, before, after))
+    return found
+
+
+def _finding(
+    name: str,
+    signal: str,
+    sensor: Sensor,
+    parameters: dict[str, Estimate],
+    equation: str,
+    before: Sequence[Pair],
+    after: Sequence[Pair],
+) -> Finding:
+    """Finding with what the convention alone removes of the samples on held-out time, all axes together."""
+    part = slice(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
+
+    def rms(pairs: Sequence[Pair]) -> float:
+        left = [(pair.real - expected(pair, ()))[pair.held_out, part] for pair in pairs]
+        return float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+
+    was, is_now = rms(before), rms(after)
+    seconds = round(sum(float(pair.held_out.sum()) * pair.period_s for pair in before), 1)
+    share = 1.0 - (is_now / was) ** 2 if was > 0.0 else 0.0
+    return Finding(name, signal, share, 0.0, 0.0, parameters, equation, HeldOut(was, is_now, ASCII_UNITS[sensor], seconds))

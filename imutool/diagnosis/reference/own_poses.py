@@ -1,0 +1,131 @@
+"""Alignment of a recording with the motion of its own true poses.
+
+A robust curve through poses takes an impact for a glitch: both are fast and rare. The IMU is their witness. A glitch is an
+error of a pose, which no sensor reads, but an impact is a motion of the body. So a curve in which all poses count alike is
+taken where it leaves clearly less of the samples.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.fft import dct, idct
+from scipy.spatial.transform import Rotation
+
+from imutool.array_types import Float64
+from imutool.diagnosis.audit.spectral_lines import by_differences
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.time_alignment import with_truth
+from imutool.diagnosis.estimation.whitening import Band
+from imutool.diagnosis.settings import DiagnoseSettings, ReferenceSettings
+from imutool.errors import DataError
+from imutool.recording import Recording
+from imutool.sensor.effects.vibration import is_motion
+from imutool.sensor.samples import IdealMotion
+from imutool.sensor.trajectory import SmoothMotion, Stretch, smooth_motion
+
+CLEARLY = 0.5  # of the squares that the robust curve leaves of one sensor
+
+
+def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pair]:
+    """Stretches of a recording that its true poses cover without a hole.
+
+    Raises:
+        DataError: no stretch is long enough, or the poses cannot be differentiated.
+    """
+    motion = smooth_motion(real.truth)
+    pairs = list(_pairs(real, motion, settings))
+    if motion.glitches:
+        plain = list(_pairs(real, smooth_motion(real.truth, robust=False), settings))
+        pairs = plain if _explain_more(plain, pairs) else pairs
+    if not pairs:
+        raise DataError(
+            f"the true poses have no stretch of {settings.alignment.least_s:g} s that can be differentiated",
+            where=real.name,
+            expected="poses at 40 Hz or more, without holes",
+            fix="Give a simulation with `sim`",
+        )
+    yield from pairs
+
+
+def band_hz(stretch: Stretch, settings: ReferenceSettings) -> float:
+    """Frequency up to which the motion of a stretch of poses is known."""
+    return max(settings.band_share * min(stretch.cutoff_hz), settings.least_band_hz)
+
+
+def is_in_raw_poses(pair: Pair, line: Float64[np.ndarray, "n 6"], f_hz: float) -> bool:
+    """Whether the poses have a spectral line before smoothing: it is motion of the body."""
+    if pair.truth is None or not pair.truth.has_positions:
+        return False
+    shown, _ = by_differences(pair.truth, np.zeros(3))
+    return is_motion(pair.stamp_s[1:-1], shown, line[1:-1], f_hz, pair.settings.search.false_discovery_rate)
+
+
+def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) -> Iterator[Pair]:
+    least_s, started_ns = settings.alignment.least_s, int(real.imu.t_ns[0])
+    for ideal in motion.ideal_motions(1.0 / real.imu.period_s):
+        if ideal.t_s[-1] - ideal.t_s[0] < least_s:
+            continue
+        middle_s = (ideal.t_s[0] + ideal.t_s[-1]) / 2.0
+        stretch = next(part for part in motion.stretches if part.start_s <= middle_s <= part.end_s)
+        # times are told from the log's start, also where its poses begin later
+        since = replace(ideal, t_s=ideal.t_s + (motion.start_ns - started_ns) * 1e-9)
+        since = _with_lost_motion(since, stretch.cutoff_hz, settings.reference.band_share)
+        pair = with_truth(real, since, started_ns, band_hz(stretch, settings.reference), settings)
+        of_gyro = np.tile(np.arange(6) < 3, (len(pair.stamp_s), 1))  # without positions nothing is known of the accelerometer
+        yield pair if real.truth.has_positions else replace(pair, known=of_gyro)
+
+
+def _explain_more(plain: Sequence[Pair], robust: Sequence[Pair]) -> bool:
+    """Whether plain curves leave clearly less of one sensor, and no more of the other."""
+    if not plain or not robust:
+        return bool(plain)
+    up_to_hz = min(pair.band_hz for pair in (*plain, *robust) if pair.band_hz is not None)
+    squares = [np.mean([_squares(pair, up_to_hz) for pair in pairs], axis=0) for pairs in (plain, robust)]
+    left = squares[0] / np.maximum(squares[1], np.finfo(np.float64).tiny)
+    return bool(left.max() <= 1.0 and left.min() < CLEARLY)
+
+
+def _squares(pair: Pair, up_to_hz: float) -> Float64[np.ndarray, "2"]:
+    """Mean square of what the motion leaves of each sensor in a band, less a constant, a gain and a delay of each axis."""
+    band = Band.below(up_to_hz, 1.0 / pair.period_s, pair.settings.noise)
+    rows, motion = (pair.fitted | pair.held_out)[:: band.every], expected(pair, ())
+    left = band(pair.real - motion)[rows]
+    like = np.stack([np.ones_like(motion), motion, rate := np.gradient(motion, axis=0), np.gradient(rate, axis=0)], axis=2)
+    each = [
+        _left(A, y) if known else 0.0
+        for A, y, known in zip(np.moveaxis(band(like)[rows], 1, 0), left.T, pair.axes, strict=True)
+    ]
+    return np.array([sum(each[:3]), sum(each[3:])])
+
+
+def _left(A: Float64[np.ndarray, "m q"], y: Float64[np.ndarray, " m"]) -> float:
+    return float(np.mean((y - A @ np.linalg.lstsq(A, y)[0]) ** 2))
+
+
+def _with_lost_motion(ideal: IdealMotion, cutoffs_hz: tuple[float, float], share: float) -> IdealMotion:
+    """Motion with what the splines through its poses took of it, up to a share of each cut-off.
+
+    A spline with a penalty on its third derivative leaves 1 / (1 + (f / cutoff)^6) of a motion (position, rotation), in the
+    axes of the world. Uncorrected, the edge of the band shows it as a smoothing of the poses, or as a scale.
+    """
+    R_wb, n = ideal.R_wb, len(ideal.t_s)
+    assert R_wb is not None, "poses have an attitude"
+    to_world = functools.partial(np.einsum, "nij,nj->ni", R_wb)
+    f_hz = np.arange(n)[:, None] * ideal.rate_hz / (2.0 * n)
+    of_position, of_rotation = (np.minimum(f_hz / hz, share) ** 6 for hz in cutoffs_hz)
+
+    def lost(x: Float64[np.ndarray, "n 3"], part: Float64[np.ndarray, "n 1"]) -> Float64[np.ndarray, "n 3"]:
+        return np.asarray(idct(dct(x, axis=0) * part, axis=0))
+
+    force, turn = to_world(ideal.accel), lost(to_world(ideal.gyro), of_rotation)
+    angle = np.cumsum(turn, axis=0) / ideal.rate_hz
+    back = Rotation.from_rotvec(angle - angle.mean(axis=0)) * Rotation.from_matrix(R_wb)
+    force = force + lost(force, of_position)
+    alpha = to_world(ideal.alpha)
+    gyro, accel, alpha = (back.inv().apply(x) for x in (to_world(ideal.gyro) + turn, force, alpha + lost(alpha, of_rotation)))
+    return replace(ideal, gyro=gyro, accel=accel, alpha=alpha, R_wb=back.as_matrix())

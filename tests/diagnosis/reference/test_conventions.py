@@ -1,0 +1,51 @@
+"""A wrong unit and swapped axes beside a simulation of the same motion have their own names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support import planted
+from support.diagnoses import replace
+
+from imutool.diagnosis.audit.motion import OTHER_UNIT
+from imutool.diagnosis.reference.conventions import with_common_conventions
+from imutool.diagnosis.wording.effect_sentences import SENTENCES
+
+SWAPPED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+CYCLIC = np.roll(np.eye(3), 1, axis=0)
+SECONDS = 12.0
+NORMAL = {"gyro_scale": [0.03, -0.02, 0.01], "mount_rotation": [0.05, -0.08, 0.06], "lever_arm": [0.1, 0.1, -0.2]}
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return planted.pair(planted.rich(2, SECONDS), NORMAL)
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "named"),
+    [
+        (np.eye(3), np.eye(3), []),
+        (np.eye(3), np.eye(3) / OTHER_UNIT["accel"], [("wrong_unit", "accel")]),
+        (np.eye(3) / OTHER_UNIT["gyro"], np.eye(3), [("wrong_unit", "gyro")]),
+        (np.eye(3), OTHER_UNIT["accel"] * np.eye(3), [("wrong_unit", "accel")]),
+        (SWAPPED, SWAPPED, [("left_handed", "both")]),
+        (np.eye(3), CYCLIC, [("permuted_axes", "accel")]),
+        (SWAPPED, SWAPPED / OTHER_UNIT["accel"], [("wrong_unit", "accel"), ("left_handed", "both")]),
+        (0.9 * np.eye(3), 1.1 * np.eye(3), []),
+    ],
+)
+def test_a_convention_is_named_and_undone(pair, gyro: np.ndarray, accel: np.ndarray, named: list[tuple[str, str]]) -> None:
+    read = np.concatenate([pair.real[:, :3] @ gyro.T, pair.real[:, 3:] @ accel.T], axis=1)
+    (after,), found = with_common_conventions([replace(pair, real=read)])
+    assert [(one.effect, one.signal) for one in found] == named
+    assert after.real == pytest.approx(pair.real if named else read)
+    for one in found:
+        assert one.effect != "wrong_unit" or callable(SENTENCES[one.effect])
+        assert one.share > 0.9
+
+
+def test_axes_that_the_motion_does_not_tell_apart_stay() -> None:
+    flat = planted.pair(planted.planar(SECONDS))
+    swapped = np.concatenate([flat.real[:, :3] @ SWAPPED.T, flat.real[:, 3:]], axis=1)
+    assert with_common_conventions([replace(flat, real=swapped)])[1] == []
