@@ -231,7 +231,14 @@ def trained(perfect: Make) -> dict[str, Training]:
     """conv and linear on three flights of a gyro that lags by 20 ms and is 5 % too large."""
     torch.set_num_threads(1)
     flights = [lagging(perfect(seed, duration_s=20.0), 0.02, 0.05, seed) for seed in (1, 2, 3)]
-    small = {"steps": 150, "gyro_rate": 4e-2, "samples": 6000, "validate_every": 40, "gyro_window_s": (0.5, 2.0), "accel_window_s": (0.5, 1.0)}
+    small = {
+        "steps": 150,
+        "gyro_rate": 4e-2,
+        "samples": 6000,
+        "validate_every": 40,
+        "gyro_window_s": (0.5, 2.0),
+        "accel_window_s": (0.5, 1.0),
+    }
     small |= {"increments": IncrementSettings(stretch_s=5.0)}
     done = {
         "conv": Training(flights, "conv", settings_of("conv")(**small, model=SMALL | {"gyro_unit_rad_s": 0.1})),
