@@ -15,6 +15,7 @@ little memory. A tensor asked for on "meta" meanwhile is one on the GPU, with it
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ GPU, STANDS_FOR_IT = torch.device("cuda", 0), torch.device("meta")
 ATEN = torch.ops.aten
 INDEXED = (ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_, ATEN._unsafe_index)  # tensor, indices, values
 FILLED = (ATEN.fill, ATEN.fill_, ATEN.masked_fill, ATEN.masked_fill_)
+NAMES_DEVICE = (str, torch.device)
 OPTIMISERS = importlib.import_module("torch.optim.optimizer")  # torch.optim hides it
 
 
@@ -104,7 +106,8 @@ class _Names(TorchFunctionMode):
     ) -> Any:
         if function is torch.device:
             return function(*args, **(named or {}))
-        args, named = tuple(map(_renamed, args)), {name: _renamed(value) for name, value in (named or {}).items()}
+        args = tuple([_renamed(value) if type(value) in NAMES_DEVICE else value for value in args])
+        named = {name: _renamed(value) for name, value in named.items()} if named else {}
         if function in (torch.tensor, torch.as_tensor) and named.get("device") == STANDS_FOR_IT:
             return function(*args, **named | {"device": "cpu"}).to(STANDS_FOR_IT)
         if function is Tensor.new_tensor and isinstance(args[0], OnGpu):
@@ -145,7 +148,7 @@ def _computed(operation: Any, args: tuple[Any, ...], named: dict[str, Any]) -> A
 
     here, here_named = _mapped(numbers, args), {name: _mapped(numbers, value) for name, value in named.items()}
     tensors = [one for one in given if isinstance(one, Tensor)]
-    cpu = [one for one in tensors if not isinstance(one, OnGpu)]
+    cpu = [one for one in tensors if type(one) is not OnGpu]
     assert not any(one.is_meta for one in cpu), f"{operation} on a tensor without numbers"
     if 0 < len(cpu) < len(tensors):
         _refuse_two_devices(operation, args, cpu)
@@ -155,11 +158,16 @@ def _computed(operation: Any, args: tuple[Any, ...], named: dict[str, Any]) -> A
     if there:
         _refuse_foreign_generator(given)
     done = operation(*here, **here_named)
-    if torch.Tag.inplace_view in operation.tags:  # such as squeeze_: the shape that torch sees changes as well
+    if _changes_shape(operation):  # such as squeeze_: the shape that torch sees changes as well
         with no_dispatch():
             operation(*args, **named)
     same = {id(_numbers(one)): one for one in tensors}  # what an operation changes in place stays the same tensor
     return _mapped(lambda one: same.get(id(one), OnGpu(one) if there else one) if isinstance(one, Tensor) else one, done)
+
+
+@functools.cache
+def _changes_shape(operation: Any) -> bool:
+    return torch.Tag.inplace_view in operation.tags
 
 
 def _refuse_two_devices(operation: Any, args: tuple[Any, ...], cpu: Sequence[Tensor]) -> None:
@@ -196,11 +204,11 @@ def _refuse_foreign_generator(given: Sequence[Any]) -> None:
 
 
 def _numbers(value: Any) -> Any:
-    return value.numbers if isinstance(value, OnGpu) else value
+    return value.numbers if type(value) is OnGpu else value
 
 
 def _mapped(change: Callable[[Any], Any], value: Any) -> Any:
     """A value, or every one in lists and tuples of values, changed."""
-    if isinstance(value, list | tuple):
+    if type(value) is tuple or type(value) is list:
         return type(value)([_mapped(change, one) for one in value])
     return change(value)

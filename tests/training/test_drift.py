@@ -21,7 +21,7 @@ from imutool.training.run import train
 from imutool.training.settings import TrainSettings, settings_of
 from imutool.training.training_windows import Pool
 
-TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (120.0,)
+TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (90.0,)
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
 FEW = ("steps=1", "samples=500", "gyro_window_s=[1.0]", "accel_window_s=[0.5]")
 BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
@@ -100,7 +100,7 @@ def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path, loaded: tuple
     assert BETTER * ode < static
 
 
-def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path) -> None:
+def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path, one_start: None) -> None:
     """Logs that are left out decide that the drift stays, and the files of both methods have it."""
     logs = saved(tmp_path, "ambient", 0, TRAINING_S)
     hybrid = trained(tmp_path, logs, "hybrid", *ALONE, "compare=true")

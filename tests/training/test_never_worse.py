@@ -21,7 +21,7 @@ from imutool.training.run import train
 from imutool.training.settings import settings_of
 from imutool.training.training_windows import Pool
 
-KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0)
+KIND = Switchings(sensor_seed=0, rest_s=10.0, duration_s=30.0, rate_hz=50.0)
 TRAINING, TESTS = 4, 4  # tests/bench/never_worse.py has many sensors, six and eight logs of each
 
 

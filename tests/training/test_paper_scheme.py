@@ -28,7 +28,7 @@ PAPER = {"gyro_steps": 40, "accel_steps": 2, "segments": 100, "halve_every": 15}
 
 def scaled(perfect: Make, seed: int) -> Recording:
     """A gyro with errors of scale and a bias, and noise."""
-    exact = perfect(seed, duration_s=8.0, still_s=0.5)
+    exact = perfect(seed, duration_s=8.0, still_s=0.5, rate_hz=100.0)
     noise = np.random.default_rng(seed).normal(size=(len(exact.imu), 3))
     gyro = exact.imu.gyro * (1 + SCALED) + 0.02 + 2e-3 * noise
     return Recording(exact.name, Imu(exact.imu.t_ns, gyro, exact.imu.accel), exact.truths)

@@ -165,11 +165,11 @@ def test_the_coning_rate_is_that_of_the_coning_rotation() -> None:
 @pytest.mark.parametrize("method", ["euler", "rk4", "dopri5"])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 5e-4), (F64, EXACT)])
 def test_a_constant_rate_over_many_turns_is_exact_for_every_method(method: str, dtype: torch.dtype, tolerance: float) -> None:
-    """The chart turns a constant rate into a constant vector, which Euler integrates exactly; 6.4 turns, 13 charts.
+    """The chart turns a constant rate into a constant vector, which Euler integrates exactly; 3.2 turns, 6 charts.
 
-    In float32 the outputs of dopri5 pass through its interpolant: a few roundings each, 200 times."""
+    In float32 the outputs of dopri5 pass through its interpolant: a few roundings each, 100 times."""
     rate = torch.tensor([1.0, -2.0, 3.3], dtype=dtype)
-    t = torch.linspace(0, 10, 201, dtype=F64)
+    t = torch.linspace(0, 5, 101, dtype=F64)
     with torch.no_grad():
         R, _ = integrate(ConstantRate(rate), torch.zeros(3, dtype=dtype), t, torch.eye(3, dtype=dtype), method=method)
     assert R.dtype == dtype
@@ -179,10 +179,10 @@ def test_a_constant_rate_over_many_turns_is_exact_for_every_method(method: str, 
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("rk4", 4)])
 def test_fixed_step_methods_converge_at_their_order_through_chart_changes(method: str, order: int) -> None:
     field, errors = Coning(), []
-    for n in (40, 80, 160):
-        t = torch.linspace(0, 8, n + 1, dtype=F64)
+    for n in (40, 80):
+        t = torch.linspace(0, 4, n + 1, dtype=F64)
         with torch.no_grad():
-            R, state = integrate(field, torch.ones(1, dtype=F64), t, field.answer(t[:1])[0], method=method)
+            R, state = integrate(field, torch.ones(1, dtype=F64), t, field.answer(t[:1])[0], method=method, max_angle=1.0)
             exact = t - 1 + 2 * torch.exp(-t)
             errors.append((float((R - field.answer(t)).abs().max()), float((state[:, 0] - exact).abs().max())))
     for rotation_or_state in zip(*errors, strict=True):
@@ -190,23 +190,23 @@ def test_fixed_step_methods_converge_at_their_order_through_chart_changes(method
         assert abs(measured[-1] - order) < ORDER_TOLERANCE, (method, measured)
 
 
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-8, 1e-10])
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-10])
 def test_dopri5_meets_its_tolerance(tolerance: float) -> None:
-    field, t = Coning(), torch.linspace(0, 8, 33, dtype=F64)
+    field, t = Coning(), torch.linspace(0, 5, 21, dtype=F64)
     with torch.no_grad():
         R, _ = integrate(
             field, torch.ones(1, dtype=F64), t, field.answer(t[:1])[0], method="dopri5", rtol=tolerance, atol=tolerance
         )
-        assert (R - field.answer(t)).abs().max() < 10 * tolerance  # 32 intervals, each of which may use up the tolerance
+        assert (R - field.answer(t)).abs().max() < 10 * tolerance  # 20 intervals, each of which may use up the tolerance
 
 
 def test_states_follow_the_rotation_they_depend_on() -> None:
     """The first body axis under a turn about z integrates to (sin, 1 - cos) / rate."""
-    rate, t = torch.tensor([0.0, 0.0, 2.0], dtype=F64), torch.linspace(0, 9, 181, dtype=F64)
+    rate, t = torch.tensor([0.0, 0.0, 2.0], dtype=F64), torch.linspace(0, 4.5, 91, dtype=F64)
     with torch.no_grad():
         _, state = integrate(ConstantRate(rate), torch.zeros(3, dtype=F64), t, EYE, method="rk4")
     exact = torch.stack([torch.sin(2 * t) / 2, (1 - torch.cos(2 * t)) / 2, torch.zeros_like(t)], dim=1)
-    assert (state - exact).abs().max() < 1e-6  # (2 * 0.05)^4 / 2880 a step, 180 steps
+    assert (state - exact).abs().max() < 1e-6  # (2 * 0.05)^4 / 2880 a step, 90 steps
 
 
 def test_elements_of_a_batch_change_charts_at_their_own_times_and_without_disturbing_each_other() -> None:
@@ -220,7 +220,7 @@ def test_elements_of_a_batch_change_charts_at_their_own_times_and_without_distur
         def forward(self, t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
             return self.rate * (1 + 0.3 * torch.sin(t)), R_wb[..., 0]
 
-    t = torch.linspace(0, 12, 121, dtype=F64)
+    t = torch.linspace(0, 6, 61, dtype=F64)
     with torch.no_grad():
         R, state = integrate(Batch(rates), torch.zeros(4, 3, dtype=F64), t, EYE.expand(4, 3, 3), method="rk4")
         turned = t + 0.3 * (1 - torch.cos(t))
@@ -232,11 +232,11 @@ def test_elements_of_a_batch_change_charts_at_their_own_times_and_without_distur
 
 
 def test_where_the_chart_changes_does_not_matter_to_a_converged_answer() -> None:
-    field, t = Coning(), torch.linspace(0, 6, 151, dtype=F64)
+    field, t = Coning(), torch.linspace(0, 3, 76, dtype=F64)
     with torch.no_grad():
         often, _ = integrate(field, torch.ones(1, dtype=F64), t, EYE, method="rk4", max_angle=0.2)
         seldom, _ = integrate(field, torch.ones(1, dtype=F64), t, EYE, method="rk4", max_angle=5.0)
-    assert (often - seldom).abs().max() < 1e-6  # (0.04 s x 1.5 rad/s)^4 / 120 a step, 150 steps
+    assert (often - seldom).abs().max() < 1e-6  # (0.04 s x 1.5 rad/s)^4 / 120 a step, 75 steps
 
 
 def test_float32_states_meet_float64_times_a_day_into_a_log() -> None:
@@ -258,7 +258,7 @@ def test_float32_states_meet_float64_times_a_day_into_a_log() -> None:
 
 
 def gradients(
-    field: nn.Module, method: str, *, n: int, adjoint: bool = False, max_angle: float = math.pi, span: float = 4.0
+    field: nn.Module, method: str, *, n: int, adjoint: bool = False, max_angle: float = 1.5, span: float = 2.0
 ) -> list[Tensor]:
     """Of a scalar of everything that comes back, by the field's parameters, the start rotation and the start state."""
     generator = torch.Generator().manual_seed(7)
@@ -285,14 +285,14 @@ FIELDS = [lambda: ConstantRate(torch.tensor([0.5, -0.9, 0.8], dtype=F64)), Conin
 
 @pytest.mark.parametrize("make", FIELDS)
 def test_a_chart_change_leaves_the_gradient_as_it_is(make: Callable[[], nn.Module]) -> None:
-    """Up to 1.7 pi one chart is enough; the same with the chart changed at pi (the constant rate only), at 1 and at 0.3."""
-    one_chart = gradients(make(), "rk4", n=60, max_angle=6.2)
-    for max_angle in (math.pi, 1.0, 0.3):
-        assert_close(gradients(make(), "rk4", n=60, max_angle=max_angle), one_chart, GRADIENT_TOLERANCE)
+    """Up to 1.1 pi one chart is enough; the same with the chart changed at pi (the constant rate only) and at 0.5."""
+    one_chart = gradients(make(), "rk4", n=39, max_angle=6.2, span=2.6)
+    for max_angle in (math.pi, 0.5):
+        assert_close(gradients(make(), "rk4", n=39, max_angle=max_angle, span=2.6), one_chart, GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("make", FIELDS)
-@pytest.mark.parametrize(("method", "n"), [("rk4", 60), ("dopri5", 4)])
+@pytest.mark.parametrize(("method", "n"), [("rk4", 30), ("dopri5", 4)])
 def test_the_adjoint_gives_the_gradient_of_backpropagation(make: Callable[[], nn.Module], method: str, n: int) -> None:
     expected = gradients(make(), method, n=n)
     assert_close(gradients(make(), method, n=n, adjoint=True), expected, GRADIENT_TOLERANCE)
@@ -300,14 +300,14 @@ def test_the_adjoint_gives_the_gradient_of_backpropagation(make: Callable[[], nn
 
 def test_the_adjoint_of_euler_comes_closer_to_backpropagation_with_the_step() -> None:
     make, gaps = FIELDS[0], []
-    for n in (40, 80):
+    for n in (20, 40):
         exact, adjoint = gradients(make(), "euler", n=n), gradients(make(), "euler", n=n, adjoint=True)
         gaps.append(max(float((a - b).abs().max()) for a, b in zip(adjoint, exact, strict=True)))
     assert abs(math.log2(gaps[0] / gaps[1]) - 1) < ORDER_TOLERANCE
 
 
 def test_the_gradient_is_the_derivative() -> None:
-    rate, t = torch.tensor([0.5, -0.9, 0.8], dtype=F64), torch.linspace(0, 3, 6, dtype=F64)
+    rate, t = torch.tensor([0.5, -0.9, 0.8], dtype=F64), torch.linspace(0, 2, 4, dtype=F64)
 
     def last(A: Tensor) -> Tensor:
         def field(t: Tensor, R_wb: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -320,7 +320,7 @@ def test_the_gradient_is_the_derivative() -> None:
 
 
 def test_the_adjoint_reaches_tensors_it_is_told_of() -> None:
-    t = torch.linspace(0, 4, 41, dtype=F64)
+    t = torch.linspace(0, 2.5, 26, dtype=F64)
     results = []
     for adjoint in (False, True):
         u = torch.tensor([0.5, -0.9, 0.8], dtype=F64, requires_grad=True)
@@ -330,7 +330,7 @@ def test_the_adjoint_reaches_tensors_it_is_told_of() -> None:
 
         R, state = integrate(field, torch.zeros(3, dtype=F64), t, EYE, method="rk4", adjoint=adjoint, parameters=[u])
         results.append(list(torch.autograd.grad(R[-1].sum() + state[-1].sum(), u)))
-    assert_close(results[1], results[0], 1e-4)  # rk4 at a tenth of a second and up to 6 rad/s
+    assert_close(results[1], results[0], 1e-4)  # rk4 at a tenth of a second and up to 5 rad/s
 
 
 # --- leaving the meaningful range ----------------------------------------------------------------------------------------

@@ -231,7 +231,14 @@ def trained(perfect: Make) -> dict[str, Training]:
     """conv and linear on three flights of a gyro that lags by 20 ms and is 5 % too large."""
     torch.set_num_threads(1)
     flights = [lagging(perfect(seed, duration_s=20.0), 0.02, 0.05, seed) for seed in (1, 2, 3)]
-    small = {"steps": 250, "samples": 6000, "validate_every": 40, "gyro_window_s": (0.5, 2.0), "accel_window_s": (0.5, 1.0)}
+    small = {
+        "steps": 150,
+        "gyro_rate": 4e-2,
+        "samples": 6000,
+        "validate_every": 40,
+        "gyro_window_s": (0.5, 2.0),
+        "accel_window_s": (0.5, 1.0),
+    }
     small |= {"increments": IncrementSettings(stretch_s=5.0)}
     done = {
         "conv": Training(flights, "conv", settings_of("conv")(**small, model=SMALL | {"gyro_unit_rad_s": 0.1})),
@@ -252,7 +259,7 @@ def rate_error(model: BiasNetwork, exact: Recording, measured: Recording) -> flo
 
 def test_it_learns_to_take_back_a_lag_which_no_matrix_can(trained: dict[str, Training], perfect: Make) -> None:
     """On a flight it has not seen: half the error of the raw samples, 0.7 of that of the best matrix, and 0.75 of its drift
-    where both were judged. Four seeds gave 0.26 to 0.38, 0.35 to 0.50 and 0.41 to 0.49."""
+    where both were judged. Four seeds gave 0.32 to 0.43, 0.43 to 0.57 and 0.40 to 0.58."""
     exact = perfect(9, duration_s=20.0)
     measured = lagging(exact, 0.02, 0.05, 9)
     raw = rate_error(static.Network().double(), exact, measured)
@@ -295,22 +302,27 @@ def same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_one_seed_gives_the_same_bits_and_another_does_not(flights: list[Recording]) -> None:
-    states = []
-    for seed in (0, 0, 1):
-        torch.manual_seed(99 + len(states))  # whatever the state of the world
+@pytest.fixture(scope="module")
+def expected(flights: list[Recording]) -> Training:
+    """A training of seed 0 without incident."""
+    training = short(flights)
+    list(training.epochs())
+    return training
+
+
+def test_one_seed_gives_the_same_bits_and_another_does_not(flights: list[Recording], expected: Training) -> None:
+    for seed in (0, 1):
+        torch.manual_seed(99 + seed)  # whatever the state of the world
         training = short(flights, seed)
         list(training.epochs())
-        states.append(state(training))
-    assert same(states[0], states[1])
-    assert not same(states[0], states[2])
+        assert same(state(training), state(expected)) == (seed == 0)
 
 
 @pytest.mark.parametrize("lines", [2, 3, 6])
-def test_taken_up_again_it_draws_the_dropout_it_would_have_drawn(flights: list[Recording], tmp_path: Path, lines: int) -> None:
+def test_taken_up_again_it_draws_the_dropout_it_would_have_drawn(
+    flights: list[Recording], expected: Training, tmp_path: Path, lines: int
+) -> None:
     path = tmp_path / "c"
-    expected = short(flights)
-    list(expected.epochs())
     first = short(flights)
     progress = first.epochs()
     for _ in range(lines):
