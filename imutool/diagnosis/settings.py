@@ -118,9 +118,9 @@ class AlignmentSettings(WienerSettings, frozen=True):
     alike_sigma: tuple[float, float] = (3.0, 6.0)  # over chance, with a shared epoch and at any lag; 210 unrelated pairs: 5.3
     poses_share: Share = 0.9  # of the simulation that its poses must cover to stand for it
     poses_hz: Positive = 40.0  # slower poses cannot be differentiated twice
-    coarse_samples: Count = 5  # of the means in which a misfit between poses and samples stands out
-    coarse_factor: Positive = 1.3  # over their noise, up to which poses stand for the samples
-    line_chance: Share = 1e-6  # of white noise to show a line above those means, below which poses do not stand for the samples
+    coarse_bands: Count = 5  # of all frequencies, in any of which a misfit between poses and samples may stand out
+    coarse_factor: Positive = 1.3  # over the quietest of them, up to which poses stand for the samples
+    line_chance: Share = 1e-6  # of white noise to show a line above the first, below which poses do not stand for the samples
 
 
 class SignalSettings(Settings, frozen=True):

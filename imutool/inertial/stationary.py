@@ -232,6 +232,28 @@ def nothing_but_noise(x: Float64[np.ndarray, " n"], least: float = 0.0) -> bool:
     return all(float(mean.std()) <= TOLERATED_MEAN * noise / np.sqrt(size) for mean, size in zip(means, sizes, strict=True))
 
 
+def is_white(
+    residual: Float64[np.ndarray, "n k"],
+    noise: Float64[np.ndarray, " k"],
+    least: Float64[np.ndarray, " k"],
+    bands: int,
+    factor: float,
+    chance: float,
+) -> bool:
+    """Whether a residual is white, without a line, and no louder than a noise where motion is.
+
+    A misfit of a motion is loud at low frequencies, or near Nyquist, where poses lose impacts.
+    """
+    from scipy.signal import periodogram
+
+    f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
+    parts, least = np.stack([part.mean(axis=0) for part in np.array_split(power[1:], bands)]), least**2
+    fast = power[f > 1.0 / bands]
+    line = len(fast) * np.exp(-fast.max(axis=0) / np.maximum(fast.mean(axis=0), least))
+    alike = (parts < factor**2 * np.maximum(parts.min(axis=0), least)).all()
+    return bool(alike and (parts[0] < factor**2 * np.maximum(noise**2, least)).all() and line.min() > chance)
+
+
 def _window_statistics(
     mean: Float64[np.ndarray, "m 3"], var: Float64[np.ndarray, "m 3"], width: int
 ) -> tuple[Float64[np.ndarray, " w"], Float64[np.ndarray, " w"], Float64[np.ndarray, "w 3"]]:

@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta
-from scipy.ndimage import binary_erosion, median_filter, uniform_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter, uniform_filter1d
 from scipy.signal import ShortTimeFFT
 from scipy.signal.windows import hann
 from scipy.stats import beta
@@ -54,6 +54,8 @@ def denoised(
     rate_hz: float,
     settings: WienerSettings | None = None,
     recorded: Float64[np.ndarray, "n r"] | None = None,
+    *,
+    of_poses: bool = False,
 ) -> tuple[Float64[np.ndarray, "n k"], NoiseLeft]:
     """Signals without noise, by a Wiener filter in short times, and the noise that is left.
 
@@ -62,7 +64,8 @@ def denoised(
     units of it, the eigenvectors of the cross-spectrum with hardly more than noise go: what a gyro shows of a motion helps an
     accelerometer that hardly shows it.
     What stays is multiplied by 1 - noise / power of its own time: one gain for all of it would leave noise at rest, and take
-    from the motion.
+    from the motion. Of a motion by poses (`of_poses`) nothing stays that is not shared: their errors are not
+    white, and those of rounding change with the position.
     """
     n, settings = len(x), settings or WienerSettings()
     line = _line(x)
@@ -72,7 +75,9 @@ def denoised(
     mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
     parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
     shared = None if recorded is None else _shared(x, recorded, stft, settings)
-    std, untold = _noise_std(parts, shared, settings)
+    if of_poses and shared is None:
+        return x, NoiseLeft(stft.f, np.zeros((len(stft.f), x.shape[1])))
+    std, untold = _noise_std(parts, shared, settings, white=not of_poses)
     std = std[:, None]
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
@@ -85,6 +90,8 @@ def denoised(
     around_each = (settings.short_time_parts, settings.short_time_parts, 1)
     here = uniform_filter(np.abs(parts) ** 2, around_each, mode="nearest")
     gain = np.where(here < MOSTLY * noise, 0.0, 1.0 - noise / np.maximum(here, 1e-300))
+    if of_poses and shared is not None:
+        gain *= ~_apart(shared, settings)[:, None]
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
     left = 2.0 * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0] / (rate_hz * float((stft.win**2).sum()))
     left = np.where(untold, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
@@ -108,26 +115,31 @@ def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Floa
 
 
 def _noise_std(
-    parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings
+    parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings, *, white: bool
 ) -> tuple[Float64[np.ndarray, "f k"], Bool[np.ndarray, " k"]]:
     """Noise of the parts by frequency, and the signals in which it cannot be told from the motion.
 
-    It is that of the frequencies that are not shared, and as white as the top where nothing is compared. Where almost all are
-    shared it cannot be told, and is next to nothing here: a filter takes none of it.
+    It is that of the frequencies that are not shared, and, if `white`, of the top where nothing is compared. Where almost all
+    are shared it cannot be told, and is next to nothing here: a filter takes none of it.
     """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
     out, untold = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1)), np.zeros(top.shape[2], bool)
-    apart = APART * settings.short_time_parts
     for k, column in enumerate(shared.T if shared is not None else ()):
-        own = np.flatnonzero(binary_erosion(~column, iterations=apart, border_value=True))
+        own = np.flatnonzero(_apart(column, settings))
         by_chance = settings.short_time_parts  # of frequencies whose means overlap
         if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
-        elif column.mean() > ALMOST_ALL:
-            out[:, k], untold[k] = NO_NOISE * power[:, k].max(), True
+        elif column.mean() > ALMOST_ALL or not white:
+            out[:, k], untold[k] = NO_NOISE * power[:, k].max(), white
     return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold
+
+
+def _apart(shared: Bool[np.ndarray, "f ..."], settings: WienerSettings) -> Bool[np.ndarray, "f ..."]:
+    """Frequencies away from those that are shared."""
+    near = maximum_filter1d(shared, 2 * APART * settings.short_time_parts + 1, axis=0, mode="nearest")
+    return np.asarray(~near)
 
 
 def _shared(

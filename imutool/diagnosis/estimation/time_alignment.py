@@ -1,9 +1,10 @@
 """Time alignment of a recording with a simulation or true poses: one clock, a row a sample.
 
 A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
-look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, without noise
-and with their derivatives. Else its samples go through a Wiener filter: what their own spectrum shows to be noise is taken
-away.
+look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, with their
+derivatives. But poses are rounded, which their second derivative shows as the square of the frequency. An effect that shrinks
+fast motion would take this error, so what no samples share is none. Else the samples go through a Wiener filter: what their
+own spectrum shows to be noise is taken away.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
-from scipy.signal import periodogram
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Bool, Float64
@@ -22,7 +22,7 @@ from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.inertial.correlation import cross_correlation
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
-from imutool.inertial.stationary import nothing_but_noise, white_noise
+from imutool.inertial.stationary import is_white, nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
@@ -173,8 +173,10 @@ def _simulated(
     ideal = _by_poses(sim, samples, noise, 1.0 / period_s, settings)
     if ideal is not None:
         t_s = seconds(sim.truth.t_ns[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
-        t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-        return replace(ideal, t_s=t_s, channels=_channels(real, t_ns)), np.zeros(6), None
+        ideal = replace(ideal, t_s=t_s, channels=_channels(real, start_ns + np.round(t_s * 1e9).astype(np.int64)))
+        witnesses = recorded_at(sim.imu, t_s, start_ns + nanoseconds(shift_s)), recorded_at(real.imu, t_s, start_ns)
+        ideal, left = _shared_motion(ideal, 1.0 / period_s, np.concatenate(witnesses, axis=1), settings.alignment)
+        return ideal, np.zeros(6), None if own_poses else left
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns)  # which does not share errors of poses either
@@ -200,25 +202,18 @@ def _by_poses(
     """
     if not sim.truths:
         return None
-    poses, own = sim.truth, settings.alignment
+    poses, own, t_ns = sim.truth, settings.alignment, sim.imu.t_ns
     holes = np.diff(poses.t_ns).max() > 1e9 * settings.split.gap_periods * poses.period_s
-    if holes or poses.period_s * own.poses_hz > 1.0:
+    rows = (t_ns >= poses.t_ns[0]) & (t_ns <= poses.t_ns[-1])
+    if holes or poses.period_s * own.poses_hz > 1.0 or rows.mean() < own.poses_share:
         return None
     trajectory = fit_trajectory(poses)  # a simulation's poses are exact, or the test below fails
-    t_ns = sim.imu.t_ns
-    rows = (t_ns >= poses.t_ns[0]) & (t_ns <= poses.t_ns[-1])
-    if rows.mean() < own.poses_share:
-        return None
     there = trajectory.at(t_ns[rows])
     residual = samples[rows] - np.concatenate([there.omega_b, there.specific_force()], axis=1)
     R_wb = rotation_matrices(there)
-    off = _gravity_error(R_wb, residual[:, 3:])
+    off = _gravity_error(R_wb, residual[:, 3:], settings.search.observable_squares)
     residual[:, 3:] -= np.einsum("nji,j->ni", R_wb, off)
-    residual = residual - residual.mean(axis=0)
-    size, least = own.coarse_samples, np.maximum(noise, LEAST_NOISE)
-    coarse = residual[: len(residual) // size * size].reshape(-1, size, 6).mean(axis=1)  # shows a misfit of motion
-    exact = (coarse.std(axis=0) < own.coarse_factor * least / np.sqrt(size)).all()
-    if not exact or _has_line(residual, 1.0 / size, own.line_chance):
+    if not is_white(residual - residual.mean(axis=0), noise, LEAST_NOISE, own.coarse_bands, own.coarse_factor, own.line_chance):
         return None
     t_ns = poses.t_ns[0] + np.arange(int(poses.duration_s * rate_hz) + 1) * round(1e9 / rate_hz)
     motion = trajectory.at(t_ns[t_ns <= poses.t_ns[-1]])
@@ -226,19 +221,28 @@ def _by_poses(
     return IdealMotion(t_s, motion.omega_b, motion.specific_force(g_w=G_W - off), motion.alpha_b, rotation_matrices(motion))
 
 
-def _gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], residual: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
-    """By how much a simulator's own specific force at rest differs, in the world, beside a constant of the body."""
-    few = slice(None, None, len(residual) // 20_000 + 1)
-    columns = np.concatenate([R_wb[few].transpose(0, 2, 1), np.broadcast_to(np.eye(3), (len(R_wb[few]), 3, 3))], axis=2)
-    return np.asarray(np.linalg.lstsq(columns.reshape(-1, 6), residual[few].ravel(), rcond=1e-6)[0][:3])
+def _shared_motion(
+    ideal: IdealMotion, rate_hz: float, witnesses: Float64[np.ndarray, "n r"], settings: AlignmentSettings
+) -> tuple[IdealMotion, NoiseLeft]:
+    """Motion of poses at the frequencies that an IMU shares, and the noise that is left in it."""
+    noisy = np.concatenate([ideal.gyro, ideal.accel], axis=1)
+    clean, left = denoised(noisy, rate_hz, settings, witnesses, of_poses=True)
+    alpha = ideal.alpha - np.asarray(make_interp_spline(ideal.t_s, noisy[:, :3] - clean[:, :3], k=5)(ideal.t_s, 1))
+    return replace(ideal, gyro=clean[:, :3], accel=clean[:, 3:], alpha=alpha), left
 
 
-def _has_line(residual: Float64[np.ndarray, "n 6"], above: float, chance: float) -> bool:
-    """Whether one frequency (Nyquist: 1) stands out of white noise, as a simulated vibration does."""
-    f, power = periodogram(residual, fs=2.0, axis=0)  # white noise has its variance at each frequency
-    band = power[f > above]
-    floor = np.maximum(band.mean(axis=0), LEAST_NOISE**2)
-    return bool(band.size and (len(band) * np.exp(-band.max(axis=0) / floor)).min() < chance)
+def _gravity_error(R_wb: Float64[np.ndarray, "n 3 3"], y: Float64[np.ndarray, "n 3"], least: float) -> Float64[np.ndarray, "3"]:
+    """By how much a simulator's own gravity differs, beside a constant of the body; zero if it gains fewer squares of noise."""
+    R_wb, y = (x[:: len(y) // 20_000 + 1] for x in (R_wb, y))
+    columns = np.concatenate([R_wb.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R_wb.shape)], axis=2)
+    found = np.asarray(np.linalg.lstsq(columns.reshape(-1, 6), y.ravel(), rcond=1e-6)[0])
+    without, left = y.var(axis=0).mean(), np.square(y - columns @ found).mean()
+    return found[:3] if (without - left) * y.size > least * left else np.zeros(3)
+
+
+def rotation_matrices(poses: Poses | Motion) -> Float64[np.ndarray, "n 3 3"]:
+    """R_wb of some poses."""
+    return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
 
 
 def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 3 3"] | None:
@@ -246,11 +250,6 @@ def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 
         return None
     poses, known = recording.truth.at(t_ns, max_gap_s=1.0)
     return rotation_matrices(poses) if known.mean() > 0.9 else None
-
-
-def rotation_matrices(poses: Poses | Motion) -> Float64[np.ndarray, "n 3 3"]:
-    """R_wb of some poses."""
-    return np.asarray(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix())
 
 
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
