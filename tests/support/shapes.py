@@ -2,8 +2,7 @@
 
 jaxtyping and beartype check every call, at 0.1 to 0.3 ms each: two thirds of the time of the tests of `diagnose`.
 What they check depends on types, dtypes and shapes alone, so a combination that has passed passes again.
-A function without an array or a Literal in its annotations is left as it is: mypy checks all other types. One whose
-calls have brought nothing new for long is looked at every few calls: looking costs more than most functions.
+A function without an array or a Literal in its annotations is left as it is: mypy checks all other types.
 """
 
 from __future__ import annotations
@@ -21,8 +20,6 @@ from typing import Any
 import jaxtyping
 import numpy as np
 
-SETTLED, SELDOM = 64, 8
-"""Calls in a row without a new combination, after which every eighth is looked at, until one is new."""
 LONGEST = 16
 """Longest tuple or list whose elements are all looked at; of a longer one its length and first elements."""
 _CHECK_EACH_CALL: Any = jaxtyping.jaxtyped
@@ -66,21 +63,15 @@ def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[
     check = functools.cache(functools.partial(_CHECK_EACH_CALL, typechecker=typechecker))
     results: list[Any] = []
     give_result = _with_signature(lambda *_, **__: results.pop(), function)
-    since_new = 0
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        nonlocal since_new
-        since_new += 1
-        if since_new > SETTLED and since_new % SELDOM:
-            return function(*args, **kwargs)
         called: Hashable = _combinations(args)
         if kwargs:
             called = called, *kwargs, _combinations(kwargs.values())
         returned = passed.get(called)
         if returned is None:
-            since_new = 0
             result = check(function)(*args, **kwargs)
             passed[called] = {_combination(result)}
             return result
@@ -89,7 +80,6 @@ def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[
             results.append(result)
             check(give_result)(*args, **kwargs)
             returned.add(combination)
-            since_new = 0
         return result
 
     return checked
