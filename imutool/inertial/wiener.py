@@ -158,8 +158,8 @@ def _shared(
     if independent <= 2 * r:
         return None
     power = uniform_filter1d(np.einsum("fti,ftj->fij", parts, parts.conj()), around, axis=0, mode="nearest")
-    own = np.maximum(np.abs(np.diagonal(power, axis1=1, axis2=2)), 1e-300)
-    power /= np.sqrt(own[:, :, None] * own[:, None, :])
+    size = np.sqrt(np.maximum(np.abs(np.diagonal(power, axis1=1, axis2=2)), 1e-300))  # of an axis that is stuck nothing
+    power /= size[:, :, None] * size[:, None, :]
     of_recorded, cross = power[:, :r, :r] + 1e-9 * np.eye(r), power[:, :r, r:]
     coherence = np.einsum("frk,frk->fk", cross.conj(), np.linalg.solve(of_recorded, cross)).real
     return np.asarray(coherence > beta.isf(CHANCE, r, independent - r))

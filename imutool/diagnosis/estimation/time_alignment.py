@@ -137,6 +137,7 @@ def _pair(
         usable & held_out,
         ideal=replace(ideal, gyro=gyro, accel=accel, alpha=alpha),
         truth=truth,
+        poses_hz=1.0 / real.truth.period_s if truth is not None else 0.0,
         aligned_s=aligned_s,
         band_hz=band_hz,
         start_ns=int(t_ns[0]),
