@@ -22,10 +22,10 @@ from imutool.diagnosis.result import Curve, Estimate, Finding
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.sensor import catalogue
 
-ALIKE_STD = (
-    4.5  # joint deviations: 0.5 % for the largest of nine numbers by Student's t of ten blocks; further apart are two values,
+ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t of ten blocks, the largest of nine numbers)
+ALIKE_SHARE = (
+    0.03  # of the largest number: smoothed poses lack a per cent of either motion. Alike is what is within one of both
 )
-ALIKE_SHARE = 0.03  # unless they are within this of the largest: smoothed poses lack a per cent of either motion
 CONTRADICTS = 0.15  # of what own numbers leave of a log and of what they explain; logs of one real unit miss both by up to 0.04
 READING = {"gyro": "omega", "accel": "f"}  # what a sensor reads, as equations write it
 OF_READING = (  # or of its rest, where rounding errs by a constant

@@ -282,7 +282,7 @@ def _curve(selected: SelectedEffect, fitted: Fit) -> Curve | None:
 def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
     """Remark that nothing moves, where not even a clock offset could be seen."""
     if "clock_offset" in hidden:
-        names = ", ".join({pair.name: None for pair in pairs})
+        names = ", ".join(dict.fromkeys(pair.name for pair in pairs))
         yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
 
 

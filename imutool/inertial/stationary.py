@@ -240,9 +240,10 @@ def is_white(
     factor: float,
     chance: float,
 ) -> bool:
-    """Whether a residual is white, without a line, and no louder than a noise where motion is.
+    """Whether a residual is white, without a line, and as quiet as a noise where it is slowest.
 
-    A misfit of a motion is loud at low frequencies, or near Nyquist, where poses lose impacts.
+    White is what has as much power in each of so many bands as in the quietest, up to a factor of its size. A misfit of a
+    motion is loud at low frequencies, or near Nyquist, where poses lose impacts. Less than `least` is no misfit.
     """
     from scipy.signal import periodogram
 

@@ -160,10 +160,9 @@ def smooth_motion(poses: Poses, *, robust: bool = True) -> SmoothMotion:
 
 
 class _Last:
-    motions: ClassVar[tuple[Poses | None, dict[bool, SmoothMotion]]] = (
-        None,
-        {},
-    )  # second simulation and audit ask for the same
+    """The last poses, and their motions by `robust`: the second simulation and the audit ask for the same."""
+
+    motions: ClassVar[tuple[Poses | None, dict[bool, SmoothMotion]]] = (None, {})
 
 
 def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
@@ -205,7 +204,7 @@ def _unbroken(t_s: Times) -> list[tuple[int, int]]:
 
 
 def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
-    """Robust fit, in which glitches count little and gross ones not at all, or a plain one in one pass; its last weights.
+    """Robust fit, in which glitches count little and gross ones not at all; its last weights. One pass is a plain fit.
 
     Weights 1 / (1 + (r / 3 sigma)²), those of heavy tails, so that a fit with a few wild samples still converges.
     """
@@ -215,7 +214,8 @@ def _fitted(t_s: Times, y: Values, passes: int) -> tuple[Penalised, Times]:
     near_hz = None
     for index in range(passes):
         samples = Samples(t_s, y, weights, knot_s)
-        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if index == 0 < passes - 1 else None, near_hz)
+        is_first_of_several = index == 0 and passes > 1
+        fit = samples.fit(min(FIRST_CUTOFF_HZ, samples.highest_hz) if is_first_of_several else None, near_hz)
         near_hz = fit.cutoff_hz if index else None
         size = np.linalg.norm(fit.residual(), axis=1)
         local = percentile_filter(size, USUAL_PERCENTILE, window, mode="nearest")

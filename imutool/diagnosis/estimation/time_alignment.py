@@ -2,9 +2,9 @@
 
 A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
 look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, with their
-derivatives. But poses are rounded, which their second derivative shows as the square of the frequency. An effect that shrinks
-fast motion would take this error, so what no samples share is none. Else the samples go through a Wiener filter: what their
-own spectrum shows to be noise is taken away.
+derivatives. But poses are rounded. In their second derivative this error grows with the square of the frequency, and an effect
+that shrinks fast motion would remove it. So what neither IMU shares with the poses does not count as motion. If the poses do
+not explain the samples, a Wiener filter takes away what the samples' own spectrum shows to be noise.
 """
 
 from __future__ import annotations

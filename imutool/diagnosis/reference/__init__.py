@@ -1,1 +1,1 @@
-"""References of a recording that are its own: true poses."""
+"""References: own poses, and simulations in other units or of another motion."""

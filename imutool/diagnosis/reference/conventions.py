@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
 
-EXPLAINED = 0.03  # of the squares, that the right convention leaves: a mount that is turned by more than 10 degrees has its own
+EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless the mount is turned by 10 degrees besides
 Readings = Float64[np.ndarray, "n 3"]
 
 

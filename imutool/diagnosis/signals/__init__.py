@@ -27,10 +27,11 @@ ONE_CLOCK = "The motion of the IMU puts both logs on one clock, so a delay of an
 
 
 def check_signals(named: Sequence[str], reals: Sequence[Location], sim: Location | None) -> None:
-    """Refuse signals without a simulation, and names that a log lacks, before the search.
+    """Refuse wrong signals before the search.
 
     Raises:
-        ConfigError, LogError: as said.
+        ConfigError: they need one recording and its simulation.
+        LogError: a log has no such field.
     """
     if named and (sim is None or len(reals) != 1):
         raise ConfigError("`signals` compare one recording with its simulation", where="signals", fix="Give one log and `sim`")

@@ -209,7 +209,7 @@ def _inked(colors: Mapping[str, str], salt: str) -> Iterator[None]:
 
 
 def _content(figure: Any, **saving: Any) -> bytes:
-    """Content of the file of a figure."""
+    """A figure as the bytes of a file."""
     _lay_out(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, **saving)
