@@ -19,6 +19,7 @@ from imutool.units import ASCII_UNITS
 
 SCHEMA = "imutool.diagnosis/1"
 LEAST_MISFIT = 0.1  # of the noise's power: with less misfit than that, a share of it means nothing
+CONVENTIONS = frozenset({"wrong_unit", "permuted_axes", "left_handed"})  # effects that are no physics
 
 Kind = Literal["catalogue", "driven", "unknown"]
 Extent = Literal["regime", "everywhere", "intermittent"]

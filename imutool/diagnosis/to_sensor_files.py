@@ -14,14 +14,13 @@ from typing import Literal
 import numpy as np
 
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.result import Diagnosis, Estimate, Finding
+from imutool.diagnosis.result import CONVENTIONS, Diagnosis, Estimate, Finding
 from imutool.noise.colour import measured
 from imutool.noise.datasheet import Noise
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
-CONVENTIONS = frozenset({"wrong_unit", "permuted_axes", "left_handed"})
 NO_EFFECT = CONVENTIONS | {"dropped_samples", "timestamp_jitter", "reference_error", "reference_smoothing"}
 
 

@@ -67,7 +67,8 @@ def _findings(before: Sequence[Pair], after: Sequence[Pair], changes: dict[Senso
     for sensor, (factor, _) in changes.items():
         if factor != 1.0:
             scale = {"scale": Estimate(1.0 / factor, 0.0, "-")}
-            found.append(_finding("wrong_unit", sensor, sensor, scale, "accel = x / 9.80665, gyro = 180 / pi x", before, after))
+            text = f"{sensor} = {1.0 / factor:.6g} {sensor} of the simulation"
+            found.append(_finding("wrong_unit", sensor, sensor, scale, text, before, after))
     turned = {sensor: P for sensor, (_, P) in changes.items() if not np.array_equal(P, np.eye(3))}
     alike = len({P.tobytes() for P in turned.values()}) == 1 and len(turned) == len(SENSORS)
     for sensor, P in turned.items():

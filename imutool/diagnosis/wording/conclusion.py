@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 
-from imutool.diagnosis.result import Closer, Diagnosis, HeldOut, Located, Unexplained
+from imutool.diagnosis.result import CONVENTIONS, Closer, Diagnosis, HeldOut, Located, Unexplained
 from imutool.diagnosis.wording.effect_sentences import has_gain, label, named_sentence, parameters_text, reference, signals
 from imutool.diagnosis.wording.quantity import percent, symbol
 from imutool.units import UNITS
@@ -197,7 +197,9 @@ def _all_findings(d: Diagnosis) -> str:
         for signal, closer in d.closer.items()
         if signal in touched and closer.share is not None and closer.share > 0.0
     ]
-    return f"{text}; together they remove {' and '.join(gains)}" if gains else text
+    of_convention = any(finding.effect in CONVENTIONS for finding in d.findings)
+    who = "in the units and axes of the simulation the others remove" if of_convention else "together they remove"
+    return f"{text}; {who} {' and '.join(gains)}" if gains else text
 
 
 def _unnamed_place(d: Diagnosis) -> str:

@@ -165,6 +165,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "reference_error": _reference_error,
     "reference_smoothing": "the true poses are smoothed, and slower than the body, by {w.main.labelled}",
     "wrong_unit": _wrong_unit,
+    "left_handed": "its axes are those of the other hand: {w.finding.equation}",
+    "permuted_axes": "its axes are in another order: {w.finding.equation}",
     "gain": "its gain is {w.main} of that of {w.other}",
     "offset": "{w.it} reads a constant {w.main} too much",
     "delay": _delay,
@@ -215,7 +217,8 @@ def effect_sentence(d: Diagnosis, finding: Finding) -> str:
     main = quantities[0] if quantities else Quantity("", (), ())
     words = Words(_pronoun(finding.signal), reference(d), main, tuple(quantities[1:]), finding)
     template = SENTENCES.get(finding.effect)
-    if template is None or not (quantities or (finding.curve is not None and callable(template))):
+    needs_quantity = finding.curve is None if callable(template) else "{w.main" in (template or "")
+    if template is None or (needs_quantity and not quantities):
         text = f"{words.it} shows {finding.effect}, {finding.equation}"
         text += f", {main.labelled}" if quantities else ""
     else:

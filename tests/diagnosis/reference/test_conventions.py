@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support import planted
+from support import diagnoses, planted
 from support.diagnoses import replace
 
 from imutool.diagnosis.audit.motion import OTHER_UNIT
 from imutool.diagnosis.reference.conventions import with_common_conventions
+from imutool.diagnosis.result import CONVENTIONS, Closer
+from imutool.diagnosis.wording.conclusion import conclusion
 from imutool.diagnosis.wording.effect_sentences import SENTENCES
 
 SWAPPED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -41,7 +43,8 @@ def test_a_convention_is_named_and_undone(pair, gyro: np.ndarray, accel: np.ndar
     assert [(one.effect, one.signal) for one in found] == named
     assert after.real == pytest.approx(pair.real if named else read)
     for one in found:
-        assert one.effect != "wrong_unit" or callable(SENTENCES[one.effect])
+        assert one.effect in SENTENCES
+        assert one.effect in CONVENTIONS
         assert one.share > 0.9
 
 
@@ -49,3 +52,14 @@ def test_axes_that_the_motion_does_not_tell_apart_stay() -> None:
     flat = planted.pair(planted.planar(SECONDS))
     swapped = np.concatenate([flat.real[:, :3] @ SWAPPED.T, flat.real[:, 3:]], axis=1)
     assert with_common_conventions([replace(flat, real=swapped)])[1] == []
+
+
+def test_the_conclusion_does_not_count_a_convention_among_what_the_others_remove(pair) -> None:
+    read = np.concatenate([pair.real[:, :3] @ SWAPPED.T, pair.real[:, 3:] @ SWAPPED.T], axis=1)
+    _, (axes,) = with_common_conventions([replace(pair, real=read)])
+    (arm,) = diagnoses.ARM.findings
+    closer = {"accel": Closer.computed(arm.held_out, 0.001)}
+    said = conclusion(replace(diagnoses.ARM, findings=(axes, arm), closer=closer))
+    assert "in the units and axes of the simulation the others remove" in said
+    alone = conclusion(replace(diagnoses.ARM, findings=(axes,)))
+    assert "its axes are those of the other hand: recorded x, y, z = y, x, z of the simulation (left_handed)" in alone
