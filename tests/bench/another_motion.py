@@ -37,8 +37,8 @@ Curve = Callable[[Times], Times]
 class Motion(NamedTuple):
     """Yaw, pitch, roll in rad, and position in m."""
 
-    angles: tuple[Curve, Curve, Curve]
-    position: tuple[Curve, Curve, Curve]
+    angles: tuple[Curve, ...]
+    position: tuple[Curve, ...]
 
 
 class Device(NamedTuple):
@@ -80,16 +80,16 @@ def sines(rng: Generator, slowest_hz: float, fastest_hz: float, count: int, size
     return lambda t: np.asarray(np.sin(2.0 * np.pi * np.outer(t, f_hz) + phase) @ a)
 
 
-def gait(rng: Generator, beat: Curve, multiple: float, size: float) -> Curve:
-    """One harmonic of a step whose phase wanders."""
-    begins = rng.uniform(0.0, 2.0 * np.pi)
-    return lambda t: size * np.cos(multiple * beat(t) + begins)
-
-
 def steps(rng: Generator, rate_hz: float, wander: float) -> Curve:
     """Phase of a gait."""
     wanders = sines(rng, 0.05, 0.5, 6, wander)
     return lambda t: 2.0 * np.pi * (rate_hz * t + wanders(t))
+
+
+def harmonic(rng: Generator, beat: Curve, multiple: float, size: float) -> Curve:
+    """One harmonic of a gait."""
+    begins = rng.uniform(0.0, 2.0 * np.pi)
+    return lambda t: size * np.cos(multiple * beat(t) + begins)
 
 
 def impacts(rng: Generator, times_s: Times, width_s: float, size: float) -> Curve:
@@ -124,89 +124,85 @@ def added(*curves: Curve) -> Curve:
     return lambda t: np.sum([curve(t) for curve in curves], axis=0)
 
 
-def motion(kind: str, rng: Generator, duration_s: float) -> Motion:
-    """A motion of a kind of body."""
+class Channel(NamedTuple):
+    """One of yaw, pitch, roll (rad), x, y, z (m) of a body: sines, harmonics of its gait, and what an impact does."""
 
-    def s(slowest_hz: float, fastest_hz: float, count: int, size: float) -> Curve:
-        return sines(rng, slowest_hz, fastest_hz, count, size)
-
-    if kind == "quadruped":
-        beat = steps(rng, rate_hz := rng.uniform(1.6, 2.6), 0.06)
-        ticks, t = np.arange(1, int(2.0 * rate_hz * duration_s) - 2), np.arange(0.0, duration_s, 1e-3)
-        strikes_s = np.interp(ticks + rng.normal(0.0, 0.01, len(ticks)), beat(t) / np.pi, t)
-
-        def g(multiple: float, size: float) -> Curve:
-            return gait(rng, beat, multiple, size)
-
-        def hit(size: float, width_s: float) -> Curve:
-            return impacts(rng, strikes_s, width_s, size)
-
-        return Motion(
-            (
-                added(s(0.02, 0.25, 8, 0.8), g(1, 0.02), hit(1e-3, 9e-3)),
-                added(s(0.05, 0.6, 6, 0.04), g(2, 0.02), g(1, 0.008), hit(2e-3, 9e-3)),
-                added(s(0.05, 0.6, 6, 0.03), g(1, 0.03), g(3, 0.006), hit(3e-3, 9e-3)),
-            ),
-            (
-                added(s(0.02, 0.3, 8, 1.5), g(2, 0.006), hit(1.2e-4, 8e-3)),
-                added(s(0.02, 0.3, 8, 1.0), g(1, 0.008), hit(1.2e-4, 8e-3)),
-                added(s(0.05, 0.3, 5, 0.02), g(2, 0.012), g(4, 0.002), hit(4e-4, 8e-3)),
-            ),
-        )
-    if kind == "head":
-        beat = steps(rng, rng.uniform(1.6, 2.1), 0.1)
-
-        def nod(multiple: float, size: float) -> Curve:
-            return gait(rng, beat, multiple, size)
-
-        return Motion(
-            (
-                added(s(0.05, 1.2, 14, 0.6), nod(0.5, 0.02)),
-                added(s(0.05, 1.5, 12, 0.15), nod(1, 0.015)),
-                added(s(0.05, 1.5, 12, 0.08), nod(0.5, 0.015)),
-            ),
-            (
-                added(s(0.02, 0.3, 8, 2.0), nod(1, 0.01)),
-                added(s(0.02, 0.3, 8, 2.0), nod(0.5, 0.02)),
-                added(s(0.05, 0.5, 6, 0.03), nod(1, 0.025), nod(2, 0.004)),
-            ),
-        )
-    if kind == "arm":
-        turns, ways = ([moves(rng, duration_s, size) for size in sizes] for sizes in ((0.5, 0.3, 0.4), (0.2, 0.2, 0.15)))
-        return Motion((turns[0], turns[1], turns[2]), (ways[0], ways[1], ways[2]))
-    yaw, pitch, roll, x, y, z = (s(*words) for words in SINES[kind])
-    return Motion((yaw, pitch, roll), (x, y, z))
+    slowest_hz: float
+    fastest_hz: float
+    count: int
+    rms: float
+    harmonics: tuple[tuple[float, float], ...] = ()  # multiple of the gait's rate, and size
+    impact: tuple[float, float] = (0.0, 0.0)  # width in s, and size
 
 
-# slowest and fastest frequency (Hz), number and RMS of the sines of yaw, pitch, roll (rad) and x, y, z (m)
-SINES: dict[str, tuple[tuple[float, float, int, float], ...]] = {
+BODIES: dict[str, tuple[Channel, ...]] = {
     "boat": (
-        (0.01, 0.12, 8, 0.6), (0.08, 0.35, 14, 0.07), (0.1, 0.5, 14, 0.12),
-        (0.01, 0.3, 10, 3.0), (0.01, 0.3, 10, 2.0), (0.08, 0.4, 14, 0.45),
+        Channel(0.01, 0.12, 8, 0.6), Channel(0.08, 0.35, 14, 0.07), Channel(0.1, 0.5, 14, 0.12),
+        Channel(0.01, 0.3, 10, 3.0), Channel(0.01, 0.3, 10, 2.0), Channel(0.08, 0.4, 14, 0.45),
     ),
     "underwater": (
-        (0.01, 0.15, 8, 0.9), (0.01, 0.2, 8, 0.12), (0.02, 0.3, 8, 0.06),
-        (0.01, 0.15, 8, 2.0), (0.01, 0.15, 8, 1.5), (0.01, 0.15, 8, 0.8),
+        Channel(0.01, 0.15, 8, 0.9), Channel(0.01, 0.2, 8, 0.12), Channel(0.02, 0.3, 8, 0.06),
+        Channel(0.01, 0.15, 8, 2.0), Channel(0.01, 0.15, 8, 1.5), Channel(0.01, 0.15, 8, 0.8),
     ),
     "quadrotor": (
-        (0.05, 0.8, 10, 1.0), (0.1, 2.5, 18, 0.2), (0.1, 2.5, 18, 0.2),
-        (0.05, 0.8, 14, 1.2), (0.05, 0.8, 14, 1.2), (0.05, 0.9, 14, 0.5),
+        Channel(0.05, 0.8, 10, 1.0), Channel(0.1, 2.5, 18, 0.2), Channel(0.1, 2.5, 18, 0.2),
+        Channel(0.05, 0.8, 14, 1.2), Channel(0.05, 0.8, 14, 1.2), Channel(0.05, 0.9, 14, 0.5),
     ),
     "car": (
-        (0.01, 0.25, 10, 1.2), (0.1, 2.5, 14, 0.012), (0.1, 2.5, 14, 0.02),
-        (0.01, 0.1, 8, 40.0), (0.01, 0.1, 8, 40.0), (0.3, 8.0, 20, 0.01),
+        Channel(0.01, 0.25, 10, 1.2), Channel(0.1, 2.5, 14, 0.012), Channel(0.1, 2.5, 14, 0.02),
+        Channel(0.01, 0.1, 8, 40.0), Channel(0.01, 0.1, 8, 40.0), Channel(0.3, 8.0, 20, 0.01),
     ),
     "handheld": (
-        (0.1, 2.0, 16, 0.7), (0.1, 3.0, 16, 0.4), (0.1, 3.0, 16, 0.4),
-        (0.1, 2.5, 16, 0.3), (0.1, 2.5, 16, 0.3), (0.1, 2.5, 16, 0.2),
+        Channel(0.1, 2.0, 16, 0.7), Channel(0.1, 3.0, 16, 0.4), Channel(0.1, 3.0, 16, 0.4),
+        Channel(0.1, 2.5, 16, 0.3), Channel(0.1, 2.5, 16, 0.3), Channel(0.1, 2.5, 16, 0.2),
     ),
     "train": (
-        (0.005, 0.08, 6, 0.5), (0.01, 1.2, 10, 0.006), (0.2, 1.8, 12, 0.012),
-        (0.005, 0.05, 5, 150.0), (0.005, 0.05, 5, 150.0), (0.5, 6.0, 16, 0.004),
+        Channel(0.005, 0.08, 6, 0.5), Channel(0.01, 1.2, 10, 0.006), Channel(0.2, 1.8, 12, 0.012),
+        Channel(0.005, 0.05, 5, 150.0), Channel(0.005, 0.05, 5, 150.0), Channel(0.5, 6.0, 16, 0.004),
+    ),
+    "quadruped": (
+        Channel(0.02, 0.25, 8, 0.8, ((1, 0.02),), (9e-3, 1e-3)),
+        Channel(0.05, 0.6, 6, 0.04, ((2, 0.02), (1, 0.008)), (9e-3, 2e-3)),
+        Channel(0.05, 0.6, 6, 0.03, ((1, 0.03), (3, 0.006)), (9e-3, 3e-3)),
+        Channel(0.02, 0.3, 8, 1.5, ((2, 0.006),), (8e-3, 1.2e-4)),
+        Channel(0.02, 0.3, 8, 1.0, ((1, 0.008),), (8e-3, 1.2e-4)),
+        Channel(0.05, 0.3, 5, 0.02, ((2, 0.012), (4, 0.002)), (8e-3, 4e-4)),
+    ),
+    "head": (
+        Channel(0.05, 1.2, 14, 0.6, ((0.5, 0.02),)),
+        Channel(0.05, 1.5, 12, 0.15, ((1, 0.015),)),
+        Channel(0.05, 1.5, 12, 0.08, ((0.5, 0.015),)),
+        Channel(0.02, 0.3, 8, 2.0, ((1, 0.01),)),
+        Channel(0.02, 0.3, 8, 2.0, ((0.5, 0.02),)),
+        Channel(0.05, 0.5, 6, 0.03, ((1, 0.025), (2, 0.004))),
     ),
 }  # fmt: skip
-KINDS = (*SINES, "quadruped", "head", "arm")
+GAITS = {"quadruped": (1.6, 2.6, 0.06), "head": (1.6, 2.1, 0.1)}  # slowest and fastest rate (Hz), and how far its phase wanders
+MOVES = (0.5, 0.3, 0.4, 0.2, 0.2, 0.15)  # size of an arm's, in the channels
+KINDS = (*BODIES, "arm")
 FILTERS_HZ = {"boat": (5.0, 10.0, 20.0), "underwater": (20.0, 40.0, 80.0)}  # of these bodies always, of others at times
+
+
+def motion(kind: str, rng: Generator, duration_s: float) -> Motion:
+    """A motion of a kind of body."""
+    if kind == "arm":
+        curves = [moves(rng, duration_s, size) for size in MOVES]
+        return Motion(tuple(curves[:3]), tuple(curves[3:]))
+    beat: Curve = np.zeros_like  # without a gait
+    strikes_s = np.zeros(0)
+    if kind in GAITS:
+        slowest_hz, fastest_hz, wander = GAITS[kind]
+        beat = steps(rng, rate_hz := rng.uniform(slowest_hz, fastest_hz), wander)
+        if any(channel.impact[1] for channel in BODIES[kind]):
+            ticks, t = np.arange(1, int(2.0 * rate_hz * duration_s) - 2), np.arange(0.0, duration_s, 1e-3)
+            strikes_s = np.interp(ticks + rng.normal(0.0, 0.01, len(ticks)), beat(t) / np.pi, t)
+    curves = []
+    for channel in BODIES[kind]:
+        parts = [sines(rng, channel.slowest_hz, channel.fastest_hz, channel.count, channel.rms)]
+        parts += [harmonic(rng, beat, multiple, size) for multiple, size in channel.harmonics]
+        parts.append(impacts(rng, strikes_s, *channel.impact))
+        curves.append(added(*parts))
+    return Motion(tuple(curves[:3]), tuple(curves[3:]))
 
 
 # ── readings ─────────────────────────────────────────────────────────────────────────────────────────────────────────
