@@ -32,7 +32,7 @@ from imutool.diagnosis.held_out import resimulate
 from imutool.diagnosis.imu_relation import imu_relation, imu_sentence
 from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.reference.conventions import with_common_conventions
-from imutool.diagnosis.reference_coverage import (
+from imutool.diagnosis.reference.coverage import (
     align,
     align_all,
     check_without_reference,
@@ -43,7 +43,7 @@ from imutool.diagnosis.reference_coverage import (
     without_unseen_offset,
     without_unusable,
 )
-from imutool.diagnosis.reference_errors import SMOOTHED, reference_caveat, reference_errors, turned_reference
+from imutool.diagnosis.reference.errors import SMOOTHED, reference_caveat, reference_errors, turned_reference
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.signals import check_signals, with_signals

@@ -30,8 +30,8 @@ from imutool.diagnosis.held_out import (
     with_effects,
 )
 from imutool.diagnosis.localization import locate_findings, locate_residual
+from imutool.diagnosis.reference.coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.reference.own_poses import is_in_raw_poses
-from imutool.diagnosis.reference_coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file

@@ -46,8 +46,8 @@ from imutool.diagnosis.diagnose import EVERY_UNIT, candidates_for, effect_sizes
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.held_out import gains, with_constant
-from imutool.diagnosis.reference_coverage import align, without_unusable
-from imutool.diagnosis.reference_errors import SMOOTHED
+from imutool.diagnosis.reference.coverage import align, without_unusable
+from imutool.diagnosis.reference.errors import SMOOTHED
 from imutool.diagnosis.result import Closer
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.errors import ImutoolError

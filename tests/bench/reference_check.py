@@ -32,7 +32,7 @@ from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.time_alignment import with_truth
-from imutool.diagnosis.reference_coverage import align, without_unusable
+from imutool.diagnosis.reference.coverage import align, without_unusable
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.read import read
 from imutool.recording import Recording

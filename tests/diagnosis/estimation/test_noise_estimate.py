@@ -15,7 +15,7 @@ from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import known_band_hz, noise_std, whitened
 from imutool.diagnosis.estimation.whitening import WhitenedImu
-from imutool.diagnosis.reference_errors import SMOOTHED
+from imutool.diagnosis.reference.errors import SMOOTHED
 from imutool.diagnosis.settings import BandSettings
 from imutool.errors import DataError
 from imutool.inertial.wiener import wiener_filter

@@ -14,8 +14,8 @@ from support import planted
 from imutool.diagnosis.diagnose import candidates_for
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.reference_coverage import align
-from imutool.diagnosis.reference_errors import SMOOTHED, turned_reference
+from imutool.diagnosis.reference.coverage import align
+from imutool.diagnosis.reference.errors import SMOOTHED, turned_reference
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.summarize import vibration_above_band

@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
-from imutool.diagnosis.reference_coverage import align, align_all
+from imutool.diagnosis.reference.coverage import align, align_all
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
