@@ -21,7 +21,7 @@ from imutool.training.run import train
 from imutool.training.settings import TrainSettings, settings_of
 from imutool.training.training_windows import Pool
 
-TRAINING_S, TEST_S = (60.0, 60.0, 60.0, 60.0), (90.0,)
+TRAINING_S, TEST_S, LAG_S = (40.0, 40.0, 40.0, 40.0), (60.0,), 10.0
 ALONE = ("model.remainder=false", 'model.accel_effects=["accel_misalignment","accel_scale"]')  # no network, gyro chosen
 FEW = ("steps=1", "samples=500", "gyro_window_s=[1.0]", "accel_window_s=[0.5]")
 BETTER = 4.0  # tests/bench/drift.py has more kinds and logs: five to twelve there
@@ -33,7 +33,7 @@ def saved(folder: Path, kind: Kind, first: int, durations_s: tuple[float, ...], 
     paths = [folder / f"{seed}.mcap" for seed in range(first, first + len(durations_s))]
     for k, (path, duration_s) in enumerate(zip(paths, durations_s, strict=True)):
         before_s = on_s[k] if on_s else 0.0
-        whole = log(first + k, Drifting(kind=kind, rate_hz=50.0, lag_s=15.0), before_s + duration_s)
+        whole = log(first + k, Drifting(kind=kind, rate_hz=50.0, lag_s=LAG_S), before_s + duration_s)
         write(whole.between(int(whole.imu.t_ns[0] + 1e9 * before_s), int(whole.imu.t_ns[-1])), path)
     return paths
 
@@ -70,7 +70,7 @@ def test_no_drift_is_found_where_there_is_none(tmp_path: Path) -> None:
 
 def test_training_logs_tell_how_long_their_sensor_was_on(tmp_path: Path) -> None:
     """What is learned from logs that begin warm, each by another time, holds for a cold sensor."""
-    logs = saved(tmp_path, "warm_up", 0, TRAINING_S, on_s=(0.0, 10.0, 20.0, 100.0))
+    logs = saved(tmp_path, "warm_up", 0, TRAINING_S, on_s=(0.0, 7.0, 14.0, 70.0))
     trained(tmp_path, logs, "linear")
     model = trained(tmp_path, logs, "hybrid", *ALONE)
     assert isinstance(model.config, Config)
@@ -102,7 +102,7 @@ def test_the_neural_ode_has_the_states_of_the_load(tmp_path: Path, loaded: tuple
 
 def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path, one_start: None) -> None:
     """Logs that are left out decide that the drift stays, and the files of both methods have it."""
-    logs = saved(tmp_path, "ambient", 0, TRAINING_S)
+    logs = saved(tmp_path, "ambient", 0, (55.0,) * 4)  # its steps are rarer than changes of the load
     hybrid = trained(tmp_path, logs, "hybrid", *ALONE, "compare=true")
     ode = trained(tmp_path, logs, "neural_ode", *FEW)
     assert isinstance(hybrid.config, Config)
@@ -113,7 +113,7 @@ def test_a_bias_follows_the_temperature_of_its_log(tmp_path: Path, one_start: No
     scores = hybrid.card["left_out"]["scores"]
     effects, linear = (np.mean([s["aoe_deg"] for s in scores if s["model"] == name]) for name in ("effects", "linear"))
     assert effects < 0.5 * linear
-    (test,) = saved(tmp_path, "ambient", 50, (60.0,))
+    (test,) = saved(tmp_path, "ambient", 50, TEST_S)
     models = ["static", *(str(tmp_path / f"{method}.safetensors") for method in ("hybrid", "neural_ode"))]
     _, static, *learnt = (result["aoe_deg"] for result in evaluate(test, models=models, init="truth"))
     assert BETTER * max(learnt) < static
