@@ -2,7 +2,7 @@
 
 jaxtyping and beartype check every call, at 0.1 to 0.3 ms each: two thirds of the time of the tests of `diagnose`.
 What they check depends on types, dtypes and shapes alone, so a combination that has passed passes again.
-A function without an array or a Literal in its annotations is left as it is: mypy checks all other types.
+Only parameters and results whose annotation names an array or a Literal are looked at: mypy checks all other types.
 """
 
 from __future__ import annotations
@@ -39,18 +39,17 @@ def _check_new_combinations(checked: Any = None, *, typechecker: Any) -> Any:
     if inspect.isclass(checked):
         if dataclasses.is_dataclass(checked) and isinstance(init := vars(checked).get("__init__"), types.FunctionType):
             names = vars(sys.modules[checked.__module__])
-            if _any_to_check(init, names):
-                checked.__init__ = _check_function(init, typechecker)  # type: ignore[misc]
+            checked.__init__ = _check_function(init, names, typechecker)  # type: ignore[misc]
         return checked
     if not isinstance(checked, types.FunctionType):
         return _CHECK_EACH_CALL(checked, typechecker=typechecker)
-    return _check_function(checked, typechecker) if _any_to_check(checked, checked.__globals__) else checked
+    return _check_function(checked, checked.__globals__, typechecker)
 
 
-def _any_to_check(function: types.FunctionType, names: dict[str, Any]) -> bool:
-    """Whether an annotation (a text, by `from __future__ import annotations`) names an array or a Literal."""
-    words = {word for annotation in function.__annotations__.values() for word in re.findall(r"\w+", str(annotation))}
-    return any(_is_checked(names.get(word)) for word in words)
+def _to_check(function: types.FunctionType, names: dict[str, Any]) -> set[str]:
+    """Parameters, and `return`, with an array or a Literal in the annotation (a text, by `from __future__ import`)."""
+    words = {name: re.findall(r"\w+", str(annotation)) for name, annotation in function.__annotations__.items()}
+    return {name for name, of_one in words.items() if any(_is_checked(names.get(word)) for word in of_one)}
 
 
 def _is_checked(kind: Any) -> bool:
@@ -58,8 +57,14 @@ def _is_checked(kind: Any) -> bool:
     return kind is typing.Literal or module.startswith("jaxtyping") or any(map(_is_checked, typing.get_args(kind)))
 
 
-def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[..., Any]:
-    passed = _passed.setdefault(function.__code__, {})
+def _check_function(function: types.FunctionType, names: dict[str, Any], typechecker: Any) -> Callable[..., Any]:
+    asked, code = _to_check(function, names), function.__code__
+    if not asked:
+        return function
+    places = [k for k, name in enumerate(code.co_varnames[: code.co_argcount]) if name in asked]
+    more = code.co_argcount if code.co_flags & inspect.CO_VARARGS else sys.maxsize  # where *args begin
+    every = bool(code.co_flags & inspect.CO_VARKEYWORDS)
+    passed = _passed.setdefault(code, {})
     check = functools.cache(functools.partial(_CHECK_EACH_CALL, typechecker=typechecker))
     results: list[Any] = []
     give_result = _with_signature(lambda *_, **__: results.pop(), function)
@@ -67,16 +72,19 @@ def _check_function(function: types.FunctionType, typechecker: Any) -> Callable[
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        called: Hashable = _combinations(args)
+        given = len(args)
+        called: Hashable = _combinations([args[k] for k in places if k < given])
         if kwargs:
-            called = called, *kwargs, _combinations(kwargs.values())
+            called = called, *kwargs, _combinations([kwargs[name] for name in kwargs if every or name in asked])
+        if given > more:
+            called = called, _combinations(args[more:])
         returned = passed.get(called)
         if returned is None:
             result = check(function)(*args, **kwargs)
             passed[called] = {_combination(result)}
             return result
         result = function(*args, **kwargs)
-        if (combination := _combination(result)) not in returned:
+        if "return" in asked and (combination := _combination(result)) not in returned:
             results.append(result)
             check(give_result)(*args, **kwargs)
             returned.add(combination)
