@@ -44,6 +44,7 @@ LOST = 3  # something of a log is
 DISK_BYTES = 200_000  # less than any log here, more than any message
 WAIT_S = 120.0  # for the middle of a run, on a machine busy with other things
 TRIES = 20  # the middle may pass between two looks
+QUICK_S = 13.0  # of the flight that is trained on
 QUICK_SETTINGS = ("steps=40", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
 QUICK = ["--method", "neural_ode", *(word for setting in QUICK_SETTINGS for word in ("--set", setting))]
 
@@ -442,7 +443,8 @@ def test_a_full_disk_leaves_nothing(here: Path, refuse: Refuse, name: str) -> No
 
 
 def test_a_full_disk_leaves_no_half_model(here: Path, refuse: Refuse) -> None:
-    words = ["train", "flight_1.mcap", "-o", "m.safetensors", *QUICK, "--set", "validate_every=5"]
+    write(flight(3, duration_s=QUICK_S, rate_hz=100.0), here / "flight_3.mcap")
+    words = ["train", "flight_3.mcap", "-o", "m.safetensors", *QUICK, "--set", "validate_every=5"]
     assert "m.safetensors" in refuse(CONFIG, *words, preexec_fn=full_disk, env=NO_BYTECODE)
 
 
@@ -528,8 +530,9 @@ def test_ctrl_c_in_the_middle_of_debias_leaves_nothing(on_disk: Path, logs: Path
 def test_ctrl_c_in_the_middle_of_training_leaves_a_checkpoint_that_resume_takes_up(
     here: Path, command: str, imutool: Run
 ) -> None:
+    write(flight(3, duration_s=QUICK_S, rate_hz=100.0), here / "flight_3.mcap")
     before, kept = digests(here), here / "m.safetensors.checkpoint"
-    words = ["train", "flight_1.mcap", "-o", "m.safetensors", *QUICK, "--set", "validate_every=10"]
+    words = ["train", "flight_3.mcap", "-o", "m.safetensors", *QUICK, "--set", "validate_every=10"]
     code, stderr = interrupted([command, *words, "-q"], here, kept.exists)
     assert_interrupted(code, stderr, "m.safetensors.checkpoint", "--resume")
     left = digests(here)

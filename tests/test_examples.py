@@ -17,6 +17,7 @@ from support.saved_rrd import entities
 
 from imutool.cli.demo import write_asl
 from imutool.debiasing import debias
+from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -57,9 +58,10 @@ def test_a_data_set_becomes_debiased_logs_with_smaller_errors(tmp_path: Path, ex
     assert max(errors["static"]) < min(errors["raw"])
 
 
-def test_a_model_is_trained_on_given_logs(tmp_path: Path, logs: Path, example: Example) -> None:
+def test_a_model_is_trained_on_given_logs(tmp_path: Path, example: Example) -> None:
+    write(flight(1, duration_s=13.0, rate_hz=100.0), tmp_path / "log.mcap")
     words = ["steps=2", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]"]
-    printed = example("train_on_your_logs.py", "m.safetensors", logs / "flight_1.mcap", *words)
+    printed = example("train_on_your_logs.py", "m.safetensors", "log.mcap", *words)
     assert "accel    2/2" in printed
     assert len(re.findall(r"held-out error", printed)) == 2
     assert (tmp_path / "m.safetensors").is_file()

@@ -8,6 +8,7 @@ has a prior, measured against the residuals' own noise, so that what the motion 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -220,8 +221,11 @@ def integrated(
 def minus_log_likelihood(logs: Integrated, theta: Float[Tensor, " p"], prior: Float[Tensor, " p"]) -> Float[Tensor, "*batch"]:
     """Twice the negative logarithm, but for a constant, with all unknowns integrated out."""
     S, v = torch.diag(prior) + logs.S.sum(-3), prior * theta + logs.v.sum(-2)
-    found: Tensor = logs.c.sum(-1) + torch.logdet(S) - (v * torch.linalg.solve(S, v[..., None])[..., 0]).sum(-1)
-    return found
+    L, failed = torch.linalg.cholesky_ex(S)  # one factor for both terms: a third of the time of logdet and solve
+    whitened = torch.linalg.solve_triangular(L, v[..., None], upper=False)
+    logdet = 2.0 * torch.diagonal(L, dim1=-2, dim2=-1).log().sum(-1)
+    found = logs.c.sum(-1) + logdet - whitened.square().sum((-2, -1))
+    return torch.where(failed == 0, found, math.inf)  # rounding alone makes S indefinite
 
 
 def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:

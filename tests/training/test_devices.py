@@ -164,7 +164,7 @@ def test_afterwards_it_is_gone() -> None:
 
 SMALL_ODE = {"curve_width": 8, "drift_step_s": 0.25}
 EFFECTS = {"gyro_effects": ["gyro_scale", "gyro_misalignment"], "accel_effects": ["accel_scale"]}
-CHOOSING = {"remainder": False}
+CHOOSING = {"remainder": False, "accel_effects": ["accel_scale"]}  # the gyro alone, of two sensors that choose alike
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "linear": ("linear", {}),
     "neural_ode": ("neural_ode", {**SMALL_ODE, "loads": ["gyro_rate_load"]}),

@@ -81,7 +81,7 @@ def test_one_along_other_or_exact_poses_is_trusted_throughout() -> None:
 def test_errors_of_its_poses_are_no_physics(tmp_path: Path) -> None:
     """In full band the poses' noise was a resonance of the mount at 4.6 Hz, and hid the accelerometer's scale."""
     real, sim = tmp_path / "real.mcap", tmp_path / "sim.mcap"
-    recording = flight(2, duration_s=30.0, rate_hz=RATE_HZ)
+    recording = flight(2, duration_s=20.0, rate_hz=RATE_HZ)
     write(recording, real)
     write(simulated(recording, (), datasheet.read("none"), RATE_HZ, 1).recording, sim)
     found, alone = diagnose([real], sim), diagnose([real])
