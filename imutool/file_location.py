@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
@@ -94,20 +94,25 @@ def to_location(text: str) -> Location:
     return place
 
 
-def location(path: LogPath) -> Location:
+def location(path: object) -> Location:
     """File or object of a path or URL.
 
     Raises:
-        ConfigError: unknown store, missing package for it, or a password in the URL.
+        ConfigError: no path, an unknown store, a missing package for it, or a password in the URL.
     """
-    return to_location(path) if isinstance(path, str) else path
+    if isinstance(path, str):
+        return to_location(path)
+    if isinstance(path, Path) or hasattr(path, "fs"):  # a URL's path; its package stays unimported
+        return path  # type: ignore[return-value]
+    what = f"an argument is of type {type(path).__name__}"
+    raise ConfigError(what, expected="a path or a URL", fix="`imutool.write` makes a log of arrays")
 
 
-def local(path: LogPath, parameter: str) -> Path:
+def local(path: object, parameter: str) -> Path:
     """File on this machine.
 
     Raises:
-        ConfigError: `path` is a URL.
+        ConfigError: `path` is a URL, or no path.
     """
     place = location(path)
     if not isinstance(place, Path):
@@ -115,14 +120,9 @@ def local(path: LogPath, parameter: str) -> Path:
     return place
 
 
-def locals_of(paths: LogPath | Sequence[LogPath], parameter: str) -> list[Path]:
-    """Files on this machine, of one path or of several.
-
-    Raises:
-        ConfigError: one of them is a URL.
-    """
-    several = paths if isinstance(paths, Sequence) and not isinstance(paths, str) else [paths]
-    return [local(path, parameter) for path in several]
+def several(given: Any) -> list[Any]:
+    """Items of a list or another iterable; a text, a path or any other value is one item."""
+    return [given] if isinstance(given, str) or not isinstance(given, Iterable) else list(given)
 
 
 def _refuse_secrets(scheme: str, text: str) -> None:

@@ -65,8 +65,10 @@ def _own(group: str) -> frozenset[str]:
     return found - NOT_PLUGINS.get(group, frozenset())
 
 
-def load(group: str, name: str) -> ModuleType:
+def load(group: str, name: str, where: str = "") -> ModuleType:
     """Module of a key; a file of this package comes first, and then no other package is asked.
+
+    `where` is the parameter that names the key.
 
     Raises:
         ConfigError: no such key; the message names the nearest.
@@ -77,7 +79,7 @@ def load(group: str, name: str) -> ModuleType:
         known = names(group)
         raise ConfigError(
             f"{name!r} is not known",
-            where=group.removeprefix("imutool."),
+            where=where or group.removeprefix("imutool."),
             expected=f"one of {', '.join(known)}",
             fix=did_you_mean(name, known, "{!r}"),
         )

@@ -60,6 +60,14 @@ class Section(msgspec.Struct, frozen=True):
 class Report(msgspec.Struct, frozen=True, tag_field="schema"):
     """Report of a command; the `tag` of a subclass is its schema's name and version."""
 
+    def __str__(self) -> str:
+        """JSON, as `--json` writes it."""
+        return json_text(self).rstrip()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, as JSON has them: `json_values`."""
+        return json_values(self)
+
 
 def json_values(report: msgspec.Struct | Mapping[str, Any]) -> dict[str, Any]:
     """Plain JSON values of a report: arrays as lists, paths as text.

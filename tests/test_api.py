@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,95 @@ def test_samples_one_by_one_are_debiased_as_the_recording_is(logs: Path) -> None
 def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: Path, tmp_path: Path) -> None:
     with pytest.raises(imutool.ConfigError, match=said):
         call(str(logs / "flight_1.mcap"))
+
+
+STILL = imutool.example_recording(1, duration_s=5.0)
+STATIC = imutool.load_model("static")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: imutool.read(STILL), "of type Recording; expected a path or a URL. `imutool.write` makes a log"),
+        (lambda: imutool.write("a.mcap", STILL.imu), "recording: of type Imu; expected a Recording"),
+        (lambda: imutool.debias(STILL.imu, "static"), "of type Imu; expected a path or a URL"),
+        (
+            lambda: imutool.debias(STILL, "out.mcap", model="static"),
+            "target: a recording is debiased to arrays, with one model",
+        ),
+        (lambda: imutool.debias(STILL, "static", imus=["/imu0"], overwrite=True), "imus, overwrite: a recording is debiased"),
+        (lambda: imutool.debias(replace(STILL, imu=STILL.imu.rows(slice(0, 1))), "static"), "1 samples; expected at least 2"),
+        (lambda: imutool.debias(STILL, "static", init=STILL), "init: of type Recording; expected the name of a method, or six"),
+        (lambda: imutool.load_model(STATIC), "of type Model; expected a file, or the name of a model"),
+        (lambda: imutool.bias_at_rest("static", STILL.imu), "model, imu: of type str, Imu"),
+        (lambda: imutool.OnlineDebiaser("static"), "model: of type str; expected a loaded model"),
+        (lambda: imutool.train([], "m.safetensors"), "logs: no log is given"),
+        (
+            lambda: imutool.train("a.mcap", "m.safetensors", settings=["steps=3"]),
+            "settings: of type list; expected a dictionary",
+        ),
+        (lambda: imutool.train("a.mcap", "m.safetensors", method="lineer", settings={}), "method: .*Did you mean 'linear'"),
+        (lambda: imutool.diagnose([]), "reals: no log is given"),
+        (lambda: imutool.diagnose("a.mcap", metric=lambda log: 1.0), "`metric` is a function, for `close` and `sim`"),
+    ],
+    ids=range(15),
+)
+def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
+    with pytest.raises(imutool.ImutoolError, match=said):
+        call()
+
+
+def test_six_numbers_are_a_start_as_their_text_is() -> None:
+    numbers = [0.01, -0.02, 1.0 / 3.0, 0.1, 0.0, -0.3]
+    text = ",".join(map(repr, numbers))
+    for given in (numbers, np.array(numbers), text):
+        debiased = imutool.debias(STILL, STATIC, init=given)
+        assert np.array_equal(debiased.start.rest, numbers)
+
+
+def test_a_live_sample_of_another_kind_is_refused() -> None:
+    call = inspect.unwrap(imutool.OnlineDebiaser.__call__)  # as users call it: without the check of annotations
+    for stamp, gyro, accel in ((0.5, np.zeros(3), np.ones(3)), (5, np.zeros((2, 3)), np.ones((2, 3))), (5, np.zeros(6), [0.0])):
+        with pytest.raises(imutool.DataError, match="expected one sample of 3 values each, at integer nanoseconds"):
+            call(imutool.OnlineDebiaser(STATIC), stamp, gyro, accel)
+    assert call(imutool.OnlineDebiaser(STATIC), np.int64(5), [0.0, 0.0, 0.1], (0.0, 0.0, 9.8))[0][2] == 0.1
+
+
+def test_accelerations_without_gravity_at_rest_are_refused() -> None:
+    """A motion so strong that its median is that of gravity; while the body rests, 3 s long, nothing is measured."""
+    recording = imutool.example_recording(1, duration_s=7.0)
+    accel = recording.imu.accel.copy()
+    accel[:600] -= accel[:600].mean(axis=0)
+    without = replace(recording, imu=imutool.Imu(recording.imu.t_ns, recording.imu.gyro, accel))
+    assert imutool.debias(recording, "static").fitness.verdict == "fits"
+    with pytest.raises(imutool.ModelError, match=r"a bias of 9\.\d+ m/s²: it does not measure gravity"):
+        imutool.debias(without, "static")
+
+
+def test_times_outside_a_log_are_refused_with_those_it_has(tmp_path: Path) -> None:
+    imutool.write(tmp_path / "log.mcap", STILL)
+    assert imutool.read(tmp_path / "log.mcap", end_ns=int(STILL.imu.t_ns[0])).imu == STILL.imu.rows(slice(0, 1))
+    with pytest.raises(imutool.LogError, match=r"to `end_ns` 10; expected times within 17\d+ to 17\d+"):
+        imutool.read(tmp_path / "log.mcap", start_ns=5, end_ns=10)
+
+
+def test_one_name_is_a_list_of_one(tmp_path: Path) -> None:
+    imutool.write(tmp_path / "log.mcap", STILL)
+    (survey,) = imutool.clean(tmp_path / "log.mcap", imus="/imu0", rules="gaps").surveys
+    assert survey.topic == "/imu0"
+    assert [trace.name for trace in imutool.load_run(tmp_path / "log.mcap", models="static").traces] == ["raw", "static"]
+
+
+def test_a_misspelt_option_of_view_is_named_before_any_work() -> None:
+    with pytest.raises(TypeError, match=r"view\(\) got an unexpected keyword argument 'model'. Did you mean 'models'"):
+        imutool.view("absent.mcap", model="static")
+
+
+def test_a_report_prints_as_the_json_of_its_command(tmp_path: Path) -> None:
+    imutool.write(tmp_path / "log.mcap", STILL)
+    report = imutool.info(tmp_path / "log.mcap")
+    assert json.loads(str(report)) == report.to_dict()
+    assert report.to_dict()["imu"][0]["samples"] == len(STILL.imu)
 
 
 @pytest.mark.parametrize("unit_ns", [1_000, 1_000_000])

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from imutool.api import NamedProgress, Progress
+from imutool.api import Init, NamedProgress, Progress, init_text
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen
 from imutool.errors import ConfigError
-from imutool.file_location import LogPath, location
+from imutool.file_location import LogPath, location, several
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.repair import RepairReport
@@ -40,12 +40,12 @@ def clean(
     target: LogPath | None = None,
     *,
     model: str | Path | None = None,
-    imus: Sequence[str] = (),
-    rules: Sequence[str] = (),
-    skip_rules: Sequence[str] = (),
+    imus: str | Sequence[str] = (),
+    rules: str | Sequence[str] = (),
+    skip_rules: str | Sequence[str] = (),
     force: bool = False,
     fix: bool = False,
-    init: str = "auto",
+    init: Init = "auto",
     smooth: bool = False,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -76,7 +76,7 @@ def clean(
         >>> report.surveys[0].verdict
         'good'
     """
-    wanted = chosen(rules, skip_rules, force, fix)
+    wanted, imus = chosen(several(rules), several(skip_rules), force, fix), several(imus)
     check_outputs([OutputFile("target", target, output_conflicts.LOG)], [source, model], overwrite=overwrite)
     if target is None:
         return survey_imus(source, imus, wanted)
@@ -87,7 +87,7 @@ def clean(
         location(target),
         model=model,
         imus=imus,
-        init=init,
+        init=init_text(init),
         smooth=smooth,
         clean=wanted,
         force=force,

@@ -8,9 +8,9 @@ from pathlib import Path
 from imutool.api import NamedProgress
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
-from imutool.errors import ConfigError, did_you_mean
+from imutool.errors import ConfigError, DataError, LogError, did_you_mean
 from imutool.exporting import ExportReport, euroc, rosbag2, simulators
-from imutool.file_location import LogPath, local, location
+from imutool.file_location import LogPath, local, location, several
 from imutool.log_info import inspection
 from imutool.log_info.report import LogInfo
 from imutool.mcap_io.log import Log
@@ -46,7 +46,8 @@ def read(
 
     Raises:
         ConfigError: The file cannot be opened.
-        LogError: No IMU, several without `imu`, an unknown topic, NaN, decreasing stamps, or damage.
+        LogError: No IMU, several without `imu`, an unknown topic, no sample between `start_ns` and `end_ns`, NaN, decreasing
+            stamps, or damage.
 
     Examples:
         >>> import imutool
@@ -58,7 +59,13 @@ def read(
     """
     with Log(location(path)) as log:
         found = read_recordings(log, imu=imu, truth=truth, start_ns=start_ns, end_ns=end_ns)
-        return longest_recording(with_temperatures(found, log, start_ns, end_ns))
+        recording = longest_recording(with_temperatures(found, log, start_ns, end_ns))
+        blocks = log.index.blocks
+    if not len(recording.imu) and blocks and (start_ns, end_ns) != (None, None):
+        what = f"no sample of the IMU from `start_ns` {start_ns} to `end_ns` {end_ns}"
+        first_ns, last_ns = min(block.start_ns for block in blocks), max(block.end_ns for block in blocks)
+        raise LogError(what, where=path, expected=f"times within {first_ns} to {last_ns}")
+    return recording
 
 
 def write(path: LogPath, recording: Recording, *, compression: str = "zstd", overwrite: bool = False) -> None:
@@ -72,7 +79,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
 
     Raises:
         ConfigError: The log exists without `overwrite`, cannot be written, or the compression is unknown.
-        DataError: Two topics of one name, times before 1970, or an IMU whose times are not in nanoseconds.
+        DataError: No recording, two topics of one name, times before 1970, or an IMU whose times are not in nanoseconds.
 
     Examples:
         >>> import imutool
@@ -85,6 +92,9 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
         True
     """
     check_outputs([OutputFile("path", path, output_conflicts.LOG)], overwrite=overwrite)
+    given: object = recording
+    if not isinstance(given, Recording):
+        raise DataError(f"of type {type(given).__name__}", where="recording", expected="a Recording")
     recording.imu.check_rate(recording.name)
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
@@ -94,15 +104,15 @@ def convert(
     out: str | Path,
     *,
     format: str = "auto",
-    sequences: Sequence[str] = (),
+    sequences: str | Sequence[str] = (),
     compression: str = "zstd",
     images: bool = True,
     overwrite: bool = False,
     sensor: str = "",
-    kinds: Sequence[str] = (),
+    kinds: str | Sequence[str] = (),
     mapping: str | Path | None = None,
     imu: str = "",
-    correct: Sequence[str] = (),
+    correct: str | Sequence[str] = (),
     workers: int | None = None,
     progress: NamedProgress | None = None,
 ) -> ConvertReport:
@@ -137,15 +147,15 @@ def convert(
         local(source, "source"),
         f"{local(out, 'out')}/" if str(out).endswith("/") else local(out, "out"),
         format=format,
-        sequences=sequences,
+        sequences=several(sequences),
         compression=compression,
         images=images,
         overwrite=overwrite,
         sensor=sensor,
-        kinds=kinds,
+        kinds=several(kinds),
         mapping=None if mapping is None else local(mapping, "mapping"),
         imu=imu,
-        correct=correct,
+        correct=several(correct),
         workers=workers,
         progress=progress,
     )

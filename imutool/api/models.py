@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 
 from imutool import debiasing, evaluation
-from imutool.api import Progress
+from imutool.api import Init, Progress, init_text
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
@@ -24,8 +24,8 @@ from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
 from imutool.debiasing import DebiasReport
-from imutool.errors import ConfigError
-from imutool.file_location import LogPath, location
+from imutool.errors import ConfigError, DataError
+from imutool.file_location import Location, LogPath, location, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu, Recording
@@ -71,6 +71,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
         `rest`, the bias (gyro in rad/s, accel in m/s²), its standard deviation `std`, and the method in words, `how`.
 
     Raises:
+        ConfigError: `model` is not a loaded model, or `imu` not an `Imu`.
         DataError: The samples are not at rest.
 
     Examples:
@@ -80,6 +81,10 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
         >>> start.rest.shape
         (6,)
     """
+    given: tuple[object, object] = (model, imu)
+    if not isinstance(given[0], BiasModel) or not isinstance(given[1], Imu):
+        what = f"of type {type(given[0]).__name__}, {type(given[1]).__name__}"
+        raise ConfigError(what, where="model, imu", expected="a model of `imutool.load_model`, and an `Imu`")
     return at_rest(model, imu)
 
 
@@ -120,7 +125,7 @@ def debias(
     target: Model | None = None,
     *,
     model: Model | None = None,
-    init: str = "auto",
+    init: Init = "auto",
     smooth: bool = False,
     force: bool = False,
 ) -> DebiasedRecording: ...
@@ -132,9 +137,9 @@ def debias(
     target: LogPath | None = None,
     *,
     model: str | Path | Mapping[str, str | Path] | None = None,
-    init: str = "auto",
+    init: Init = "auto",
     smooth: bool = False,
-    imus: Sequence[str] = (),
+    imus: str | Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
     force: bool = False,
@@ -149,9 +154,9 @@ def debias(
     target: LogPath | BiasModel | None = None,
     *,
     model: Model | Mapping[str, str | Path] | None = None,
-    init: str = "auto",
+    init: Init = "auto",
     smooth: bool = False,
-    imus: Sequence[str] = (),
+    imus: str | Sequence[str] = (),
     in_place: bool = False,
     check: str = "imu",
     force: bool = False,
@@ -169,7 +174,7 @@ def debias(
         target: Log to write. With a recording, the second argument is the model.
         model: Model file, name of a model that ships, `static`, or a dictionary from IMU topic to model. By default the
             model that ships for this unit of the sensor, else the mean at rest. With a recording, also a loaded model.
-        init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers.
+        init: Initial bias: `auto`, `stationary`, `prior`, `truth`, `truth:SECONDS`, or six numbers (rad/s, m/s²).
         smooth: Estimate the initial bias from the whole log, forward and backward.
         imus: IMU topics of a log; by default the only one.
         in_place: Replace the log `source` instead of writing `target`.
@@ -194,22 +199,43 @@ def debias(
         >>> report.rewrite.added["/imu0/debiased"]
         4001
     """
+    start = init_text(init)
     if isinstance(source, Recording):
-        return _debias_recording(source, model if target is None else target, init, smooth, force)
+        for_logs = {"imus": imus, "in_place": in_place, "check": check != "imu", "encoding": encoding != "own"}
+        _refuse(for_logs | {"overwrite": overwrite, "progress": progress, "target": model is not None and target})
+        return _debias_recording(source, model if target is None else target, start, smooth, force)
+    place, out, chosen = _log_to_debias(source, target, model, in_place=in_place, overwrite=overwrite)
+    run = partial(debiasing.debias, place, out, model=chosen, imus=several(imus), init=start, smooth=smooth, check=check)
+    return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
+
+
+def _log_to_debias(
+    source: object, target: object, model: Model | Mapping[str, str | Path] | None, *, in_place: bool, overwrite: bool
+) -> tuple[Location, Location | None, str | Path | Mapping[str, str | Path] | None]:
+    """Log, target and model, checked before any work."""
+    place = location(source)
     if isinstance(model, BiasModel) or isinstance(target, BiasModel):
         raise ConfigError("a loaded model", where="model", expected="a model file, whose digest goes into the log")
     if in_place == (target is not None):
         raise ConfigError("`target` and `in_place`", where="debias", expected="one of the two")
     out, given = None if target is None else location(target), list(model.values()) if isinstance(model, Mapping) else model
-    check_outputs([OutputFile("target", out, output_conflicts.LOG)], [source, given], overwrite=overwrite)
-    run = partial(debiasing.debias, location(source), out, model=model, imus=imus, init=init, smooth=smooth, check=check)
-    return run(encoding=encoding, force=force, overwrite=overwrite, progress=progress)
+    check_outputs([OutputFile("target", out, output_conflicts.LOG)], [place, given], overwrite=overwrite)
+    return place, out, model
+
+
+def _refuse(options: Mapping[str, object]) -> None:
+    """Refuse options of a log, by name, that are given with a recording."""
+    if names := ", ".join(name for name, given in options.items() if given):
+        fix = "Leave it out, and write the result with `imutool.write(path, debiased.recording)`"
+        raise ConfigError("a recording is debiased to arrays, with one model", where=names, fix=fix)
 
 
 def _debias_recording(recording: Recording, model: object, init: str, smooth: bool, force: bool) -> DebiasedRecording:
     if not isinstance(model, Model | None):
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     recording.imu.check_rate(recording.name)
+    if len(recording.imu) < 2:
+        raise DataError(f"the IMU has {len(recording.imu)} samples", where=recording.name, expected="at least 2")
     name, chosen, start = _model_and_start(recording, model, init, smooth)
     about = recording.metadata.get("imutool", {})
     fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).report(name, recording.name, force=force)

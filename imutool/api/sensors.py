@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
 
 from imutool import diagnosis_output
-from imutool.api import NamedProgress
+from imutool.api import NamedProgress, given_logs
 from imutool.diagnosis.result import Diagnosis
-from imutool.file_location import LogPath, local, location
+from imutool.errors import ConfigError
+from imutool.file_location import LogPath, local, location, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Recording
@@ -94,12 +95,12 @@ def simulate(
 
 
 def diagnose(
-    reals: LogPath | Sequence[LogPath],
+    reals: LogPath | Iterable[LogPath],
     sim: LogPath | None = None,
     *,
     imu: str | None = None,
     truth: str | None = None,
-    signals: Sequence[str] = (),
+    signals: str | Sequence[str] = (),
     output: str | Path | None = None,
     close: bool = False,
     metric: Callable[[Path], float] | None = None,
@@ -116,7 +117,7 @@ def diagnose(
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
         output: Folder for `findings.json`, `physics.toml`, `noise.toml`, `report.html`, `log.html` and `view.rrd`.
         close: Simulate again with the physics that was found, diagnose again, and compare. It needs one recording and `output`.
-        metric: Your own figure for `close`, from the path of a simulated log.
+        metric: Your own figure for `close`, from the path of a simulated log: of `sim`, and of the one with the physics.
         overwrite: Replace an earlier diagnosis in `output`.
         progress: Callback with steps done, steps in all, and the current step.
 
@@ -124,7 +125,7 @@ def diagnose(
         `findings`, each with effect, parameters, uncertainty and gain, and `remarks`; with `close` also `closed`.
 
     Raises:
-        ConfigError: A log cannot be read, `output` exists, or `close` without what it needs.
+        ConfigError: A log cannot be read, `output` exists, or `close` or `metric` without what it needs.
         LogError: No such topic.
         DataError: No truth and no simulation, or too little shared time.
 
@@ -134,17 +135,17 @@ def diagnose(
         >>> [finding.effect for finding in diagnosis.findings]  # doctest: +SKIP
         ['lever_arm']
     """
-    several = reals if isinstance(reals, Sequence) and not isinstance(reals, str) else [reals]
-    logs = [location(real) for real in several]
-    folder = None if output is None else local(output, "output")
-    check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [several, sim], overwrite=overwrite)
+    logs, folder = given_logs(reals, "reals"), None if output is None else local(output, "output")
+    if metric is not None and not (callable(metric) and close and sim is not None):
+        raise ConfigError("`metric` is a function, for `close` and `sim`", fix="Give both, or leave `metric` out")
+    check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sim], overwrite=overwrite)
     diagnosis, _ = diagnosis_output.diagnose(
         logs,
         None if sim is None else location(sim),
         folder,
         imu=imu,
         truth=truth,
-        signals=signals,
+        signals=several(signals),
         close=close,
         metric=metric,
         overwrite=overwrite,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from imutool import evaluation
+from imutool.api import Init, given_logs, init_text
 from imutool.bias.model import BiasModel
 from imutool.config import build
-from imutool.file_location import LogPath, local, locals_of
+from imutool.file_location import LogPath, local, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def train(
-    logs: LogPath | Sequence[LogPath],
+    logs: LogPath | Iterable[LogPath],
     out: str | Path,
     *,
     method: str = "hybrid",
@@ -60,9 +61,10 @@ def train(
     from imutool.training.settings import placed, settings_of
 
     chosen = None if settings is None else build(settings_of(method), placed(method, settings), where="settings")
-    check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [logs], overwrite=overwrite)
+    files = [local(log, "logs") for log in given_logs(logs, "logs")]
+    check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [files], overwrite=overwrite)
     return run(
-        locals_of(logs, "logs"),
+        files,
         local(out, "out"),
         method=method,
         settings=chosen,
@@ -79,7 +81,7 @@ def evaluate(
     log: str | Path,
     *,
     models: Sequence[str | Path] | str | Path = (),
-    init: str = "auto",
+    init: Init = "auto",
     smooth: bool = False,
     aid: str | None = None,
     truth: str | None = None,
@@ -117,12 +119,12 @@ def evaluate(
         True
     """
     tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True, of_each="{}_*.tum")
-    several = [models] if isinstance(models, str | Path) else models
-    check_outputs([tum], [log, list(several)], overwrite=overwrite)
+    chosen = several(models)
+    check_outputs([tum], [log, chosen], overwrite=overwrite)
     return evaluation.evaluate(
         local(log, "log"),
-        models=several,
-        init=init,
+        models=chosen,
+        init=init_text(init),
         smooth=smooth,
         aid=aid,
         truth=truth,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import inspect
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from imutool.api import Init, init_text
 from imutool.array_types import Float64
 from imutool.debiasing import DebiasedBlock
-from imutool.file_location import LogPath, local, location
+from imutool.errors import ConfigError, DataError, did_you_mean
+from imutool.file_location import LogPath, local, location, several
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
@@ -27,8 +30,8 @@ from imutool.viewing.rerun import live
 def load_run(
     log: LogPath,
     *,
-    models: Sequence[str | Path] = (),
-    init: str = "auto",
+    models: Sequence[str | Path] | str | Path = (),
+    init: Init = "auto",
     smooth: bool = False,
     imu: str | None = None,
     truth: str | None = None,
@@ -68,8 +71,8 @@ def load_run(
     """
     return load(
         location(log),
-        models=models,
-        init=init,
+        models=several(models),
+        init=init_text(init),
         smooth=smooth,
         imu=imu,
         truth=truth,
@@ -80,7 +83,7 @@ def load_run(
 
 
 def view(
-    logs: LogPath | RunData | Sequence[LogPath | RunData],
+    logs: LogPath | RunData | Iterable[LogPath | RunData],
     *,
     at: float | str | None = None,
     source: bool = True,
@@ -126,17 +129,28 @@ def view(
         >>> print(page.said)
         Wrote flight_2.html. Open it in a browser
     """
-    several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
+    given: list[Any] = several(logs)
+    _check_options(options, given)
     paths = [None if path is None else Path(path) for path in (save, export_web, png, html)]
     cursor = None if at is None else str(at)
-    check_outputs(_outputs(*paths), [path for path in several if not isinstance(path, RunData)], overwrite=overwrite)
+    check_outputs(_outputs(*paths), [path for path in given if not isinstance(path, RunData)], overwrite=overwrite)
     asked = RequestedOutputs(paths[0], connect, web, port, paths[1], paths[2], paths[3], cursor, source, overwrite)
     with Outputs(asked) as views:
-        shown = views.show([log if isinstance(log, RunData) else load_run(log, **options) for log in several])
+        shown = views.show([log if isinstance(log, RunData) else load_run(log, **options) for log in given])
         if views.refused is not None:
             raise views.refused
         views.serve()
     return shown
+
+
+def _check_options(options: Mapping[str, Any], logs: Sequence[object]) -> None:
+    """Refuse options that `load_run` does not take, and options for runs that are loaded already."""
+    known = list(inspect.signature(load_run).parameters)[1:]
+    for name in options:
+        if name not in known:
+            raise TypeError(f"view() got an unexpected keyword argument {name!r}. {did_you_mean(name, known, '{!r}')}".rstrip())
+    if options and any(isinstance(log, RunData) for log in logs):
+        raise ConfigError("a run is loaded already", where=", ".join(options), fix="Give these to `load_run`")
 
 
 def _outputs(save: Path | None, export_web: Path | None, png: Path | None, html: Path | None) -> list[OutputFile]:
@@ -161,7 +175,7 @@ def notebook_viewer(runs: RunData | Sequence[RunData]) -> Any:
         >>> import imutool
         >>> imutool.notebook_viewer(imutool.load_run("flight_2.mcap"))  # doctest: +SKIP
     """
-    return notebook.show([runs] if isinstance(runs, RunData) else runs)
+    return notebook.show(several(runs))
 
 
 def notebook_page(runs: RunData | Sequence[RunData]) -> notebook.Page:
@@ -179,7 +193,7 @@ def notebook_page(runs: RunData | Sequence[RunData]) -> notebook.Page:
         >>> "<svg" in page.content
         True
     """
-    return notebook.page([runs] if isinstance(runs, RunData) else runs)
+    return notebook.page(several(runs))
 
 
 class LiveView:
@@ -199,7 +213,13 @@ class LiveView:
             imu: Raw samples.
             bias: Subtracted bias at each sample: gyro (rad/s), then accel (m/s²).
             std: One standard deviation of `bias`.
+
+        Raises:
+            DataError: `bias` or `std` has not one row of six for each sample.
         """
+        if not np.shape(bias) == np.shape(std) == (len(imu), 6):
+            what = f"bias and std of shape {list(np.shape(bias))}, {list(np.shape(std))}"
+            raise DataError(what, where="LiveView.add", expected=f"[{len(imu)}, 6], a row for each sample")
         sequence = np.arange(self._count, self._count + len(imu), dtype=np.uint32)
         self._count += len(imu)
         batch = ImuBatch(imu.t_ns, imu.t_ns, sequence, imu.t_ns, imu.gyro, imu.accel, "imu")

@@ -41,10 +41,7 @@ TEMPERATURE_SHAPES: Shapes = {  # of the temperature in training: range (°C, K)
 
 @runtime_checkable
 class Stream(Protocol):
-    """Bias stream of a model.
-
-    Samples arrive in blocks of any size, and the stream keeps its state between them.
-    """
+    """Bias stream of a model over blocks of any size; it keeps its state between them."""
 
     def __call__(
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
@@ -111,9 +108,7 @@ class LogDrift(Protocol):
 
 @runtime_checkable
 class CovarianceModel(Protocol):
-    """Roots S of the covariance S S^T of the motion-dependent bias, by sensor.
-
-    It takes a stream of samples.
+    """Roots S of the covariance S S^T of the motion-dependent bias of samples, by sensor.
 
     The columns of S belong to the same unknowns at every sample: the covariance root of a mean is the mean of S.
     """
@@ -143,6 +138,10 @@ class BiasModel(ABC):
         self.config, self.rate_hz, self.card = config, rate_hz, {}
         blank = {name: np.zeros(shape) for name, shape in self.shapes(config).items() if name not in (tensors or {})}
         self.tensors = blank | {name: np.array(value, dtype=np.float64) for name, value in (tensors or {}).items()}
+
+    def __repr__(self) -> str:
+        name = str(self.card.get("name", self.method))
+        return f"<bias model {name!r}: {self.method}, {f'{self.rate_hz:g} Hz' if self.rate_hz else 'any rate'}>"
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:

@@ -195,6 +195,8 @@ def model_file(name: str | Path) -> Path:
     Raises:
         ModelError: neither.
     """
+    if not isinstance(name, str | Path):
+        raise ModelError(f"a model of type {type(name).__name__}", expected="a file, or the name of a model")
     path = Path(name)
     return path if path.suffix in (".toml", ".safetensors") or path.exists() else shipped(str(name))
 

@@ -17,6 +17,7 @@ from imutool.bias.temperature_drift import OnlineDrift, bound
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
 from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured
+from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import MOST_GAP_S
 
@@ -82,6 +83,10 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
+        given: object = model
+        if not isinstance(given, BiasModel):
+            what = f"of type {type(given).__name__}"
+            raise ConfigError(what, where="model", expected="a loaded model", fix="Load it with `imutool.load_model`")
         self._model, self._start = model, start
         self._start_ns, self._before_ns, self._bias = -1, -1, np.zeros(6)
         self._drift = OnlineDrift(model) if model.temperature_parameters() else None
@@ -93,8 +98,17 @@ class OnlineDebiaser:
         accel: Float64[np.ndarray, "3"],
         temperature: float | None = None,
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
-        """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias."""
+        """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias.
+
+        A sample that is no measurement (NaN, for instance) changes nothing: the bias is that of the sample before.
+
+        Raises:
+            DataError: not one sample of three and three values, or a stamp that is not an integer.
+        """
         u = np.concatenate((gyro, accel))
+        if u.shape != (6,) or not isinstance(stamp_ns, int | np.integer):
+            what = f"gyro and accel of shape {list(np.shape(gyro))}, {list(np.shape(accel))} at {stamp_ns!r}"
+            raise DataError(what, where="OnlineDebiaser", expected="one sample of 3 values each, at integer nanoseconds")
         size = np.abs(u)
         if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
             if self._drift is None:

@@ -74,8 +74,7 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     `about` is what the log says of its origin: `sensor`, `dataset`.
     """
     samples = head(batches)
-    wrong = _wrong_gravity(samples) if len(samples[0]) else ""
-    if wrong:
+    if len(samples[0]) and (wrong := _wrong_gravity(samples, start)):
         return Fitness("unfit", (wrong,))
     if model.method == static.Model.method:
         units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
@@ -136,13 +135,14 @@ def head(batches: Iterable[Samples]) -> Samples:
     return t_s[:end], gyro[:end], accel[:end]
 
 
-def _wrong_gravity(samples: Samples) -> str:
-    """Sentence on a mean specific force that is not gravity's; empty if it is."""
-    size = float(quantile(np.linalg.norm(samples[2], axis=1), 0.5))
+def _wrong_gravity(samples: Samples, start: InitialBias) -> str:
+    """Sentence on a specific force that is not gravity's in the median or at rest; empty if it is."""
+    size, bias = float(quantile(np.linalg.norm(samples[2], axis=1), 0.5)), float(np.linalg.norm(start.rest[3:]))
     low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
-    if low <= size <= high:
-        return ""
-    return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
+    if not low <= size <= high:
+        return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
+    without = f"the accelerometer would have a bias of {bias:.3g} m/s²: it does not measure gravity, or in another unit"
+    return without if bias > GRAVITY_M_S2 - low else ""
 
 
 def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Samples:

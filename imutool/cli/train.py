@@ -44,7 +44,7 @@ def train(
     common: Common = COMMON,
 ) -> None:
     """Train a bias model on logs of one sensor with true poses."""
-    registry.load("imutool.bias", method)  # refuse a wrong name before reading any log
+    registry.load("imutool.bias", method, "method")  # refuse a wrong name before reading any log
     from imutool.config import load
     from imutool.processes.forked import forking
     from imutool.training.run import train as run

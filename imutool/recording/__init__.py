@@ -17,7 +17,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError
 from imutool.geometry import quaternion
-from imutool.recording.columns import Columns, clock_jumps
+from imutool.recording.columns import Columns, checked_mapping, clock_jumps, converted
 
 GRAVITY_M_S2 = 9.81
 UNIT_QUATERNION_TOLERANCE = 1e-6  # six printed decimals, as in the normalised EuRoC truth
@@ -51,7 +51,6 @@ class Imu(Columns):
     accel: Float64[np.ndarray, "n 3"]
 
     def __post_init__(self) -> None:
-        self.freeze()
         self.check(gyro=(3,), accel=(3,))
 
     def check_rate(self, where: str) -> None:
@@ -78,12 +77,12 @@ class Poses(Columns):
     v_w: Float64[np.ndarray, "n 3"] | None = None
 
     def __post_init__(self) -> None:
-        self.freeze()
         self.check(p_wb=(3,), q_wb_wxyz=(4,), v_w=(3,))
         error = np.abs(quaternion.length(self.q_wb_wxyz) - 1.0)
         if len(error) and error.max() > UNIT_QUATERNION_TOLERANCE:
             row = int(np.argmax(error))
-            raise DataError(f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}", expected="norm 1")
+            what = f"Poses.q_wb_wxyz row {row} is {self.q_wb_wxyz[row].tolist()}"
+            raise DataError(what, expected="norm 1", fix="Divide each quaternion by its norm")
 
     @property
     def has_positions(self) -> bool:
@@ -101,6 +100,7 @@ class Poses(Columns):
         Raises:
             DataError: fewer than two poses.
         """
+        t_ns = np.atleast_1d(converted(t_ns, "t_ns", times=True))
         gap_s = max(GAP_FACTOR * self.period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
         clipped = np.clip(t_ns, self.t_ns[0], self.t_ns[-1])
         after = np.clip(np.searchsorted(self.t_ns, clipped, side="left"), 1, len(self.t_ns) - 1)
@@ -130,7 +130,8 @@ class Scalars(Columns):
     unit: str = ""
 
     def __post_init__(self) -> None:
-        self.freeze()
+        values = converted(self.values, "Scalars.values")
+        object.__setattr__(self, "values", values[:, None] if values.ndim == 1 else values)
         self.check(values=self.values.shape[1:])
         if self.values.ndim != 2 or self.values.shape[1] not in (1, 3):
             raise DataError(f"Scalars.values is {list(self.values.shape)}", expected="[n, 1] or [n, 3]")
@@ -145,13 +146,12 @@ class Frames:
     each: Callable[[], Iterator[tuple[int, bytes]]]  # (t_ns, bytes of the encoded image)
 
 
-def _mapping(value: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Read-only copy of a mapping and the mappings in it."""
-    return MappingProxyType({k: _mapping(v) if isinstance(v, Mapping) else v for k, v in value.items()})
-
-
 def _dict(value: Any) -> Any:
     return {k: _dict(v) for k, v in value.items()} if isinstance(value, MappingProxyType) else value
+
+
+PLAIN_PARTS: dict[str, type] = {"name": str, "imu": Imu, "imu_topic": str, "source": str}
+KEYED_PARTS: dict[str, type] = {"truths": Poses, "scalars": Scalars, "frames": Frames, "metadata": Mapping, "other_poses": str}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,8 +174,11 @@ class Recording:
     other_poses: Mapping[str, str] = field(default_factory=dict)  # kinds of pose topics that are no truth
 
     def __post_init__(self) -> None:
-        for name in ("other_poses", "truths", "scalars", "frames", "metadata"):
-            object.__setattr__(self, name, _mapping(getattr(self, name)))
+        for name, kind in PLAIN_PARTS.items():
+            if not isinstance(value := getattr(self, name), kind):
+                raise DataError(f"Recording.{name} is of type {type(value).__name__}", expected=kind.__name__)
+        for name, kind in KEYED_PARTS.items():
+            object.__setattr__(self, name, checked_mapping(getattr(self, name), kind, f"Recording.{name}"))
 
     def __repr__(self) -> str:
         """A line for each topic."""

@@ -5,9 +5,10 @@ Base class of the array types of `imutool.recording`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,34 +26,28 @@ class Columns:
 
     t_ns: Int64[np.ndarray, " n"]
 
-    def freeze(self) -> None:
-        """Make every array contiguous and read-only; a copy only where it is not already."""
-        for column in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, column.name)
-            if isinstance(value, np.ndarray):
-                if not (value.flags.c_contiguous and _is_immutable(value)):
-                    value = np.array(value, order="C")
-                    value.flags.writeable = False
-                object.__setattr__(self, column.name, value)
-
     def check(self, **shapes: tuple[int, ...]) -> None:
-        """Check types, lengths, finite values and strictly increasing time.
+        """Convert the columns to int64 and float64, make them read-only, and check them.
+
+        A column that has its type, is contiguous and cannot be written is not copied.
 
         Raises:
-            DataError: a check fails; the message names the row.
+            DataError: a type that does not convert without loss, a wrong length, a number that is not finite, or time that does
+                not increase; the message names the row.
         """
         kind = type(self).__name__
-        for name, wanted in {"t_ns": "int64", **dict.fromkeys(shapes, "float64")}.items():
-            if not isinstance(value := getattr(self, name), np.ndarray | None):
-                fix = f"Convert it with np.asarray(..., np.{wanted})"
-                raise DataError(f"{kind}.{name} is a {type(value).__name__}", expected=f"a numpy array of {wanted}", fix=fix)
-        if self.t_ns.dtype != np.int64 or self.t_ns.ndim != 1:
+        optional = {column.name for column in fields(self) if column.default is None}  # type: ignore[arg-type]
+        for name in ("t_ns", *shapes):
+            value = getattr(self, name)
+            if value is not None or name not in optional:
+                object.__setattr__(self, name, _fixed(converted(value, f"{kind}.{name}", times=name == "t_ns")))
+        if self.t_ns.ndim != 1:
             raise DataError(f"{kind}.t_ns is {self.t_ns.dtype}{list(self.t_ns.shape)}", expected="int64[n]")
         for name, tail in shapes.items():
             value = getattr(self, name)
             if value is None:
                 continue
-            if value.dtype != np.float64 or value.shape != (len(self.t_ns), *tail):
+            if value.shape != (len(self.t_ns), *tail):
                 raise DataError(
                     f"{kind}.{name} is {value.dtype}{list(value.shape)}",
                     expected=f"float64{[len(self.t_ns), *tail]}",
@@ -126,6 +121,53 @@ def _same(a: object, b: object) -> bool:
             return False
         return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
     return bool(a == b)
+
+
+def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarray, "..."]:
+    """Array of float64, or of int64 nanoseconds for `times`, if the value converts without loss.
+
+    A list, a table's column, float32, another byte order, smaller integers, and `datetime64` for times.
+
+    Raises:
+        DataError: it does not: seconds as float, masked values, text, or nothing.
+    """
+    wanted = np.dtype(np.int64 if times else np.float64)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # rows of different lengths
+        array = np.asarray(None)
+    mask = getattr(value, "mask", None)
+    masked = isinstance(mask, np.ndarray | np.bool_) and bool(mask.any())
+    if times and array.dtype.kind == "M" and not np.isnat(array).any():
+        array = array.astype("datetime64[ns]").astype(np.int64)
+    if not masked and (np.can_cast(array.dtype, wanted, "safe") or (times and array.dtype.kind == "u")):
+        return array.astype(wanted, copy=False)
+    kind = f"{array.dtype}{list(array.shape)}" if isinstance(value, np.ndarray) else f"of type {type(value).__name__}"
+    fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)" if times and array.dtype.kind == "f" else ""
+    raise DataError(
+        f"{where} is {kind}{' with masked values' * masked}", expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix
+    )
+
+
+def checked_mapping(value: object, of: type, where: str) -> Mapping[str, Any]:
+    """Read-only copy of a mapping, and of the mappings in it.
+
+    Raises:
+        DataError: it is none, or holds a value of another type.
+    """
+    if not isinstance(value, Mapping):
+        raise DataError(f"{where} is of type {type(value).__name__}", expected=f"a mapping from names to {of.__name__}")
+    if wrong := [type(v).__name__ for v in value.values() if not isinstance(v, of)]:
+        raise DataError(f"{where} holds a value of type {wrong[0]}", expected=of.__name__)
+    return MappingProxyType({k: checked_mapping(v, str, where) if of is Mapping else v for k, v in value.items()})
+
+
+def _fixed(array: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+    """The array, contiguous and read-only; a copy only where it is not already."""
+    if not (array.flags.c_contiguous and _is_immutable(array)):
+        array = np.array(array, order="C")
+        array.flags.writeable = False
+    return array
 
 
 def _is_immutable(array: np.ndarray) -> bool:

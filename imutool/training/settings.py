@@ -127,7 +127,7 @@ def settings_of(method: str) -> type[TrainSettings]:
     Raises:
         ConfigError: unknown method.
     """
-    prefers = registry.load("imutool.networks", method).Network.prefers
+    prefers = registry.load("imutool.networks", method, "method").Network.prefers
     if not prefers:
         return TrainSettings
     kinds = {field.name: field.type for field in msgspec.structs.fields(TrainSettings)}
@@ -175,8 +175,11 @@ def placed(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings with the method's own in their place, under `model`.
 
     Raises:
-        ConfigError: unknown method.
+        ConfigError: unknown method, or no mapping.
     """
+    given: object = settings
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"of type {type(given).__name__}", where="settings", expected="a dictionary")
     general = {key: value for key, value in settings.items() if full_name(method, key) == key}
     own = {key: value for key, value in settings.items() if key not in general}
     return {**general, "model": {**general.get("model", {}), **own}} if own else general
