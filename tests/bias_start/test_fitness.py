@@ -129,6 +129,14 @@ def test_a_small_correction_of_another_unit_fits_but_the_reason_says_what_the_lo
     assert "correction in motion" not in judged(model, recording.imu).reasons[0], "this model has none"
 
 
+@pytest.mark.parametrize(("bias", "verdict"), [(1.5, "fits"), (9.7, "unfit"), (-8.8, "unfit")])
+def test_a_bias_at_rest_as_large_as_gravity_is_none(bias: float, verdict: str, recording: Recording) -> None:
+    """It is what rest shows of accelerations without gravity, and of those in g, however strong the motion later is."""
+    found = judge(static.Model(), from_numbers(f"0,0,0,0,0,{bias}"), [relative_samples(recording.imu)], {})
+    assert found.verdict == verdict
+    assert ("does not measure gravity, or in another unit" in found.reasons[0]) == (verdict == "unfit")
+
+
 def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(model: BiasModel, scaled: Imu) -> None:
     shifted = replace(scaled, gyro=scaled.gyro + np.array([0.0, 0.015, 0.0]))
     found = judged(corrects(model, WRONG), shifted)
