@@ -119,7 +119,8 @@ def convert(
     """Convert recordings of any format to MCAP logs, one log per sequence.
 
     Args:
-        source: Bag, log, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these.
+        source: Bag, log, table, sequence folder or archive (.zip, .tar, .tar.gz), or a folder of these; single MCAP logs and
+            tables in a folder are not looked for.
         out: Log file for one sequence, folder for several; `logs/` is a folder for one too.
         format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
         sequences: Names of the sequences to convert; by default all.
@@ -168,6 +169,9 @@ def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> 
         path: MCAP log: a file or a URL.
         check: Compare the CRC of every chunk; otherwise only of chunks with IMU messages.
         max_chunk: Largest chunk in bytes, packed or unpacked, to read into memory (256 MiB).
+
+    Returns:
+        `topics`, `imu` and `truth`, one entry per topic, `warnings` and `losses`; `to_dict()` gives plain values.
 
     Raises:
         ConfigError: The file cannot be opened.

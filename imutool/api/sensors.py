@@ -122,7 +122,8 @@ def diagnose(
         progress: Callback with steps done, steps in all, and the current step.
 
     Returns:
-        `findings`, each with effect, parameters, uncertainty and gain, and `remarks`; with `close` also `closed`.
+        `findings`, each with effect, parameters, uncertainty and gain, and `remarks`; with `close` also `closed`. `report` is
+        the JSON of the command.
 
     Raises:
         ConfigError: A log cannot be read, `output` exists, or `close` or `metric` without what it needs.
