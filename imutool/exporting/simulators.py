@@ -27,7 +27,7 @@ from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
 PHYSICS, NOISE = "physics.toml", "noise.toml"
-RATE_HZ = 200.0  # of a noise without a rate
+RATE_HZ = 200.0  # of a sensor whose rate neither the given noise nor the diagnosed one says
 DEVIATIONS = 2.0  # of a range
 CORRELATION_S = 3600.0  # of a bias that walks, where a simulator lets it come back
 Vector = Float64[np.ndarray, "3"]
@@ -41,12 +41,8 @@ class Twin:
     bias_std: Mapping[Sensor, Vector]
     noise: Noise
     units: int
+    rate_hz: float = RATE_HZ
     used: set[str] = field(default_factory=set)
-
-    @property
-    def rate_hz(self) -> float:
-        """Sample rate of the noise."""
-        return RATE_HZ if self.noise.colour is None else self.noise.colour.rate_hz
 
     def vector(self, effect: str) -> Vector:
         """Three parameters of an effect, zero where it is not known."""
@@ -126,7 +122,7 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     if not folders:
         raise ConfigError("holds no diagnosis", where=source, expected=f"the folder of imutool diagnose, with {PHYSICS}")
     files = [physics_file.read(folder / PHYSICS) for folder in folders]
-    noises = [datasheet.read(folder / NOISE) for folder in folders if (folder / NOISE).is_file()] if noise is None else []
+    noises = [datasheet.read(folder / NOISE) for folder in folders if (folder / NOISE).is_file()]
     if noise is None and not noises:
         raise ConfigError(f"holds no {NOISE}", where=source, fix="Diagnose again, or give `noise`")
     sheet = datasheet.read(noise) if noise is not None else _middle(noises)
@@ -135,7 +131,8 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     mean = Bias(**{s: three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
     std: dict[Sensor, Vector] = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
     physics = files[0] if len(files) == 1 else _of_fleet(files)
-    return Twin(msgspec.structs.replace(physics, bias=mean), std, sheet, len(files))
+    rates = [each.colour.rate_hz for each in (sheet, *noises) if each.colour is not None]
+    return Twin(msgspec.structs.replace(physics, bias=mean), std, sheet, len(files), next(iter(rates), RATE_HZ))
 
 
 def _of_fleet(files: list[PhysicsFile]) -> PhysicsFile:

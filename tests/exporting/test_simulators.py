@@ -103,6 +103,17 @@ def test_gazebo_has_pose_noise_walk_and_digits_by_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(read["stddev"], 3e-3 * np.sqrt(RATE_HZ), rtol=1e-6)
 
 
+def test_a_data_sheets_noise_has_the_rate_of_the_diagnosed_sensor(tmp_path: Path) -> None:
+    """A density says nothing of a sample without the rate."""
+    export(diagnosed(tmp_path / "d"), tmp_path / "out", format="gazebo", noise="bmi160")
+    sensor = ElementTree.parse(tmp_path / "out" / "imu.sdf").getroot().find("model/link/sensor")
+    assert sensor is not None
+    assert float(sensor.findtext("update_rate") or "") == RATE_HZ
+    density = datasheet.read("bmi160").values("gyro_density")[0]
+    stddev = sensor.findtext("imu/angular_velocity/x/noise/stddev")
+    np.testing.assert_allclose(float(stddev or ""), density * np.sqrt(RATE_HZ), rtol=1e-6)
+
+
 class Recorded:
     """Stands for a class of Isaac Lab, which does not install here: it keeps what it is made of."""
 
