@@ -77,7 +77,7 @@ def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) ->
 class OnlineDebiaser:
     """Corrects IMU samples one at a time, for a live node.
 
-    `start` is the bias of `imutool.bias_at_rest` over the first seconds, for instance. Without `start` it begins at the prior and
+    `start` is a bias of `imutool.bias_at_rest`, over the first seconds for instance. Without `start` it begins at the prior and
     tracks the rest bias, as `init="auto"` does. If the model's bias follows the temperature, give it (°C) with the samples that
     have one.
     """

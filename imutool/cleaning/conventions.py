@@ -31,6 +31,11 @@ WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
 MOST_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
 
+MISREAD = {  # quaternions of poses: what is wrong with them, and the rows and signs that make w, x, y, z of them
+    "have their w in the place of z": ((3, 0, 1, 2), (1, 1, 1, 1)),
+    "have their w in the place of x": ((1, 2, 3, 0), (1, 1, 1, 1)),
+    "are the inverse: they take vectors of the world to the body": ((0, 1, 2, 3), (1, -1, -1, -1)),
+}
 FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
 
 
@@ -70,6 +75,7 @@ class Conventions:
         up: axis of the poses' world that points up, as `+z`.
         delay: of the poses.
         unit: of the poses' positions, metres unless the motion shows another.
+        quaternions: what is wrong with those of the poses, of `MISREAD`; then all else is of the poses without this.
     """
 
     topic: str = ""
@@ -79,6 +85,7 @@ class Conventions:
     up: str | None = None
     delay: Delay | None = None
     unit: str = "m"
+    quaternions: str = ""
 
 
 def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventions:
@@ -92,9 +99,9 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
     delay = pose_delay(motion, truth)
     late_ns = 0 if delay is None else round(delay.seconds * 1e9)
     shifted = truth._replace(t_ns=truth.t_ns - late_ns)
-    gyro = _gyro_against_poses(step, mean, motion.middle_ns, shifted)
+    gyro, shifted, quaternions = _turns_against_poses(step, mean, motion.middle_ns, shifted)
     accel, up, unit = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
-    return Conventions(truth.topic, gyro, accel, relative, up, delay, unit)
+    return Conventions(truth.topic, gyro, accel, relative, up, delay, unit, quaternions)
 
 
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
@@ -193,6 +200,24 @@ def _carried(
         q = turns[unit, bool(np.linalg.det(P) > 0)]
         errors.append(np.linalg.norm(quaternion.rotate(q, last @ P) @ P.T - first, axis=1))
     return np.stack(errors)
+
+
+def _turns_against_poses(
+    step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], start_ns: int, truth: Truth
+) -> tuple[Reading | None, Truth, str]:
+    """Reading of the gyro against the poses, the poses, and what is wrong with their quaternions.
+
+    They are misread where they leave no gyro, or other axes, and otherwise read the gyro as it is, and fit it clearly better.
+    """
+    gyro = _gyro_against_poses(step, mean, start_ns, truth)
+    if gyro is not None and not gyro.wrong:
+        return gyro, truth, ""
+    for what, (rows, signs) in MISREAD.items():
+        other = truth._replace(q_wb_wxyz=truth.q_wb_wxyz[:, rows] * signs)
+        found = _gyro_against_poses(step, mean, start_ns, other)
+        if found is not None and found.as_is and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
+            return found, other, what
+    return gyro, truth, ""
 
 
 def _gyro_against_poses(

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.imu_defects import batch_of
 
-from imutool.cleaning.conventions import Conventions, judge, signed_permutations
+from imutool.cleaning.conventions import MISREAD, Conventions, judge, signed_permutations
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.rules.axes import TO_Z_UP
@@ -77,11 +77,25 @@ def test_units_axes_and_worlds_are_named_by_poses(number: int, flown: tuple[Imu,
     assert found.gyro is not None
     assert (found.gyro.axes == P).all()
     assert found.gyro.unit == unit
+    assert found.quaternions == ""
     assert found.accel is not None
     assert (found.accel.axes == Q).all()
     assert found.up == up
     assert found.delay is not None
     assert found.delay.seconds == pytest.approx(late_ns * 1e-9, abs=0.005)
+
+
+@pytest.mark.parametrize("what", MISREAD)
+def test_misread_quaternions_of_poses_are_named_and_not_the_gyro(what: str, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    rows, signs = MISREAD[what]
+    misread = np.empty_like(truth.q_wb_wxyz)
+    misread[:, rows] = truth.q_wb_wxyz * signs
+    assert judge(motion_of(imu), truth._replace(q_wb_wxyz=misread), 1.0).quaternions == what
+    found = judge(motion_of(imu), truth, 1.0)
+    assert found.quaternions == ""
+    assert found.gyro is not None
+    assert found.gyro.as_is
 
 
 @pytest.mark.parametrize(("unit", "up"), [("mm", "+z"), ("cm", "-z"), ("mm", "+y"), ("m", "+z")])

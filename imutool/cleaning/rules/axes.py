@@ -35,6 +35,11 @@ class Axes(Rule):
     def findings(self, whole: TopicSummary) -> Iterator[Finding]:
         """Findings about the sensors' axes, the poses' world, and the poses' clock."""
         found = whole.conventions
+        if found.quaternions:  # any other finding would be of poses that the log does not hold
+            yield Finding(
+                "axes", "warning", f"the quaternions of the poses {found.topic} {found.quaternions}", 1, confidence=0.95
+            )
+            return
         fixed = whole.settings.fix
         for finding, gyro, accel in _sensors(found):
             proposed = gyro is not None or accel is not None
