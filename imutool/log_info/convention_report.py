@@ -104,6 +104,8 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     if level is not None:
         size = f"reads {level:.4g} {'when calm' if at_rest else 'in the median'}"
         yield "unit of accel", bool(unit), f"{unit}: it {size}" if unit else f"cannot be judged: it {size}"
+    if found.quaternions:
+        yield "quaternions of poses", True, f"they {found.quaternions}; what follows is judged without that"
     turned = found.gyro is not None and found.gyro.sole
     by_gravity = _gyro(found.relative, "gravity as accel reads it")
     yield "gyro against accel", *(by_gravity or (False, f"cannot be judged: {NO_GRAVITY}"))
