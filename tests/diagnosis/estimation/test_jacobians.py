@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.signal import firwin
@@ -12,8 +14,10 @@ from imutool.diagnosis.estimation import unnamed_effects
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
 from imutool.diagnosis.estimation.gauss_newton import fit
-from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, step_of
+from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, priors, step_of
 from imutool.diagnosis.estimation.whitening import Band, Whitener
+from imutool.diagnosis.settings import FitSettings
+from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Stage, Theta
 
 ROUNDED = 1e-6  # of the largest derivative: differences of numbers to sixteen digits, over steps of a thousandth
@@ -164,3 +168,15 @@ def test_the_score_promises_no_more_than_a_step_by_a_factor_of_e(pair: Pair) -> 
     score = CandidateScore([log], now)
     assert score.gain(physics, score.linear(physics, np.array([2.0]))) < 0.0
     assert physics.stage == Stage.BANDWIDTH
+
+
+def test_a_candidate_that_single_precision_leaves_singular_gains_nothing() -> None:
+    """So are the rows of a recording that is compared with itself: 1e7 in float32 against the prior's ones."""
+    (effect,) = catalogue.effects(["lever_arm"])
+    start = np.zeros(3)
+    _, std = priors(((effect, start),), FitSettings())
+    score = object.__new__(CandidateScore)
+    score.N, score.g, score.left, score.total, score.axes = np.zeros((0, 0)), np.zeros(0), 2.0, 2.0, []
+    score.now = SimpleNamespace(settings=FitSettings())  # type: ignore[assignment]
+    singular = SimpleNamespace(start=start, rows=[], N=-np.diag(1.0 / std**2))
+    assert score.gain(effect, singular) == 0.0  # type: ignore[arg-type]
