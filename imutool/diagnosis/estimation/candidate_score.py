@@ -148,7 +148,10 @@ class CandidateScore:
         _, std = priors(((effect, linear.start),), self.now.settings)
         solved = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
         S, g = linear.N + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]
-        step = np.linalg.lstsq(S, g)[0]  # of a log against itself, float32 rows of 1e7 leave S singular
+        try:
+            step = np.linalg.solve(S, g)
+        except np.linalg.LinAlgError:  # of a log against itself, float32 rows of 1e7 leave S singular
+            step = np.linalg.lstsq(S, g)[0]
         far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
         return float(self.left - total + g_a @ solved[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
 
