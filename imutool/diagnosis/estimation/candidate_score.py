@@ -120,10 +120,9 @@ class CandidateScore:
             for column in range(log.pair.columns):
                 axis, on = self.axes[log.pair.columns * k + column], B.on(column)
                 if len(on) or column in added:
-                    js, b, more = B.parameters[on], axis.free(B.rows[on]), None
+                    js, b = B.parameters[on], axis.free(B.rows[on])
                     N[np.ix_(js, js)] += b @ b.T
-                    if column in added:
-                        more = axis.free(log.whiten.rows([added[column]], np.array([column]))[0])
+                    more = axis.free(log.whiten.rows([added[column]], np.array([column]))[0]) if column in added else None
                     rows.append((log.pair.columns * k + column, js, b, more))
         return _Linear(start, rows, N)
 
@@ -135,8 +134,7 @@ class CandidateScore:
         p = len(linear.start)
         N_ab, g_b, g_a, total = np.zeros((len(self.N), p)), np.zeros(p), self.g.copy(), self.total
         for k, js, b, added in linear.rows:
-            axis = self.axes[k]
-            r = axis.r
+            axis, r = self.axes[k], self.axes[k].r
             if added is not None:
                 r = r - added
                 total += float(r @ r - axis.r @ axis.r)
