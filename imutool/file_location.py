@@ -102,7 +102,7 @@ def location(path: object) -> Location:
     """
     if isinstance(path, str):
         return to_location(path)
-    if isinstance(path, Path) or hasattr(path, "fs"):  # a URL's path; its package stays unimported
+    if isinstance(path, Path) or hasattr(type(path), "fs"):  # a URL's path; its package stays unimported
         return path  # type: ignore[return-value]
     what = f"an argument is of type {type(path).__name__}"
     raise ConfigError(what, expected="a path or a URL", fix="`imutool.write` makes a log of arrays")
