@@ -58,7 +58,7 @@ from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
-from imutool.sensor.effects import clock_wander
+from imutool.sensor.effects import clock_wander, gyro_bias_drift
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
@@ -226,7 +226,8 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     exact = all(pair.exact for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     left_out = {*SHOWN_BY_SAMPLES, NEEDS_POSES if exact else NEEDS_SIMULATION}
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
-    effects = clock_wander.with_knots(effects, max(float(pair.stamp_s[-1]) for pair in pairs))
+    end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
+    effects = [*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     of_reference = timestamps.jitter(pairs) if exact else (SMOOTHED,)
     return (*effects, *of_reference, *timestamps.soft_limits(pairs, biases))

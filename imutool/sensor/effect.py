@@ -105,6 +105,8 @@ class Effect:
     fast: a trained effect for given parameters, where `forward` would be slow; the same numbers.
     lagless: `forward` with its gain and without its lag.
     of_time: what it adds depends on time alone, as the walk of a bias does.
+    reached: share of its amplitudes that a log sees, by the last parameter, a time constant. A fit moves what is seen: of a
+        time constant longer than the log only the slope is, and an amplitude in proportion does as well.
     """
 
     name: str
@@ -129,6 +131,7 @@ class Effect:
     fast: Callable[[Theta], CompiledEffect] | None = None
     lagless: Callable[[Any, Theta], Any] | None = None
     of_time: bool = False
+    reached: Callable[[float], float] | None = None
 
     @property
     def key(self) -> str:

@@ -22,6 +22,7 @@ from imutool.diagnosis.estimation.jacobians import (
     ForwardPass,
     Jacobians,
     bound,
+    bound_slopes,
     free_of,
     parameters_of,
     priors,
@@ -94,11 +95,11 @@ class Fit:
 
     def stds(self) -> dict[str, Float64[np.ndarray, " p"]]:
         """Standard deviations by effect, in the parameters' units."""
-        out, all_ = {}, np.sqrt(np.diag(self.covariance))
+        out = {}
         for effect, theta in self.chosen:
-            std = all_[self.place(effect.key)] * (self.settings.between_samples if effect.jumps else 1.0)
-            each = zip(std, theta, effect.parameters, strict=True)
-            out[effect.key] = np.array([s * t if parameter.positive else s for s, t, parameter in each])
+            slopes, own = bound_slopes(effect, theta), self.covariance[self.place(effect.key), self.place(effect.key)]
+            std = np.sqrt(np.einsum("ij,jk,ik->i", slopes, own, slopes))
+            out[effect.key] = std * (self.settings.between_samples if effect.jumps else 1.0)
         return out
 
 

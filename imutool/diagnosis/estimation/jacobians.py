@@ -132,8 +132,10 @@ class ForwardPass:
             if parameter.begins and not onsets:
                 continue
             h = step_of(parameter)
-            only_j = np.arange(len(x)) == j  # the others stay to the last bit: their rounding would look like a derivative
-            state = before.through(effect, np.where(only_j, bound(effect, x + h), theta))
+            only_j = np.arange(len(x)) == j
+            moves = only_j | (effect.reached is not None and parameter.positive)  # of which the amplitudes depend on it
+            # the others stay to the last bit: their rounding would look like a derivative
+            state = before.through(effect, np.where(moves, bound(effect, x + h * only_j), theta))
             for other, values in behind:
                 state = state.through(other, values)
             for (first, then), (_, now) in zip(self.pair.blocks(state.samples()), self.blocks, strict=True):
@@ -166,13 +168,30 @@ def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
 
 
 def free(effect: Effect, theta: Theta) -> Theta:
-    """Free parameters of a fit: logarithms of the positive ones."""
-    return np.array([np.log(t) if n.positive else t for t, n in zip(theta, effect.parameters, strict=True)])
+    """Free parameters of a fit: logarithms of the positive ones, and what a log reaches of amplitudes."""
+    x = np.array([np.log(t) if n.positive else t for t, n in zip(theta, effect.parameters, strict=True)])
+    if effect.reached is not None:
+        x[:-1] *= effect.reached(float(theta[-1]))
+    return x
 
 
 def bound(effect: Effect, x: Theta) -> Theta:
     """Parameters from the free ones: the inverse of `free`."""
-    return np.array([np.exp(np.clip(v, -50, 50)) if n.positive else v for v, n in zip(x, effect.parameters, strict=True)])
+    each = zip(x, effect.parameters, strict=True)
+    theta = np.array([np.exp(np.clip(v, -50, 50)) if n.positive else v for v, n in each])
+    if effect.reached is not None:
+        theta[:-1] /= effect.reached(float(theta[-1]))
+    return theta
+
+
+def bound_slopes(effect: Effect, theta: Theta) -> Float64[np.ndarray, "p p"]:
+    """Derivatives of the parameters by the free ones."""
+    slopes = np.diag([t if n.positive else 1.0 for t, n in zip(theta, effect.parameters, strict=True)])
+    if effect.reached is not None:
+        share, more = (effect.reached(float(theta[-1]) * at) for at in (1.0, np.exp(LOG_STEP)))
+        slopes[:-1, :-1] /= share
+        slopes[:-1, -1] = -theta[:-1] * np.log(more / share) / LOG_STEP
+    return slopes
 
 
 def step_of(parameter: Parameter) -> float:

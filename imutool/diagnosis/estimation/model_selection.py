@@ -253,7 +253,7 @@ class _Search:
         without = fit(self.logs, others, iterations=2, near=now)
         gain, aic = without.objective - now.objective, now.objective + 2 * len(now.chosen[k][1])
         for _, effect, start, promised in self.candidates.ranked(without, self.named, rivals)[:rivals]:
-            if effect.key != now.chosen[k][0].key and promised > share * gain:
+            if effect.name != now.chosen[k][0].name and promised > share * gain:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - share * gain)
                 if trial.objective + 2 * len(start) < aic + self.settings.clearly_better:
                     found.setdefault(effect.name, trial)

@@ -207,12 +207,13 @@ def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
 
 def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
     """Unidentified `effect.parameter`: as unsure as their prior, or fixed; none of a curve."""
+    name = effect.name if effect.kind == "catalogue" else effect.key
     for parameter, s in zip(effect.parameters, std, strict=True):
         if s > (log_prior if parameter.positive else parameter.plausible) and not curve:
-            yield f"{effect.key}.{parameter.name}"
+            yield f"{name}.{parameter.name}"
     if isinstance(effect.forward, FixedParameters) and effect.sensors == effect.forward.effect.sensors:
         free = {parameter.name for parameter in effect.parameters}
-        yield from (f"{effect.key}.{n.name}" for n in effect.forward.effect.parameters if n.name not in free)
+        yield from (f"{name}.{n.name}" for n in effect.forward.effect.parameters if n.name not in free)
 
 
 # ── the error of models ──

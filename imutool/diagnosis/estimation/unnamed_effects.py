@@ -259,9 +259,9 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
     """Whether a fitted frequency is no larger than its deviation, or no amplitude than its own.
 
     A curve's coefficients move together by a constant, which the bias takes: each is as unsure as its prior, however sure
-    the curve.
+    the curve. So do the amplitudes of a drift with a time constant that its log does not show.
     """
-    if curve:
+    if curve or effect.reached is not None:
         return False
     vague = any(
         parameter.unit == "Hz" and s >= value for parameter, value, s in zip(effect.parameters, theta, std, strict=True)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from imutool.diagnosis.result import Diagnosis, Finding
-from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped
+from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped, told
 from imutool.recording import GRAVITY_M_S2
 
 
@@ -61,6 +61,11 @@ def _bias_step(w: Words) -> str:
     """By how much, and when."""
     when = f" at {w.rest[0]}" if w.rest else ""
     return f"its bias steps by {w.main}{when}"
+
+
+def _bias_drift(w: Words) -> str:
+    """By how much it warms up, or how fast it drifts in a log that does not show where that ends."""
+    return f"its bias drifts by {w.main}{' in all' if w.rest else ', steadily'}"
 
 
 def _driven(w: Words) -> str:
@@ -134,8 +139,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_g_sensitivity": "{w.it} feels the specific force, with {w.main}",
     "gyro_quadratic": "{w.it} bends with the square of the rate, by {w.main}",
     "accel_quadratic": "{w.it} bends with the square of the specific force, by {w.main}",
-    "gyro_bias_drift": "its bias drifts by {w.main} in all",
-    "accel_bias_drift": "its bias drifts by {w.main} in all",
+    "gyro_bias_drift": _bias_drift,
+    "accel_bias_drift": _bias_drift,
     "gyro_bias_step": _bias_step,
     "accel_bias_step": _bias_step,
     "rate_curve": "{w.it} errs by a curve of the rate, with {w.main}",
@@ -212,7 +217,7 @@ def named_sentence(d: Diagnosis, finding: Finding) -> str:
 
 def effect_sentence(d: Diagnosis, finding: Finding) -> str:
     """What a finding does to the reading, with its numbers."""
-    parameters, small = distinguished(finding.parameters)
+    parameters, small = distinguished(told(finding))
     quantities = grouped(parameters)
     main = quantities[0] if quantities else Quantity("", (), ())
     words = Words(_pronoun(finding.signal), reference(d), main, tuple(quantities[1:]), finding)
@@ -248,7 +253,7 @@ def parameters_text(finding: Finding) -> str:
     """Quantities of a finding: `r (0.213, -0.051, 0.120) ± 0.004 m`; of a curve its variable."""
     if finding.curve is not None:
         return f"a curve of {finding.curve.variable}"
-    parameters, small = distinguished(finding.parameters)
+    parameters, small = distinguished(told(finding))
     return (", ".join(q.labelled for q in grouped(parameters)) or finding.equation) + indistinct(small)
 
 

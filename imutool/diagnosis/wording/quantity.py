@@ -7,11 +7,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from imutool.diagnosis.result import Estimate
+from imutool.diagnosis.result import Estimate, Finding
 from imutool.units import AXES, with_superscripts
 
 SHOWN = 3  # numbers of one quantity; a matrix has up to nine
 VAGUE = 10.0  # times the least deviation of a course: from here on a time shows too little to count in its span
+RATES = {"rad/s": "rad/s²", "m/s²": "m/s³"}  # unit of a rate, by that of an amplitude
 RAISED = ("⁰", "¹", "²", "³", "⁴", "⁵", "⁶", "⁷", "⁸", "⁹")
 
 # A quantity of a unit is shown in the first step that it is not too small for: (from, size of the step, its symbol).
@@ -64,6 +65,14 @@ class Quantity:
     def size(self) -> str:
         """As `str`, without the sign."""
         return str(Quantity(self.label, self.axes, tuple(Estimate(abs(e.value), e.std, e.unit) for e in self.estimates)))
+
+
+def told(finding: Finding) -> Mapping[str, Estimate]:
+    """Parameters as text tells them: of a drift whose time constant its log does not show, the rate alone."""
+    tau, amplitudes = finding.parameters.get("tau"), {key: one for key, one in finding.parameters.items() if key != "tau"}
+    if tau is None or not amplitudes or tau.std <= tau.value:
+        return finding.parameters
+    return {key: Estimate(one.value / tau.value, one.std / tau.value, RATES[one.unit]) for key, one in amplitudes.items()}
 
 
 def grouped(estimates: Mapping[str, Estimate]) -> list[Quantity]:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, each_axis, residual
+from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, each_axis, residual, starts_at
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
 TRAINING_TAU_S = 60.0
 START_TAU_S = (10.0, 30.0, 100.0)
+STEADY_TAU_S = 86400.0
 
 
 def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
@@ -45,7 +50,38 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
         starts=starts,
         trained=True,
         of_time=True,
+        reached=partial(_reached, TRAINING_TAU_S),
     )
+
+
+def within(effects: Sequence[Effect], end_s: float) -> Iterator[Effect]:
+    """Effects in a log that ends then: each warm-up by what is reached of it, and a steady drift beside it.
+
+    Of a time constant far beyond the log only the slope shows, A / tau. Tau is a day there, and as unsure as its prior.
+    """
+    for effect in effects:
+        if effect.reached is None:
+            yield effect
+        else:
+            yield from (replace(effect, reached=partial(_reached, end_s)), _steady(effect, _reached(end_s, STEADY_TAU_S)))
+
+
+def _steady(warming: Effect, share: float) -> Effect:
+    *amplitudes, tau = warming.parameters
+    sizes = (replace(one, plausible=one.plausible / share) for one in amplitudes)
+    fixed = replace(tau, plausible=STEADY_TAU_S, null_value=STEADY_TAU_S)
+    return replace(
+        warming,
+        variant="steady",
+        parameters=(*sizes, fixed),
+        forward=lambda samples, theta: warming.forward(samples, np.append(theta[:3], STEADY_TAU_S)),
+        starts=starts_at([0.0, 0.0, 0.0, STEADY_TAU_S]),
+        reached=None,
+    )
+
+
+def _reached(end_s: float, tau_s: float) -> float:
+    return -float(np.expm1(-end_s / tau_s))
 
 
 def _course(stamp_s: Float64[np.ndarray, " n"], tau_s: float) -> Float64[np.ndarray, " n"]:
