@@ -2,7 +2,7 @@
 
 A robust curve through poses takes an impact for a glitch: both are fast and rare. The IMU is their witness. A glitch is an
 error of a pose, which no sensor reads, but an impact is a motion of the body. So a curve in which all poses count alike is
-taken where it leaves clearly less of the samples.
+taken where the samples follow it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from scipy.fft import dct, idct
@@ -20,7 +21,6 @@ from imutool.diagnosis.audit.spectral_lines import by_differences
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.estimation.time_alignment import with_truth
-from imutool.diagnosis.estimation.whitening import Band
 from imutool.diagnosis.settings import DiagnoseSettings, ReferenceSettings
 from imutool.errors import DataError
 from imutool.recording import Recording
@@ -28,7 +28,7 @@ from imutool.sensor.effects.vibration import is_motion
 from imutool.sensor.samples import IdealMotion
 from imutool.sensor.trajectory import SmoothMotion, Stretch, smooth_motion
 
-CLEARLY = 0.5  # of the squares that the robust curve leaves of one sensor
+CLEAR = 3.0  # deviations of the slope
 
 
 def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pair]:
@@ -41,7 +41,7 @@ def align_with_poses(real: Recording, settings: DiagnoseSettings) -> Iterator[Pa
     pairs = list(_pairs(real, motion, settings))
     if motion.glitches:
         plain = list(_pairs(real, smooth_motion(real.truth, robust=False), settings))
-        pairs = plain if _explain_more(plain, pairs) else pairs
+        pairs = plain if _is_followed(plain, pairs) else pairs
     if not pairs:
         raise DataError(
             f"the true poses have no stretch of {settings.alignment.least_s:g} s that can be differentiated",
@@ -83,31 +83,34 @@ def _pairs(real: Recording, motion: SmoothMotion, settings: DiagnoseSettings) ->
         yield pair if real.truth.has_positions else replace(pair, known=of_gyro)
 
 
-def _explain_more(plain: Sequence[Pair], robust: Sequence[Pair]) -> bool:
-    """Whether plain curves leave clearly less of one sensor, and no more of the other."""
+def _is_followed(plain: Sequence[Pair], robust: Sequence[Pair]) -> bool:
+    """Whether samples follow plain curves where these leave the robust ones.
+
+    What is left of the samples beside the robust curve is regressed on the difference of the curves: an error of a pose has a
+    slope of 0, a motion of 1. No sensor may be nearer to 0, and one has to be clearly nearer to 1.
+    """
     if not plain or not robust:
         return bool(plain)
-    up_to_hz = min(pair.band_hz for pair in (*plain, *robust) if pair.band_hz is not None)
-    squares = [np.mean([_squares(pair, up_to_hz) for pair in pairs], axis=0) for pairs in (plain, robust)]
-    left = squares[0] / np.maximum(squares[1], np.finfo(np.float64).tiny)
-    return bool(left.max() <= 1.0 and left.min() < CLEARLY)
+    blocks = np.concatenate([_products(*both) for both in product(plain, robust)])
+    products, squares = blocks[:, 0], blocks[:, 1]
+    total = squares.sum(axis=0)
+    slope = products.sum(axis=0) / np.where(total > 0.0, total, 1.0)
+    std = np.sqrt(((products - slope * squares) ** 2).sum(axis=0)) / np.where(total > 0.0, total, 1.0)
+    nearer = ((slope - 0.5) / np.maximum(std, np.finfo(np.float64).tiny))[total > 0.0]
+    return bool(len(nearer) and nearer.min() > 0.0 and nearer.max() > CLEAR)
 
 
-def _squares(pair: Pair, up_to_hz: float) -> Float64[np.ndarray, "2"]:
-    """Mean square of what the motion leaves of each sensor in a band, less a constant, a gain and a delay of each axis."""
-    band = Band.below(up_to_hz, 1.0 / pair.period_s, pair.settings.noise)
-    rows, motion = (pair.fitted | pair.held_out)[:: band.every], expected(pair, ())
-    left = band(pair.real - motion)[rows]
-    like = np.stack([np.ones_like(motion), motion, rate := np.gradient(motion, axis=0), np.gradient(rate, axis=0)], axis=2)
-    each = [
-        _left(A, y) if known else 0.0
-        for A, y, known in zip(np.moveaxis(band(like)[rows], 1, 0), left.T, pair.axes, strict=True)
-    ]
-    return np.array([sum(each[:3]), sum(each[3:])])
-
-
-def _left(A: Float64[np.ndarray, "m q"], y: Float64[np.ndarray, " m"]) -> float:
-    return float(np.mean((y - A @ np.linalg.lstsq(A, y)[0]) ** 2))
+def _products(plain: Pair, robust: Pair) -> Float64[np.ndarray, "b 2 2"]:
+    """Products of the rest with the difference of the curves, and its squares, by block of time and sensor."""
+    t_s, mine, theirs = np.intersect1d(plain.stamp_s, robust.stamp_s, return_indices=True)
+    if not len(t_s):
+        return np.zeros((0, 2, 2))
+    motion = expected(robust, ())[theirs]
+    differs, rest = (expected(plain, ())[mine] - motion) * robust.axes, robust.real[theirs] - motion
+    rest = rest - np.median(rest, axis=0)
+    block = ((t_s - t_s[0]) / robust.settings.search.held_out_block_s).astype(int)
+    each = [[(x[:, part] * differs[:, part]).sum(axis=1) for part in robust.signals.values()] for x in (rest, differs)]
+    return np.moveaxis([[np.bincount(block, weights=column) for column in columns] for columns in each], 2, 0)
 
 
 def _with_lost_motion(ideal: IdealMotion, cutoffs_hz: tuple[float, float], share: float) -> IdealMotion:
