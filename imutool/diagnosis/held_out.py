@@ -163,7 +163,9 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
     residual = residual - residual.mean(axis=0)
     f_hz, power = welch(residual, rate_hz, nperseg=min(settings.segment_samples, len(residual)), axis=0)
     total = power.sum(axis=1)
-    seen = (f_hz >= settings.least_hz) & (f_hz <= 0.4 * rate_hz)
+    left, top = log.pair.noise_left, log.pair.settings.alignment.noise_band
+    most_hz = top * min(0.5 * rate_hz, np.inf if left is None else left.f_hz[-1])  # above, a simulation has no motion
+    seen = (f_hz >= settings.least_hz) & (f_hz <= most_hz)
     if not seen.any():
         return []
     peak = int(np.flatnonzero(seen)[np.argmax(total[seen])])

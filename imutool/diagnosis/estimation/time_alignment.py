@@ -1,10 +1,9 @@
 """Time alignment of a recording with a simulation or true poses: one clock, a row a sample.
 
-A simulation's samples carry noise of their own, and a term that can shrink the simulation would shrink its noise as well and
-look like physics. Where the simulation's poses explain its samples but for white noise, they stand in for them, with their
-derivatives. But poses are rounded. In their second derivative this error grows with the square of the frequency, and an effect
-that shrinks fast motion would remove it. So what neither IMU shares with the poses does not count as motion. If the poses do
-not explain the samples, a Wiener filter takes away what the samples' own spectrum shows to be noise.
+A simulation's samples carry noise of their own, and a term that shrinks the simulation would shrink it as well and look like
+physics. Where its poses explain its samples but for white noise, they stand in for them. But poses are rounded, and in their
+second derivative this error grows with the square of the frequency: what neither IMU shares with them does not count as motion.
+If they do not explain the samples, a Wiener filter takes away what the samples' own spectrum shows to be noise.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings
 from imutool.errors import DataError
 from imutool.inertial.correlation import cross_correlation
 from imutool.inertial.kinematics import G_W, Motion, fit_trajectory
+from imutool.inertial.resampling import refined
 from imutool.inertial.stationary import is_white, nothing_but_noise, white_noise
 from imutool.inertial.strapdown import with_velocity
 from imutool.inertial.wiener import NoiseLeft, denoised, recorded_at
@@ -148,8 +148,7 @@ def _pair(
 
 
 def _shared_s(stamp_s: Float64[np.ndarray, " n"], inside: Bool[np.ndarray, " n"]) -> float:
-    shared = stamp_s[inside]
-    return float(shared[-1] - shared[0]) if len(shared) > 1 else 0.0
+    return float(np.ptp(stamp_s[inside])) if inside.any() else 0.0
 
 
 def _channels(recording: Recording, t_ns: np.ndarray) -> dict[str, Float64[np.ndarray, " n"]]:
@@ -182,11 +181,12 @@ def _simulated(
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns)  # which does not share errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
+    clean = refined(clean, white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)))
+    t_s = np.linspace(t_s[0], t_s[-1], len(clean))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-    R_wb = _attitude(sim, t_ns + round(shift_s * 1e9))
-    if R_wb is None:
-        R_wb = _attitude(real, t_ns)
+    own = _attitude(sim, t_ns + round(shift_s * 1e9))
+    R_wb = _attitude(real, t_ns) if own is None else own
     return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, None if own_poses else left
 
 
