@@ -142,6 +142,17 @@ def test_a_finding_of_a_message_explains_its_fields() -> None:
     assert "no known effect" not in conclusion(replace(diagnoses.ARM, findings=(wheels,), located=(place,), unexplained=left))
 
 
+@pytest.mark.parametrize(
+    ("tau", "words"),
+    [(Estimate(86400.0, 1.3e5, "s"), "its bias drifts by [(400.0, -300.0, 500.0) ± 1.0] × 10⁻⁶ rad/s², steadily ("),
+     (Estimate(20.0, 1.0, "s"), "its bias drifts by (34.56, -25.92, 43.20) ± 0.09 rad/s in all, tau 20.0 ± 1.0 s (")],
+)  # fmt: skip
+def test_a_drift_whose_end_the_log_does_not_show_is_told_as_a_rate(tau: Estimate, words: str) -> None:
+    amplitudes = {axis: Estimate(value, 0.0864, "rad/s") for axis, value in zip("xyz", (34.56, -25.92, 43.2), strict=True)}
+    drift = finding("gyro_bias_drift", {**amplitudes, "tau": tau})
+    assert named_sentence(diagnoses.ARM, drift).startswith(words)
+
+
 def test_a_curve_of_which_no_number_is_distinguished_still_has_a_sentence() -> None:
     curve = replace(diagnoses.NAMELESS.findings[0].curve, variable="t")
     drift = finding("drift", {"c0": Estimate(0.1, 1.0, "m")}, equation="y += curve(t)", curve=curve)

@@ -9,9 +9,10 @@ import pytest
 from support import planted
 
 from imutool.diagnosis.estimation.gauss_newton import ONSET_TAKES, Fit, fit
-from imutool.diagnosis.estimation.jacobians import Jacobians, bound, expected, free
+from imutool.diagnosis.estimation.jacobians import Jacobians, bound, bound_slopes, expected, free
 from imutool.diagnosis.settings import DiagnoseSettings, FitSettings
 from imutool.sensor import catalogue
+from imutool.sensor.effects import gyro_bias_drift
 
 SURE = 4.0  # standard deviations: 1 in 16 000 outside
 SEEDS = 20
@@ -227,3 +228,28 @@ def test_of_an_onset_which_moves_later_a_first_step_foretells_less() -> None:
     for share, stepped in ((0.5, True), (0.5 / ONSET_TAKES, False)):
         limited = fit([log], now.chosen[:1], near=now, give_up_above=now.objective + share * gain)
         assert (limited.objective <= without.objective + 1.0) == stepped
+
+
+def test_a_drift_far_longer_than_its_log_is_found_by_what_the_log_reaches_of_it() -> None:
+    truth = np.array([100.0, -60.0, 80.0, 1e4])  # a slope of 0.01 rad/s², so clear that the time constant has to be right
+    pair = planted.pair(planted.rich(), {"gyro_bias_drift": truth.tolist()})
+    warm_up, steady = gyro_bias_drift.within(catalogue.diagnosed(["gyro_bias_drift"]), float(pair.stamp_s[-1]))
+    slope = truth[:3] / truth[3]
+    for effect in (warm_up, steady):
+        got = fit([planted.weighed(pair)], ((effect, pair.starts(effect)[-1]),))
+        assert got.reduced_chi_square < 1.1
+        (_, theta), std = got.chosen[0], got.stds()[effect.key]
+        assert theta[:3] / theta[3] == pytest.approx(slope, rel=0.02)
+        assert std[3] > 0.5 * theta[3]  # no log of half a minute shows hours
+    assert np.abs(theta[:3] / theta[3] - slope).max() < SURE * std[:3].max() / theta[3]
+    assert bound(warm_up, free(warm_up, truth)) == pytest.approx(truth)
+
+
+def test_parameters_change_with_the_free_ones_as_their_slopes_say() -> None:
+    warm_up, _ = gyro_bias_drift.within(catalogue.diagnosed(["gyro_bias_drift"]), 40.0)
+    theta, h = np.array([0.02, -0.01, 0.03, 90.0]), 1e-6
+    x = free(warm_up, theta)
+    differences = np.stack(
+        [(bound(warm_up, x + step) - bound(warm_up, x - step)) / (2.0 * h) for step in h * np.eye(4)], axis=1
+    )
+    assert bound_slopes(warm_up, theta) == pytest.approx(differences, rel=2e-3)
