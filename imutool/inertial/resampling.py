@@ -1,4 +1,7 @@
-"""Resampling of an even signal by the sampling theorem, where a cubic spline between its samples would lose motion."""
+"""Resampling of an even signal by the sampling theorem.
+
+A cubic spline between samples loses motion that is nearly as fast as half of their rate.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ MOST_FACTOR = 8
 
 
 def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "m k"]:
-    """Samples at a whole multiple of the rate, so that a cubic spline through them errs by less than some noise.
+    """Samples so dense that a cubic spline through them errs by less than some noise.
 
-    Nothing is added above half of the old rate, and samples that were there stay. What is not on the line from end to end is
+    Their rate is a multiple of the old one. Nothing is added above half of the old rate, and samples that were there stay. What is not on the line from end to end is
     mirrored at both ends, where it is zero, so that it has no step there.
     """
     factor = _factor(x, AS_GOOD * noise)

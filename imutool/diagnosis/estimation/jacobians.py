@@ -168,7 +168,7 @@ def with_value(chosen: Chosen, k: int, j: int, value: float) -> Chosen:
 
 
 def free(effect: Effect, theta: Theta) -> Theta:
-    """Free parameters of a fit: logarithms of the positive ones, and what a log reaches of amplitudes."""
+    """Free parameters of a fit: logarithms of positive ones, what a log reaches of amplitudes."""
     x = np.array([np.log(t) if n.positive else t for t, n in zip(theta, effect.parameters, strict=True)])
     if effect.reached is not None:
         x[:-1] *= effect.reached(float(theta[-1]))

@@ -68,7 +68,10 @@ class Quantity:
 
 
 def told(finding: Finding) -> Mapping[str, Estimate]:
-    """Parameters as text tells them: of a drift whose time constant its log does not show, the rate alone."""
+    """Parameters as text tells them.
+
+    Of a drift whose time constant its log does not show, that is the rate alone.
+    """
     tau, amplitudes = finding.parameters.get("tau"), {key: one for key, one in finding.parameters.items() if key != "tau"}
     if tau is None or not amplitudes or tau.std <= tau.value:
         return finding.parameters
