@@ -18,8 +18,8 @@ MOST_FACTOR = 8
 def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "m k"]:
     """Samples so dense that a cubic spline through them errs by less than some noise.
 
-    Their rate is a multiple of the old one. Nothing is added above half of the old rate, and samples that were there stay. What is not on the line from end to end is
-    mirrored at both ends, where it is zero, so that it has no step there.
+    Their rate is a multiple of the old one. Nothing is added above half of that, and samples that were there stay. What is not
+    on the line from end to end is mirrored at both ends, where it is zero, so that it has no step there.
     """
     factor = _factor(x, AS_GOOD * noise)
     line = np.linspace(x[0], x[-1], factor * (len(x) - 1) + 1)
