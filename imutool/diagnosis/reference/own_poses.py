@@ -110,7 +110,7 @@ def _products(plain: Pair, robust: Pair) -> Float64[np.ndarray, "b 2 2"]:
     rest = rest - np.median(rest, axis=0)
     block = ((t_s - t_s[0]) / robust.settings.search.held_out_block_s).astype(int)
     each = [[(x[:, part] * differs[:, part]).sum(axis=1) for part in robust.signals.values()] for x in (rest, differs)]
-    return np.moveaxis([[np.bincount(block, weights=column) for column in columns] for columns in each], 2, 0)
+    return np.moveaxis(np.array([[np.bincount(block, weights=column) for column in columns] for columns in each]), 2, 0)
 
 
 def _with_lost_motion(ideal: IdealMotion, cutoffs_hz: tuple[float, float], share: float) -> IdealMotion:
