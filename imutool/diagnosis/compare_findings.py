@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.observability import exclude_each_other, value
 from imutool.diagnosis.estimation.unnamed_effects import plausible_part
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.result import Curve, Estimate, Finding
-from imutool.diagnosis.wording.quantity import grouped, told
+from imutool.diagnosis.wording.quantity import grouped, stated_parameters
 from imutool.sensor import catalogue
 
 ALIKE_STD = 4.5  # joint deviations: chance exceeds them in 0.5 % (Student's t of ten blocks, the largest of nine numbers)
@@ -206,7 +206,7 @@ def _words(finding: Finding) -> str:
 
 
 def _numbers(finding: Finding) -> str:
-    return _listed(told(finding))
+    return _listed(stated_parameters(finding))
 
 
 def _listed(parameters: Mapping[str, Estimate]) -> str:

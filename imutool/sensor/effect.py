@@ -105,8 +105,8 @@ class Effect:
     fast: a trained effect for given parameters, where `forward` would be slow; the same numbers.
     lagless: `forward` with its gain and without its lag.
     of_time: what it adds depends on time alone, as the walk of a bias does.
-    reached: share of its amplitudes that a log sees, by the last parameter, a time constant. A fit moves what is seen: of a
-        time constant longer than the log only the slope is, and an amplitude in proportion does as well.
+    reached: share of the amplitudes that shows in a log, by the last parameter, a time constant. A fit moves this share: of a
+        time constant longer than the log only the slope shows, and any larger amplitude with a longer one gives the same.
     """
 
     name: str

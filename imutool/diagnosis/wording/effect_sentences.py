@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from imutool.diagnosis.result import Diagnosis, Finding
-from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped, told
+from imutool.diagnosis.wording.quantity import SHOWN, Quantity, distinguished, grouped, stated_parameters
 from imutool.recording import GRAVITY_M_S2
 
 
@@ -64,7 +64,7 @@ def _bias_step(w: Words) -> str:
 
 
 def _bias_drift(w: Words) -> str:
-    """By how much it warms up, or how fast it drifts in a log that does not show where that ends."""
+    """Size of a warm-up, or rate of a drift whose end the log does not show."""
     return f"its bias drifts by {w.main}{' in all' if w.rest else ', steadily'}"
 
 
@@ -217,7 +217,7 @@ def named_sentence(d: Diagnosis, finding: Finding) -> str:
 
 def effect_sentence(d: Diagnosis, finding: Finding) -> str:
     """What a finding does to the reading, with its numbers."""
-    parameters, small = distinguished(told(finding))
+    parameters, small = distinguished(stated_parameters(finding))
     quantities = grouped(parameters)
     main = quantities[0] if quantities else Quantity("", (), ())
     words = Words(_pronoun(finding.signal), reference(d), main, tuple(quantities[1:]), finding)
@@ -253,7 +253,7 @@ def parameters_text(finding: Finding) -> str:
     """Quantities of a finding: `r (0.213, -0.051, 0.120) ± 0.004 m`; of a curve its variable."""
     if finding.curve is not None:
         return f"a curve of {finding.curve.variable}"
-    parameters, small = distinguished(told(finding))
+    parameters, small = distinguished(stated_parameters(finding))
     return (", ".join(q.labelled for q in grouped(parameters)) or finding.equation) + indistinct(small)
 
 

@@ -67,10 +67,10 @@ class Quantity:
         return str(Quantity(self.label, self.axes, tuple(Estimate(abs(e.value), e.std, e.unit) for e in self.estimates)))
 
 
-def told(finding: Finding) -> Mapping[str, Estimate]:
-    """Parameters as text tells them.
+def stated_parameters(finding: Finding) -> Mapping[str, Estimate]:
+    """Parameters as sentences state them.
 
-    Of a drift whose time constant its log does not show, that is the rate alone.
+    Of a drift whose time constant the log does not show, only the rate is stated.
     """
     tau, amplitudes = finding.parameters.get("tau"), {key: one for key, one in finding.parameters.items() if key != "tau"}
     if tau is None or not amplitudes or tau.std <= tau.value:
