@@ -1,7 +1,4 @@
-"""Report of a diagnosis: located misfits, findings, biases, unexplained residuals.
-
-`DiagnosisReport` is the JSON `imutool.diagnosis/1`; the traces of a `Diagnosis` are for figures only.
-"""
+"""Report of a diagnosis: located misfits, findings, biases, unexplained residuals."""
 
 from __future__ import annotations
 
@@ -254,6 +251,10 @@ class Diagnosis:
     closed: ClosedLoop | None = None
     imus: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)  # other IMUs of the log, by topic
     start_ns: int | None = None  # of the first log, on the clock of the simulation: times count from it
+
+    def __repr__(self) -> str:
+        found = ", ".join(f"{one.effect} ({one.signal}, {one.share:.0%})" for one in self.findings)
+        return f"<diagnosis of {', '.join(self.real)}: {found or ('no name' if self.located else 'a constant bias at most')}>"
 
     @classmethod
     def without_imu(cls, reals: Sequence[Location], sim: Location) -> Diagnosis:

@@ -60,6 +60,12 @@ def test_nothing_is_said_plainly_and_what_cannot_be_seen_with_it() -> None:
     assert conclusion(still) == f"{NULL} These logs cannot show: gyro_scale (x, y), lever_arm, /odom.v.delay."
 
 
+def test_a_diagnosis_is_shown_by_its_findings_alone() -> None:
+    shown = [repr(one) for one in (diagnoses.ARM, diagnoses.UNEXPLAINED, diagnoses.NOTHING)]
+    assert shown[0] == "<diagnosis of real.mcap: lever_arm (accel, 71%)>"
+    assert [text.rpartition(": ")[2] for text in shown[1:]] == ["no name>", "a constant bias at most>"]
+
+
 def test_several_findings_are_one_sentence_strongest_first_with_their_gain_and_what_is_left() -> None:
     said = headline(diagnoses.BOTH)
     assert said == (
