@@ -78,6 +78,7 @@ class TopicSummary:
         axes: signed permutations that lead from the log's axes to right ones, gyro then accel.
         world: rotation of the poses' world after which z is up.
         position_unit: of the poses' positions.
+        quaternions: what is wrong with those of the poses; empty where nothing is.
         pose_delay_ns: by which the stamps of the poses are late.
         late_ns: sorted stamps of late samples (from `time_back`): they are not missing.
         jumps: numbers of the samples before which the clock of the stamps stepped (from `clock_jumps`).
@@ -92,6 +93,7 @@ class TopicSummary:
     axes: Float64[np.ndarray, "2 3 3"] = field(default_factory=lambda: np.stack([np.eye(3)] * 2))
     world: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     position_unit: str = "m"
+    quaternions: str = ""
     pose_delay_ns: int = 0
     late_ns: Int64[np.ndarray, " n"] = field(default_factory=lambda: np.zeros(0, np.int64))
     jumps: frozenset[int] = frozenset()

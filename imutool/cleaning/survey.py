@@ -45,6 +45,7 @@ class Survey:
         axes: signed permutations from the log's axes to right ones, gyro then accel; other than the identity only with `fix`.
         world: rotation of the poses' world after which z is up.
         position_unit: of the poses' positions.
+        quaternions: what is wrong with those of the poses; empty where nothing is.
         pose_topic: topic of the poses, and `pose_delay_ns` by which they are late.
         surplus: bit-for-bit copies of other messages; to drop them costs nothing.
         reasons: why the log is not to be trusted; empty where it is.
@@ -63,6 +64,7 @@ class Survey:
     axes: Float64[np.ndarray, "2 3 3"]
     world: Float64[np.ndarray, "3 3"]
     position_unit: str
+    quaternions: str
     pose_topic: str
     pose_delay_ns: int
     findings: tuple[Finding, ...]
@@ -209,7 +211,7 @@ def examine(
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
     counts = whole.messages, start_ns, end_ns, missing, surplus
     pose_topic = "" if truth is None else truth.topic
-    frames = whole.axes, whole.world, whole.position_unit, pose_topic, whole.pose_delay_ns
+    frames = whole.axes, whole.world, whole.position_unit, whole.quaternions, pose_topic, whole.pose_delay_ns
     return Survey(where, topic, settings, *counts, dropped, whole.scale, *frames, findings, reasons)
 
 

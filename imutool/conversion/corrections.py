@@ -19,9 +19,9 @@ import numpy as np
 from imutool import registry
 from imutool.array_types import Float64, Int64
 from imutool.cleaning import CleaningSettings, Survey, look
-from imutool.cleaning.conventions import axis_names
+from imutool.cleaning.conventions import MISREAD, axis_names
 from imutool.cleaning.position_unit import POSITIONS
-from imutool.conversion.message_patch import MessagePatch
+from imutool.conversion.message_patch import WXYZ_FROM_XYZW, XYZW_FROM_WXYZ, MessagePatch, corrected_imu
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import SAME_CLOCK_NS, find_stamps
 from imutool.errors import ConfigError
@@ -29,7 +29,6 @@ from imutool.geometry import quaternion
 from imutool.log_info.inspection import sound_samples
 from imutool.log_info.pose_imu_rotation import Body, frames_of_copies, turned_body
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
@@ -39,8 +38,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
 NOT_TURNED = Body(np.eye(3), frozenset())
-MOST_ROUNDS = 3  # a wrong clock of poses hides a turned body, and that a wrong world: each shows after the one before
-XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
+MOST_ROUNDS = 4  # quaternions in another order hide a wrong clock of poses, that a turned body, and that a wrong world
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,7 @@ class Corrections:
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
         body: rotation from the body of the poses on `pose_topic` to the IMU.
         unit: of the positions on `pose_topic`, of their velocities, and of transforms of the frames `copies`.
+        quaternions: what is wrong with those of `pose_topic` and `copies`, of `MISREAD`.
         stamps: new stamps of messages of an IMU, of poses or vectors, in file order.
         reflected: topics among them whose messages have a type of their own.
         notes: what is corrected, by topic.
@@ -65,6 +64,7 @@ class Corrections:
     body: Body = NOT_TURNED
     pose_topic: str = ""
     unit: str = "m"
+    quaternions: str = ""
     copies: frozenset[str] = frozenset()
     stamps: Mapping[str, Int64[np.ndarray, "..."]] = field(default_factory=dict)
     reflected: Mapping[str, Reflected] = field(default_factory=dict)
@@ -121,7 +121,7 @@ class Corrections:
             patched = self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
             return message._replace(payload=patched)
         if topic.name in self.imus:
-            return message._replace(payload=_imu(topic, bytes(message.payload), *self.imus[topic.name]))
+            return message._replace(payload=corrected_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         if not (self.pose_topic and _is_pose(topic)):
             return message
         patch = MessagePatch(topic, bytes(message.payload))
@@ -150,10 +150,13 @@ class Corrections:
                 factor = POSITIONS[self.unit] if dict(topic.metadata)[VELOCITY_KEY] == self.pose_topic else 1.0
                 numbers[:] = factor * self.world @ numbers
                 continue
-            is_copy = named == 2 and patch.layout.texts[2 * which + 1] in self.copies
-            factor = POSITIONS[self.unit] if topic.name == self.pose_topic or is_copy else 1.0
+            judged = topic.name == self.pose_topic or (named == 2 and patch.layout.texts[2 * which + 1] in self.copies)
+            factor = POSITIONS[self.unit] if judged else 1.0
             numbers[schemas.POSITION] = factor * self.world @ numbers[schemas.POSITION]
             q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW][None].astype(np.float64)
+            if judged and self.quaternions:
+                rows, signs = MISREAD[self.quaternions]
+                q_wxyz = q_wxyz[:, rows] * signs
             if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
                 q_wxyz = quaternion.multiply(q_wxyz, body)
             numbers[schemas.XYZW] = quaternion.multiply(turn, q_wxyz)[0][XYZW_FROM_WXYZ]
@@ -163,27 +166,6 @@ def _is_pose(topic: MessageTopic) -> bool:
     """Whether a topic holds poses, or their velocities."""
     name = schemas.canonical(topic.schema_name)
     return name in (*MESSAGE_POSES, schemas.TF) or (name == schemas.VECTOR3 and VELOCITY_KEY in dict(topic.metadata))
-
-
-def _imu(topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]) -> bytes:
-    """Message of an IMU with both vectors, their covariances and its own orientation in right units and axes."""
-    patch = MessagePatch(topic, payload)
-    numbers = patch.numbers()
-    for matrix, vector, covariance in (
-        (gyro, schemas.GYRO, schemas.GYRO_COVARIANCE),
-        (accel, schemas.ACCEL, schemas.ACCEL_COVARIANCE),
-    ):
-        numbers[vector] = matrix @ numbers[vector]
-        if numbers[covariance][0] != -1.0:
-            numbers[covariance] = (matrix @ numbers[covariance].reshape(3, 3) @ matrix.T).reshape(-1)
-    if numbers[schemas.ORIENTATION_COVARIANCE][0] != NO_ORIENTATION:
-        P, Q = (np.sign(matrix) * (matrix != 0) for matrix in (gyro, accel))
-        if (P == Q).all() and np.linalg.det(P) > 0:
-            q_wxyz = numbers[schemas.ORIENTATION][WXYZ_FROM_XYZW][None].astype(np.float64)
-            numbers[schemas.ORIENTATION] = quaternion.multiply(q_wxyz, quaternion.of_matrix(P.T))[0][XYZW_FROM_WXYZ]
-        else:
-            numbers[schemas.ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
-    return bytes(patch.data)
 
 
 def parse_corrections(names: Sequence[str]) -> tuple[str, ...]:
@@ -206,7 +188,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     """
     imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
     notes: dict[str, list[str]] = defaultdict(list)
-    world, frame_id, late_ns, body, pose_topic, unit = np.eye(3), "", 0, NOT_TURNED, "", "m"
+    world, frame_id, late_ns, body, pose_topic, unit, quaternions = np.eye(3), "", 0, NOT_TURNED, "", "m", ""
     copies, kept = frozenset[str](), list[str]()
     with Log(path) as log:
         stamps = find_stamps(log, notes) if STAMPS in wanted else {}
@@ -227,16 +209,17 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 notes[topic].append(_imu_note(survey) + others)
             if frame_id or not survey.pose_topic:
                 continue
-            comes_later = topic in imus or survey.pose_delay_ns  # a body's rotation shows by right rates at right times
+            comes_later = topic in imus or survey.pose_delay_ns or survey.quaternions  # all of it hides a body's rotation
             turned = None if comes_later else turned_body(log, sound_samples(log, topic), survey.pose_topic)
             if changes := _pose_notes(survey, turned):
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
-                unit, copies = survey.position_unit, frames_of_copies(log, pose_topic)
+                unit, quaternions, copies = survey.position_unit, survey.quaternions, frames_of_copies(log, pose_topic)
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
                 notes[pose_topic] += changes
         own_types = {t: found for t in (*stamps, *imus) if isinstance(found := log.topics[t].reflected, Reflected)}
     said = {topic: "; ".join(lines) for topic, lines in notes.items()}
-    return Corrections(imus, world, frame_id, late_ns, body, pose_topic, unit, copies, stamps, own_types, said, kept)
+    poses = world, frame_id, late_ns, body, pose_topic, unit, quaternions, copies
+    return Corrections(imus, *poses, stamps, own_types, said, kept)
 
 
 def _imu_note(survey: Survey) -> str:
@@ -247,6 +230,8 @@ def _imu_note(survey: Survey) -> str:
 
 def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
     parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
+    if survey.quaternions:
+        parts.append(f"quaternions are now those of the body in the world, as recorded they {survey.quaternions}")
     if survey.position_unit != "m":
         parts.append(f"positions are now in m, and were in {survey.position_unit}")
     if survey.pose_delay_ns:

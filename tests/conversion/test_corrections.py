@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool import registry
 from imutool.api.models import debias as debias_log
+from imutool.cleaning.conventions import MISREAD
 from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.run import convert
 from imutool.errors import LogError
@@ -100,6 +101,28 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     assert any("the body is now that of the IMU" in note for note in report.notes)
     assert inspect(tmp_path / "straight.mcap").warnings == []
     with Log(tmp_path / "straight.mcap") as log:
+        transforms = np.concatenate([batch.q_wb_wxyz for batch in log.pose_batches("/tf")])
+    np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("what", MISREAD)
+def test_misread_quaternions_come_back_and_what_they_hid_too(what: str, made: Recording, tmp_path: Path) -> None:
+    """In NED, so that a second error shows only after the first."""
+    rows, signs = MISREAD[what]
+    poses = in_ned(made.truth)
+    misread = np.empty_like(poses.q_wb_wxyz)
+    misread[:, rows] = poses.q_wb_wxyz * signs
+    write(replace(made, truths={"/ground_truth/pose": replace(poses, q_wb_wxyz=misread)}), tmp_path / "wrong.mcap")
+    warnings = inspect(tmp_path / "wrong.mcap").warnings
+    assert [warning for warning in warnings if what in warning and "--fix" in warning]
+    convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "right.mcap")
+    turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (fixed.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
+    assert (turn * true.inv()).magnitude().max() < 1e-7
+    np.testing.assert_array_equal(fixed.truth.p_wb, made.truth.p_wb)
+    assert inspect(tmp_path / "right.mcap").warnings == []
+    with Log(tmp_path / "right.mcap") as log:
+        assert what in log.metadata()[RECORD]["/ground_truth/pose"]
         transforms = np.concatenate([batch.q_wb_wxyz for batch in log.pose_batches("/tf")])
     np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-SOON_S = 60.0
+SOON_S = 240.0  # a machine may be busy with other tests
 
 
 def below(pid: int) -> list[int]:

@@ -36,9 +36,9 @@ class Axes(Rule):
         """Findings about the sensors' axes, the poses' world, and the poses' clock."""
         found = whole.conventions
         if found.quaternions:  # any other finding would be of poses that the log does not hold
-            yield Finding(
-                "axes", "warning", f"the quaternions of the poses {found.topic} {found.quaternions}", 1, confidence=0.95
-            )
+            whole.quaternions = found.quaternions
+            what = f"the quaternions of the poses {found.topic} {found.quaternions}"
+            yield Finding("axes", "warning", what, 1, values={"fix": "quaternions w, x, y, z"}, confidence=0.95)
             return
         fixed = whole.settings.fix
         for finding, gyro, accel in _sensors(found):

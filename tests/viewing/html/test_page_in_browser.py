@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from support import diagnoses, image_difference, viewers
 from support.made_once import made_once
+from support.processes import SOON_S
 
 from imutool.viewing.html import diagnosis_page, report
 from imutool.viewing.model.load_view import build
@@ -70,6 +71,7 @@ def visit(browser: Any) -> Iterator[Any]:
 
     def open_page(path: Path, *, scheme: str = "light", width: int = WIDE) -> Visit:
         context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": HEIGHT})
+        context.set_default_timeout(1e3 * SOON_S)
         contexts.append(context)
         one = Visit(context.new_page())
         one.page.on("console", lambda message: one.said.append(f"{message.type}: {message.text}"))

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from support import viewers
+from support.processes import SOON_S
 
 from imutool.viewing.rerun.entities.styles import XYZ
 
@@ -67,6 +68,7 @@ class Visit:
         self.asked: list[str] = []
         self.broken: list[str] = []
         self.context = browser.new_context(color_scheme=scheme, viewport=SIZE)
+        self.context.set_default_timeout(1e3 * SOON_S)
         self.page = self.context.new_page()
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.on("pageerror", lambda error: self.broken.append(str(error)))
