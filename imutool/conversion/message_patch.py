@@ -1,4 +1,4 @@
-"""Numbers and stamps of an encoded message, written in place."""
+"""Encoded messages patched in place: numbers and stamps, and an IMU's units and axes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class MessagePatch:
 def corrected_imu(
     topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]
 ) -> bytes:
-    """Message of an IMU with both vectors, their covariances and its own orientation in right units and axes."""
+    """Message of an IMU in right units and axes: both vectors, covariances, own orientation."""
     patch = MessagePatch(topic, payload)
     numbers = patch.numbers()
     for matrix, vector, covariance in (
