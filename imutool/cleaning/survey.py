@@ -211,8 +211,8 @@ def examine(
     start_ns, end_ns = whole.motion.start_ns or 0, whole.motion.end_ns
     counts = whole.messages, start_ns, end_ns, missing, surplus
     pose_topic = "" if truth is None else truth.topic
-    frames = whole.axes, whole.world, whole.position_unit, whole.quaternions, pose_topic, whole.pose_delay_ns
-    return Survey(where, topic, settings, *counts, dropped, whole.scale, *frames, findings, reasons)
+    poses = whole.world, whole.position_unit, whole.quaternions, pose_topic, whole.pose_delay_ns
+    return Survey(where, topic, settings, *counts, dropped, whole.scale, whole.axes, *poses, findings, reasons)
 
 
 def _through(
