@@ -141,7 +141,7 @@ def _wrong_gravity(samples: Samples, start: InitialBias) -> str:
     low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
     if not low <= size <= high:
         return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
-    without = f"the accelerometer would have a bias of {bias:.3g} m/s²: it does not measure gravity, or in another unit"
+    without = f"the accelerometer would have a bias of {bias:.3g} m/s²: it does not measure gravity, or its unit is not m/s²"
     return without if bias > GRAVITY_M_S2 - low else ""
 
 

@@ -38,7 +38,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
 NOT_TURNED = Body(np.eye(3), frozenset())
-MOST_ROUNDS = 4  # quaternions in another order hide a wrong clock of poses, that a turned body, and that a wrong world
+MOST_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ MOST_FACTOR = 8
 def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"]) -> Float64[np.ndarray, "m k"]:
     """Samples so dense that a cubic spline through them errs by less than some noise.
 
-    Their rate is a multiple of the old one. Nothing is added above half of that, and samples that were there stay. What is not
-    on the line from end to end is mirrored at both ends, where it is zero, so that it has no step there.
+    Their rate is a multiple of the old one. Old samples stay, and nothing is added above half of the old rate. The line from
+    the first sample to the last is taken off before: the rest is zero at both ends, and its odd mirror images join smoothly.
     """
     factor = _factor(x, AS_GOOD * noise)
-    line = np.linspace(x[0], x[-1], factor * (len(x) - 1) + 1)
     if factor == 1:
         return x
+    line = np.linspace(x[0], x[-1], factor * (len(x) - 1) + 1)
     sines = np.zeros((len(line) - 2, x.shape[1]))
     sines[: len(x) - 2] = factor * dst((x - line[::factor])[1:-1], type=1, axis=0)
     line[1:-1] += idst(sines, type=1, axis=0)
@@ -32,7 +32,7 @@ def refined(x: Float64[np.ndarray, "n k"], noise: Float64[np.ndarray, " k"]) -> 
 
 
 def _factor(x: Float64[np.ndarray, "n k"], most: Float64[np.ndarray, " k"]) -> int:
-    """How many times finer samples are, through which a cubic spline errs by no more than `most` (RMS).
+    """Factor of the rate from which on a cubic spline errs by no more than `most` (RMS).
 
     It passes a frequency f of a rate r on as sinc(f/r)^4 / (2/3 + cos(2 pi f/r) / 3) (Unser, IEEE Signal Processing Magazine
     16, 1999), and shows as much as it loses of it at other frequencies.

@@ -240,10 +240,10 @@ def is_white(
     factor: float,
     chance: float,
 ) -> bool:
-    """Whether a residual is white, without a line, and as quiet as a noise where it is slowest.
+    """Whether a residual is white, has no line, and is only noise at low frequencies.
 
-    White is what has as much power in each of so many bands as in the quietest, up to a factor of its size. A misfit of a
-    motion is loud at low frequencies, or near Nyquist, where poses lose impacts. Less than `least` is no misfit.
+    It is white if no band is louder than `factor` times the quietest of `bands` bands. A misfit of a motion is loud at low
+    frequencies, or near Nyquist, where poses lose impacts. Less than `least` is no misfit.
     """
     from scipy.signal import periodogram
 

@@ -158,7 +158,7 @@ def _shared(
     if independent <= 2 * r:
         return None
     power = uniform_filter1d(np.einsum("fti,ftj->fij", parts, parts.conj()), around, axis=0, mode="nearest")
-    size = np.sqrt(np.maximum(np.abs(np.diagonal(power, axis1=1, axis2=2)), 1e-300))  # of an axis that is stuck nothing
+    size = np.sqrt(np.maximum(np.abs(np.diagonal(power, axis1=1, axis2=2)), 1e-300))  # zero on a stuck axis
     power /= size[:, :, None] * size[:, None, :]
     of_recorded, cross = power[:, :r, :r] + 1e-9 * np.eye(r), power[:, :r, r:]
     coherence = np.einsum("frk,frk->fk", cross.conj(), np.linalg.solve(of_recorded, cross)).real

@@ -134,7 +134,7 @@ def test_a_bias_at_rest_as_large_as_gravity_is_none(bias: float, verdict: str, r
     """It is what rest shows of accelerations without gravity, and of those in g, however strong the motion later is."""
     found = judge(static.Model(), from_numbers(f"0,0,0,0,0,{bias}"), [relative_samples(recording.imu)], {})
     assert found.verdict == verdict
-    assert ("does not measure gravity, or in another unit" in found.reasons[0]) == (verdict == "unfit")
+    assert ("does not measure gravity, or its unit is not m/s²" in found.reasons[0]) == (verdict == "unfit")
 
 
 def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(model: BiasModel, scaled: Imu) -> None:

@@ -12,6 +12,7 @@ from imutool.units import AXES, with_superscripts
 
 SHOWN = 3  # numbers of one quantity; a matrix has up to nine
 VAGUE = 10.0  # times the least deviation of a course: from here on a time shows too little to count in its span
+DRIFTS = frozenset({"gyro_bias_drift", "accel_bias_drift"})
 RATES = {"rad/s": "rad/s²", "m/s²": "m/s³"}  # unit of a rate, by that of an amplitude
 RAISED = ("⁰", "¹", "²", "³", "⁴", "⁵", "⁶", "⁷", "⁸", "⁹")
 
@@ -72,9 +73,10 @@ def stated_parameters(finding: Finding) -> Mapping[str, Estimate]:
 
     Of a drift whose time constant the log does not show, only the rate is stated.
     """
-    tau, amplitudes = finding.parameters.get("tau"), {key: one for key, one in finding.parameters.items() if key != "tau"}
-    if tau is None or not amplitudes or tau.std <= tau.value:
+    tau = finding.parameters.get("tau") if finding.effect in DRIFTS else None
+    if tau is None or tau.std <= tau.value:
         return finding.parameters
+    amplitudes = {key: one for key, one in finding.parameters.items() if key != "tau"}
     return {key: Estimate(one.value / tau.value, one.std / tau.value, RATES[one.unit]) for key, one in amplitudes.items()}
 
 
