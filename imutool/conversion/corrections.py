@@ -231,7 +231,7 @@ def _imu_note(survey: Survey) -> str:
 def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
     parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
     if survey.quaternions:
-        parts.append(f"quaternions are now those of the body in the world, as recorded they {survey.quaternions}")
+        parts.append(f"quaternions now take vectors of the body to the world (as recorded, they {survey.quaternions})")
     if survey.position_unit != "m":
         parts.append(f"positions are now in m, and were in {survey.position_unit}")
     if survey.pose_delay_ns:
