@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,6 +23,14 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 S = TypeVar("S", bound=Settings)
 NESTED = "nested too deeply"
+WORDS = {
+    "int": "an integer",
+    "float": "a number",
+    "str": "text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a table",
+}
 MOST_NESTED = 32  # tables and lists in each other; ours have five
 MOST_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 kB, and a megabyte takes a second to parse
 
@@ -89,7 +98,18 @@ def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None)
     try:
         return msgspec.convert(values, cls)
     except msgspec.ValidationError as error:
-        raise ConfigError(str(error).rstrip("."), where=where or "settings") from error
+        raise _of_value(str(error), where) from error
+
+
+def _of_value(said: str, where: str | Path | None) -> ConfigError:
+    """Error of msgspec in our words: the setting, what it is, and what was expected."""
+    what, _, place = said.rstrip(".`").partition(" - at `$.")
+    expected, got = "", ""
+    if what.startswith("Expected "):
+        expected, _, got = what.removeprefix("Expected ").partition(", got ")
+        what = f"is {got}" if got else "is out of range"
+    what, expected = (re.sub(r"`(\w+)`", lambda name: WORDS.get(name[1], name[0]), text) for text in (what, expected))
+    return ConfigError(what, where=f"{where or 'settings'}{': ' * bool(place)}{place}", expected=expected)
 
 
 def plain(settings: Settings) -> dict[str, Any]:

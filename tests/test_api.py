@@ -226,7 +226,7 @@ STATIC = imutool.load_model("static")
         (lambda: imutool.debias(STILL, "static", imus=["/imu0"], overwrite=True), "imus, overwrite: a recording is debiased"),
         (lambda: imutool.debias(replace(STILL, imu=STILL.imu.rows(slice(0, 1))), "static"), "1 samples; expected at least 2"),
         (lambda: imutool.debias(STILL, "static", init=STILL), "init: of type Recording; expected the name of a method, or six"),
-        (lambda: imutool.load_model(STATIC), "of type Model; expected a file, or the name of a model"),
+        (lambda: imutool.load_model(STATIC), "name: of type Model; expected text or a path"),
         (lambda: imutool.bias_at_rest("static", STILL.imu), "model, imu: of type str, Imu"),
         (lambda: imutool.OnlineDebiaser("static"), "model: of type str; expected a loaded model"),
         (lambda: imutool.train([], "m.safetensors"), "logs: no log is given"),
@@ -237,8 +237,24 @@ STATIC = imutool.load_model("static")
         (lambda: imutool.train("a.mcap", "m.safetensors", method="lineer", settings={}), "method: .*Did you mean 'linear'"),
         (lambda: imutool.diagnose([]), "reals: no log is given"),
         (lambda: imutool.diagnose("a.mcap", metric=lambda log: 1.0), "`metric` is a function, for `close` and `sim`"),
+        (
+            lambda: imutool.debias("a.mcap", "b.mcap", model="static", smooth="no"),
+            "smooth: of type str; expected True or False",
+        ),
+        (lambda: imutool.simulate("a.mcap", "b.mcap", seed=1.5), "seed: of type float; expected an integer"),
+        (lambda: imutool.simulate("a.mcap", "b.mcap", noise=None), "noise: of type NoneType; expected text or a path"),
+        (lambda: imutool.read("a.mcap", truth=True), "truth: of type bool; expected text or None"),
+        (lambda: imutool.clean("a.mcap", rules=[3]), "rules: of type list; expected text or a list of texts"),
+        (
+            lambda: imutool.train("a.mcap", "m.safetensors", settings={"seed": "x"}),
+            "settings: seed: is text; expected an integer",
+        ),
+        (
+            lambda: imutool.train("a.mcap", "m.safetensors", settings={"steps": -1}),
+            "settings: steps: is out of range; expected an integer >=",
+        ),
     ],
-    ids=range(15),
+    ids=range(22),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):

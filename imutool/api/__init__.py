@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterable, Iterator
+from numbers import Integral, Real
+from typing import Any, NamedTuple, TypeVar, cast
 
 from imutool.errors import ConfigError
 from imutool.file_location import Location, LogPath, location, several
@@ -10,6 +15,59 @@ from imutool.file_location import Location, LogPath, location, several
 Progress = Callable[[int, int], None]  # bytes done, bytes in all
 NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 Init = str | Iterable[float]  # initial bias: the name of a method, or six numbers
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class _Kind(NamedTuple):
+    """Kind of value by its name in an annotation."""
+
+    words: str
+    accepts: Callable[[object], bool]
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool) or type(value).__name__ in ("bool", "bool_")  # numpy's, which may not be imported
+
+
+def _are_texts(value: object) -> bool:
+    return isinstance(value, Iterable) and (isinstance(value, Iterator) or all(isinstance(item, str) for item in value))
+
+
+KINDS = {
+    "str": _Kind("text", lambda value: isinstance(value, str)),
+    "Path": _Kind("a path", lambda value: isinstance(value, os.PathLike) or hasattr(type(value), "fs")),
+    "int": _Kind("an integer", lambda value: isinstance(value, Integral) and not _is_flag(value)),
+    "float": _Kind("a number", lambda value: isinstance(value, Real) and not _is_flag(value)),
+    "bool": _Kind("True or False", _is_flag),
+    "Sequence[str]": _Kind("a list of texts", _are_texts),
+    "None": _Kind("None", lambda value: value is None),
+}
+
+
+def checked(function: Function) -> Function:
+    """Public function that refuses values of another kind than its annotations name.
+
+    Of simple annotations alone, such as `int | None`. A number of numpy's becomes one of Python's.
+    """
+    named = {name: str(hint).split(" | ") for name, hint in function.__annotations__.items() if name != "return"}
+    kinds = {name: [KINDS[word] for word in words] for name, words in named.items() if set(words) <= set(KINDS)}
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        try:
+            bound = signature.bind(*args, **options)
+        except TypeError:
+            return function(*args, **options)  # Python's own error names the function
+        for name, value in bound.arguments.items():
+            if name in kinds and not any(kind.accepts(value) for kind in kinds[name]):
+                expected = " or ".join(kind.words for kind in kinds[name])
+                raise ConfigError(f"of type {type(value).__name__}", where=name, expected=expected)
+            if name in kinds and getattr(value, "shape", None) == ():  # a number or text of numpy's
+                bound.arguments[name] = value.item()
+        return function(*bound.args, **bound.kwargs)
+
+    return cast(Function, call)
 
 
 def given_logs(logs: LogPath | Iterable[LogPath], parameter: str) -> list[Location]:

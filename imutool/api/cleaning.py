@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from imutool.api import Init, NamedProgress, Progress, init_text
+from imutool.api import Init, NamedProgress, Progress, checked, init_text
 from imutool.bag.repair import NO_ATTACHMENTS, BagReport, is_bag, repair_bag
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.rule import chosen
@@ -35,6 +35,7 @@ class CleanReport:
     added: dict[str, int]
 
 
+@checked
 def clean(
     source: LogPath,
     target: LogPath | None = None,
@@ -116,6 +117,7 @@ def survey_imus(
         return CleanReport(tuple(surveys), log.losses, {})
 
 
+@checked
 def repair(
     source: LogPath,
     target: LogPath,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from imutool.api import NamedProgress
+from imutool.api import NamedProgress, checked
 from imutool.conversion import run as conversion
 from imutool.conversion.run import ConvertReport
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
@@ -24,6 +24,7 @@ from imutool.recording import Recording
 FORMATS = ("euroc", "rosbag2", *simulators.FORMATS)
 
 
+@checked
 def read(
     path: LogPath,
     *,
@@ -68,6 +69,7 @@ def read(
     return recording
 
 
+@checked
 def write(path: LogPath, recording: Recording, *, compression: str = "zstd", overwrite: bool = False) -> None:
     """Write a recording as an MCAP log. The log appears whole or not at all.
 
@@ -99,6 +101,7 @@ def write(path: LogPath, recording: Recording, *, compression: str = "zstd", ove
     write_log(recording, location(path), compression=compression, overwrite=overwrite)
 
 
+@checked
 def convert(
     source: str | Path,
     out: str | Path,
@@ -161,6 +164,7 @@ def convert(
     )
 
 
+@checked
 def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> LogInfo:
     """Report on a log: topics, rates, gaps, saturation, time at rest, truth coverage, damage.
 
@@ -185,6 +189,7 @@ def info(path: LogPath, *, check: bool = True, max_chunk: int | None = None) -> 
     return inspection.inspect(location(path), check=check, max_chunk=max_chunk)
 
 
+@checked
 def export(
     log: str | Path,
     out: str | Path,

@@ -11,7 +11,7 @@ from typing import overload
 import numpy as np
 
 from imutool import debiasing, evaluation
-from imutool.api import Init, Progress, init_text
+from imutool.api import Init, Progress, checked, init_text
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
@@ -33,6 +33,7 @@ from imutool.recording import Imu, Recording
 Model = str | Path | BiasModel
 
 
+@checked
 def load_model(name: str | Path, *, rate_hz: float | None = None, on_s: float | None = None) -> BiasModel:
     """Bias model from a file, by the name of a model that ships, or `static`.
 
@@ -149,6 +150,7 @@ def debias(
 ) -> DebiasReport: ...
 
 
+@checked
 def debias(
     source: LogPath | Recording,
     target: LogPath | BiasModel | None = None,

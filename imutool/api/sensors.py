@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from imutool import diagnosis_output
-from imutool.api import NamedProgress, given_logs
+from imutool.api import NamedProgress, checked, given_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.errors import ConfigError
 from imutool.file_location import LogPath, local, location, several
@@ -20,6 +20,7 @@ from imutool.sensor.simulate import Simulation
 from imutool.sensor.simulate import simulate as simulate_log
 
 
+@checked
 def example_recording(seed: int = 1, *, duration_s: float = 20.0) -> Recording:
     """Made-up flight with true poses and biases.
 
@@ -41,6 +42,7 @@ def example_recording(seed: int = 1, *, duration_s: float = 20.0) -> Recording:
     return flight(seed, msgspec.structs.replace(FlightSettings(), duration_s=duration_s))
 
 
+@checked
 def simulate(
     trajectory: str | Path,
     out: str | Path,
@@ -94,6 +96,7 @@ def simulate(
     )
 
 
+@checked
 def diagnose(
     reals: LogPath | Iterable[LogPath],
     sim: LogPath | None = None,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from imutool import evaluation
-from imutool.api import Init, given_logs, init_text
+from imutool.api import Init, checked, given_logs, init_text
 from imutool.bias.model import BiasModel
 from imutool.config import build
 from imutool.file_location import LogPath, local, several
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from imutool.training.fit import Epoch
 
 
+@checked
 def train(
     logs: LogPath | Iterable[LogPath],
     out: str | Path,
@@ -77,6 +78,7 @@ def train(
     )
 
 
+@checked
 def evaluate(
     log: str | Path,
     *,

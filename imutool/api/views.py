@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.api import Init, init_text
+from imutool.api import Init, checked, init_text
 from imutool.array_types import Float64
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import ConfigError, DataError, did_you_mean
@@ -27,6 +27,7 @@ from imutool.viewing.outputs import Outputs, RequestedOutputs
 from imutool.viewing.rerun import live
 
 
+@checked
 def load_run(
     log: LogPath,
     *,
@@ -82,6 +83,7 @@ def load_run(
     )
 
 
+@checked
 def view(
     logs: LogPath | RunData | Iterable[LogPath | RunData],
     *,
@@ -231,6 +233,7 @@ class LiveView:
         return self._show.shown
 
 
+@checked
 @contextmanager
 def watch(
     name: str, *, topic: str = "/imu0", connect: str | None = None, save: str | Path | None = None, overwrite: bool = False
