@@ -30,6 +30,7 @@ CONVERTIBLE = {  # messages of which `convert` makes others
     "px4_msgs/msg/VehicleOdometry": "poses",
     "px4_msgs/msg/VehicleImu": "an IMU",
 }
+QUATERNIONS = "quaternions of poses"  # said only where they are misread
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -105,7 +106,7 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
         size = f"reads {level:.4g} {'when calm' if at_rest else 'in the median'}"
         yield "unit of accel", bool(unit), f"{unit}: it {size}" if unit else f"cannot be judged: it {size}"
     if found.quaternions:
-        yield "quaternions of poses", True, f"they {found.quaternions}; what follows is judged without that"
+        yield QUATERNIONS, True, f"they {found.quaternions}; what follows is judged without that"
     turned = found.gyro is not None and found.gyro.sole
     by_gravity = _gyro(found.relative, "gravity as accel reads it")
     yield "gyro against accel", *(by_gravity or (False, f"cannot be judged: {NO_GRAVITY}"))

@@ -22,6 +22,7 @@ from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location
 from imutool.inertial.stationary import rest_stretches
 from imutool.log_info.convention_report import (
+    QUATERNIONS,
     constant_sensors,
     convention_summary,
     convention_warnings,
@@ -84,7 +85,8 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
             transforms(log, topic.name) if topic.schema_name == schemas.TF else [(topic.name, clocks[topic.name])]
         )
     ]
-    if check and own and truths and log.topics[own[0].topic].is_read:
+    misread = bool(own) and isinstance(own[0].conventions, list) and any(c.subject == QUATERNIONS for c in own[0].conventions)
+    if check and own and truths and log.topics[own[0].topic].is_read and not misread:  # such poses turn as no body does
         samples = sound_samples(log, own[0].topic)
         truths = [_against_gyro(log, truth, samples) for truth in truths]
     warnings = [f"{imu.topic}: {warning}" for imu in imus for warning in imu.warnings]
