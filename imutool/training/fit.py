@@ -32,7 +32,7 @@ from imutool.training.objectives.increments import IncrementObjective
 from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective, RestBiases, WindowEndObjective, error
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, corrected, sensors_up_to
-from imutool.units import SENSORS, Sensor
+from imutool.units import Sensor
 
 __all__ = ["Epoch", "Stage", "TrainSettings", "Training"]
 
@@ -144,9 +144,10 @@ class Training:
 
     def store_statistics(self, pool: Pool | None = None) -> None:
         """Store priors, spreads and noise of a pool with the same logs in the model, which is final then."""
-        lengths: dict[Sensor, tuple[float, ...]] = {sensor: self._window_s(sensor) for sensor in SENSORS}
         self.model.eval()
-        self.turn_on = bias_spread.store_statistics(self.model, pool or self.pool, self.tracks.per_log().detach(), lengths)
+        self.turn_on = bias_spread.store_statistics(
+            self.model, pool or self.pool, self.tracks.per_log().detach(), self.settings.window_s
+        )
         self.model.requires_grad_(False)
 
     def held_out(self, sensor: Sensor, model: BiasNetwork) -> float:
@@ -160,7 +161,7 @@ class Training:
         Each log's constant is solved for on that part first: it belongs to the run, and what is judged here is the sensor.
         """
         first, n = self._held_out_windows(sensor)
-        rest, lengths = self.tracks.per_log().detach(), self._window_s(sensor)[:2]
+        rest, lengths = self.tracks.per_log().detach(), self.settings.window_s[sensor][:2]
         columns = COLUMNS[sensor]
         rest[:, columns] = model.rest_at_work(sensor, rest[:, columns])
         scored, pool = corrected(model, self.pool, "held_out", sensors_up_to(sensor))
@@ -191,16 +192,13 @@ class Training:
         """Calibration and rest biases, as far as windows and a matrix show them."""
         rest = self.tracks.per_log().detach()
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
+        lengths = self.settings.window_s[sensor]
         if sensor not in self._constant:
-            self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, self._window_s(sensor), matrix=True).W)
+            self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, lengths, matrix=True).W)
         # constants that take the nuisances of their logs: the descent knows none
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
-        lengths = self._window_s(sensor)
         constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)
         self.tracks.set(sensor, constants.rest)
-
-    def _window_s(self, sensor: Sensor) -> tuple[float, ...]:
-        return self.settings.gyro_window_s if sensor == "gyro" else self.settings.accel_window_s
 
     def begin(self, sensor: Sensor) -> Stage:
         """Fresh stage from the current model and tracks: it moves the sensor's weights and the tracks."""

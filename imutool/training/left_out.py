@@ -5,7 +5,7 @@ Candidates, from the simplest: `constant` (the prior of the rest bias alone), `l
 samples and `static`, the log's own rest bias without any training, are scored alike. The poses are first turned and shifted by
 the rotation and the clock that are fitted between them and the sensor for this log alone. The simplest candidate that is not
 beaten is kept, for the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
-A left-out model is one Gauss-Newton step from the fit of all logs: effects are linear in their parameters, but the weights of
+Effects are linear in their parameters, so a left-out model is one Gauss-Newton step from the fit of all logs; the weights of
 outliers and the attitude under the accelerometer stay those of all logs (`tests/bench/left_out.py` fits anew).
 """
 
@@ -21,11 +21,8 @@ import torch
 
 from imutool.array_types import Float64
 from imutool.bias import static
-from imutool.bias.hybrid import Config
 from imutool.bias.model import BiasModel
-from imutool.bias.networks import hybrid
 from imutool.bias.networks.network import BiasNetwork
-from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
@@ -34,16 +31,16 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Recording, nanoseconds
-from imutool.training.bias_spread import speed_of, turn_on_prior
-from imutool.training.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.candidates import CANDIDATES, known, left_out_effects, left_out_model, with_statistics
+from imutool.training.effect_selection import LINEAR, Calibration, parameter_columns
 from imutool.training.log_signals import without_nuisances
+from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
 logger = logging.getLogger(__name__)
 
 STARTS = ("auto", "smooth", "truth")
-CANDIDATES = ("constant", "linear", "effects")  # from the simplest
 LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by which a candidate is better than a simpler one
 LEAST_ERROR = 1e-6  # ° or m/s
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
@@ -99,18 +96,23 @@ def compare(
     pool: Pool,
     fits: Mapping[Sensor, Calibration],
     trained: BiasNetwork,
+    settings: TrainSettings,
     scale: Scale | None = None,
 ) -> Comparison:
     """Scores of every left-out log.
 
-    `trained` has the statistics of all logs, `scale` is that of their temperature.
+    `trained` has the statistics of all logs without the effects of the fits, `scale` is that of their temperature.
     """
-    candidates = [c for c in CANDIDATES if all(_known(fit, c, sensor) for sensor, fit in fits.items())]
+    candidates = [c for c in CANDIDATES if all(known(fit, c, sensor) for sensor, fit in fits.items())]
+    if all(fit.named and set(fit.effects) == set(LINEAR[sensor]) for sensor, fit in fits.items()):
+        candidates.remove("effects")  # the same as `linear`
+    statistics = {c: with_statistics(fits, pool, trained, c, settings) for c in candidates}
 
     def of_log(numbered: tuple[int, Recording]) -> list[Score]:
         index, recording = numbered
-        effects = {c: {sensor: _names(fit, c, sensor, index) for sensor, fit in fits.items()} for c in candidates}
-        models = {c: bound_to(left_out_model(fits, pool, trained, effects[c], index, scale), recording) for c in candidates}
+        effects = {c: {sensor: left_out_effects(fit, c, sensor, index) for sensor, fit in fits.items()} for c in candidates}
+        left_out = {c: left_out_model(fits, pool, statistics[c], effects[c], index, scale) for c in candidates}
+        models = {c: bound_to(model, recording) for c, model in left_out.items()}
         log = _without_nuisances(recording, fits["gyro"], (), index)
         scores = [_score(log, "raw", "", log.imu)]
         scores += [_score(log, "static", start, imu) for start in STARTS for imu in _corrected(log, None, start)]
@@ -194,70 +196,10 @@ def _error(score: Score, sensor: Sensor) -> float | None:
     return score.aoe_deg if sensor == "gyro" else score.drift_m_s
 
 
-def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, str]) -> dict[str, tuple[str, ...]]:
-    """Settings of `hybrid` with the effects of the candidates kept, where they differ."""
-    effects: dict[str, tuple[str, ...]] = {}
-    for sensor, fit in fits.items():
-        names = {"constant": (), "linear": LINEAR[sensor], "effects": fit.effects}[kept[sensor]]
-        if not fit.named and set(names) != set(fit.effects):
-            effects[f"{sensor}_effects"] = names
-    return effects
-
-
-def left_out_model(
-    fits: Mapping[Sensor, Calibration],
-    pool: Pool,
-    trained: BiasNetwork,
-    effects: Mapping[Sensor, Sequence[str]],
-    index: int,
-    scale: Scale | None = None,
-) -> BiasModel:
-    """Model of a candidate's effects, with its prior of the rest bias, from all logs but one.
-
-    `scale` is that of the logs' temperature.
-    """
-    network = hybrid.Network(Config(remainder=False), pool.rate_hz).double()
-    rest = []
-    for sensor, fit in fits.items():
-        columns = parameter_columns(fit.forms, effects[sensor])
-        theta, covariance = fit.problem.solve(columns, without=index)
-        network.take(sensor, effects[sensor], theta[columns], covariance)
-        rest.append(np.delete(fit.problem.own_at(theta)[:, :3].cpu().numpy(), index, axis=0))
-    if scale is not None and network.temperature_theta():
-        network.take_temperature(scale.channel, temperature_tensors(scale, [], {}))
-    for name, value in trained.named_buffers(recurse=False):
-        getattr(network, name).copy_(value)
-    spans = [span for span in pool.spans_ns for _ in range(len(fits["gyro"].problem.own) // len(pool.names))]
-    unknown = [np.full_like(rest[0], np.nan)] * (2 - len(rest))
-    turn_on = turn_on_prior(np.concatenate([*rest, *unknown], axis=1), spans[:index] + spans[index + 1 :])
-    network.prior_mean.copy_(torch.from_numpy(turn_on.mean))
-    network.prior_std.copy_(torch.from_numpy(turn_on.std))
-    model = network.frozen()
-    model.card = {"logs": [{}] * (len(spans) - 1), **turn_on.card(), **speed_of(pool)}
-    return model
-
-
-def _names(fit: Calibration, candidate: str, sensor: Sensor, index: int) -> tuple[str, ...]:
-    """Effects of a candidate; those that the other logs support are found anew without the log."""
-    if candidate == "constant":
-        return ()
-    if candidate == "linear":
-        return LINEAR[sensor]
-    if fit.named:
-        return fit.effects
-    gains = effects_beyond_chance(fit.problem.without(index), fit.forms)
-    return tuple(form.name for form in fit.forms if form.name in gains)
-
-
 def _without_nuisances(log: Recording, fit: Calibration, names: Sequence[str], index: int) -> Recording:
     """Recording whose poses are turned and shifted onto the sensor, as far as a log left out shows that to some effects."""
     columns = parameter_columns(fit.forms, names)
     return without_nuisances(log, fit.problem.own_at(fit.problem.solve(columns, without=index).theta)[index].cpu().numpy())
-
-
-def _known(fit: Calibration, candidate: str, sensor: Sensor) -> bool:
-    """Whether a fit has the parameters of a candidate."""
-    return candidate != "linear" or set(LINEAR[sensor]) <= {form.name for form in fit.forms}
 
 
 def _logs(recordings: Sequence[Recording], pool: Pool, fit: Calibration) -> Iterator[Recording]:

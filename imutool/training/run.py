@@ -29,11 +29,12 @@ from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.bias_spread import speed_of
+from imutool.training.candidates import simpler_effects
 from imutool.training.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
-from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare, simpler_effects
+from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare
 from imutool.training.log_signals import with_poses_of_sensor
-from imutool.training.paper_scheme import PaperTraining
+from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
 from imutool.units import SENSORS, Sensor
@@ -160,7 +161,7 @@ def _physics_first(
     if settings.compare:
         descent.say(note("scoring left-out logs"))
         pool = Pool.of(recordings, floors=settings.pose_floors)
-        comparison = compare(recordings, pool, physics.fits, without.model, physics.scale)
+        comparison = compare(recordings, pool, physics.fits, without.model, settings, physics.scale)
         compared["left_out"] = comparison.card()
         constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
         if simpler := simpler_effects(physics.fits, comparison.kept):
@@ -243,7 +244,8 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
         hybrid_settings = msgspec.structs.replace(settings, model=names)
         physics = PhysicsFirst.of(recordings, hybrid_settings, descent.device, lambda epoch: None)
         without = descent(physics.recordings, static.Model.method, msgspec.structs.replace(settings, model={}))
-        comparison = compare(recordings, Pool.of(recordings, floors=settings.pose_floors), physics.fits, without.model)
+        pool = Pool.of(recordings, floors=settings.pose_floors)
+        comparison = compare(recordings, pool, physics.fits, without.model, settings)
         compared["left_out"] = comparison.card()
         constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
     training = descent(recordings, linear.Model.method, settings, constant)

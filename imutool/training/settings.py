@@ -18,7 +18,7 @@ from imutool.config import Settings
 from imutool.errors import ConfigError
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.linear_form import LinearForm
-from imutool.units import SENSORS
+from imutool.units import SENSORS, Sensor
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -37,7 +37,7 @@ class IncrementSettings(Settings, frozen=True):
 
 
 class PaperSettings(Settings, frozen=True):
-    """Training of the paper's scheme (`imutool.training.paper_scheme`).
+    """Training of the paper's scheme (`imutool.training.objectives.paper_scheme`).
 
     Numbers of the paper and of its released code.
     """
@@ -118,6 +118,11 @@ class TrainSettings(Settings, frozen=True):
     pose_floors: PoseFloors = PoseFloors()
     sensors: SensorPrior = SensorPrior()
     model: dict[str, Any] = msgspec.field(default_factory=dict)
+
+    @property
+    def window_s(self) -> dict[Sensor, tuple[float, ...]]:
+        """Lengths of the windows of each sensor."""
+        return {"gyro": self.gyro_window_s, "accel": self.accel_window_s}
 
 
 @functools.cache

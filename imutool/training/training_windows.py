@@ -203,7 +203,7 @@ def corrected(
     Of a model that forgets its start, what it adds to that start is taken off whole logs.
     """
     if model.forgets:
-        return static.Network().to(pool.t), _without_motion(model, pool)
+        return static.Network().to(pool.t), without_motion(model, pool)
     if not model.context:
         return model, pool
     columns = {"gyro": pool.gyro.clone(), "accel": pool.accel.clone()}
@@ -220,8 +220,11 @@ def corrected(
     return static.Network().to(pool.t), replace(pool, gyro=columns["gyro"], accel=columns["accel"])
 
 
-def _without_motion(model: BiasNetwork, pool: Pool) -> Pool:
-    """Pool without what a model adds to its prior, as `imutool.bias_start.bias_tracking` takes it off."""
+def without_motion(model: BiasNetwork, pool: Pool) -> Pool:
+    """Pool without what a model adds to its prior.
+
+    As `imutool.bias_start.bias_tracking` takes it off.
+    """
     inference, samples = model.frozen(), torch.cat([pool.gyro, pool.accel], dim=1)
     start, left = inference.prior_mean, samples.clone()
     for log in range(len(pool.names)):

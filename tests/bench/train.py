@@ -48,7 +48,7 @@ from imutool.recording import Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Training, TrainSettings
 from imutool.training.objectives.objective import RobustLoss, error
-from imutool.training.paper_scheme import PaperTraining
+from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import PaperSettings
 from imutool.training.training_windows import Windows
 from imutool.units import Sensor

@@ -108,7 +108,7 @@ class IncrementObjective(Objective):
     def settle(self) -> None:
         """Solves for the rest biases over long windows: short increments hardly show them, and the model kept is older."""
         rest, settings = self.tracks.per_log().detach(), self.settings
-        window_s = settings.gyro_window_s if self.sensor == "gyro" else settings.accel_window_s
+        window_s = settings.window_s[self.sensor]
         columns = COLUMNS[self.sensor]
         rest[:, columns] = self.model.eval().rest_at_work(self.sensor, rest[:, columns])
         model, pool = corrected(self.model, self.pool, "train", sensors_up_to(self.sensor))

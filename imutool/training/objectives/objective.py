@@ -204,7 +204,7 @@ class WindowEndObjective(Objective):
     """
 
     def _choose(self) -> None:
-        named = self.settings.gyro_window_s if self.sensor == "gyro" else self.settings.accel_window_s
+        named = self.settings.window_s[self.sensor]
         lengths = dict.fromkeys(self.pool.samples(window_s) for window_s in named)
         self.pools = [(n, first) for n in lengths if len(first := self.pool.starts(n, "train"))]
 

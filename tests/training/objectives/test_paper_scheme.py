@@ -18,7 +18,7 @@ from imutool.bias_start.correction import apply
 from imutool.recording import Imu, Recording
 from imutool.training import checkpoint
 from imutool.training.fit import Epoch, Training
-from imutool.training.paper_scheme import PaperTraining
+from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import PaperSettings, settings_of
 
 Make = Callable[..., Recording]
