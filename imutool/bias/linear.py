@@ -12,13 +12,15 @@ from typing import ClassVar
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.bias.model import BiasModel, Shapes, Stream, Vector6, matrices
+from imutool.bias.model import BiasModel, CovarianceModel, Shapes, Stream, Vector6, matrices
 from imutool.config import Settings
-from imutool.units import SENSORS
+from imutool.units import SENSORS, Sensor
 
 
 class Config(Settings, frozen=True):
-    """No settings; the training has its own."""
+    """What the file holds; the training has its own settings."""
+
+    covariance: bool = False  # of W, row by row; older files have none
 
 
 class Model(BiasModel):
@@ -31,6 +33,7 @@ class Model(BiasModel):
     """
 
     method: ClassVar[str] = "linear"
+    config: Config
 
     def __init__(
         self, config: Settings | None = None, rate_hz: float = 0.0, tensors: Mapping[str, np.ndarray] | None = None
@@ -39,8 +42,10 @@ class Model(BiasModel):
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
-        """Shapes of the statistics and of W for each sensor."""
-        return super().shapes(config) | matrices()
+        """Shapes of the statistics, and of W and its covariance for each sensor."""
+        assert isinstance(config, Config)
+        covariances: Shapes = {f"covariance.{sensor}": (9, 9) for sensor in SENSORS} if config.covariance else {}
+        return super().shapes(config) | matrices() | covariances
 
     def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Bias rest + W u at every sample."""
@@ -53,3 +58,20 @@ class Model(BiasModel):
             return bias
 
         return affine
+
+    def calibration_covariance(self) -> CovarianceModel | None:
+        """Covariance of W u, from that of W."""
+        if not self.config.covariance:
+            return None
+        roots: dict[Sensor, Float64[np.ndarray, "3 3 p"]] = {}
+        for sensor in SENSORS:
+            values, vectors = np.linalg.eigh(self.tensors[f"covariance.{sensor}"])
+            roots[sensor] = (vectors * np.sqrt(np.maximum(values, 0.0))).reshape(3, 3, 9)
+
+        def root_at(
+            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+        ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
+            samples: dict[Sensor, Float64[np.ndarray, "n 3"]] = {"gyro": gyro, "accel": accel}
+            return {sensor: np.einsum("nj,ijp->nip", u, roots[sensor]) for sensor, u in samples.items()}
+
+        return root_at

@@ -47,9 +47,13 @@ END_SAMPLES = 3  # whose mean is the rate at an end of a window
 
 @dataclass(frozen=True)
 class Solution:
-    """W, and the rest bias of each log (rad/s or m/s²) with its standard deviation."""
+    """W, and the rest bias of each log (rad/s or m/s²) with its standard deviation.
+
+    `covariance` is that of W, row by row, and empty without a matrix.
+    """
 
     W: Float[Tensor, "3 3"]
+    covariance: Float[Tensor, "p p"]
     rest: Float[Tensor, "logs 3"]
     std: Float[Tensor, "logs 3"]
 
@@ -144,8 +148,8 @@ def solve(
             W = W + step[:9].reshape(3, 3)
         own = own + step[known:].reshape(own.shape)
         rest[:, columns] = own[:, :3]
-    variance = torch.linalg.inv(H).diagonal()[known:].reshape(own.shape)
-    return Solution(W, rest[:, columns].clone(), variance[:, :3].sqrt())
+    P = torch.linalg.inv(H)
+    return Solution(W, P[:known, :known], rest[:, columns].clone(), P.diagonal()[known:].reshape(own.shape)[:, :3].sqrt())
 
 
 def nuisance_jacobian(

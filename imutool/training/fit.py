@@ -194,7 +194,9 @@ class Training:
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         lengths = self.settings.window_s[sensor]
         if sensor not in self._constant:
-            self.model.begin_at(sensor, closed_form.solve(scored, sensor, pool, rest, lengths, matrix=True).W)
+            solution = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=True)
+            self.model.begin_at(sensor, solution.W)
+            self.model.take_covariance(sensor, solution.covariance)
         # constants that take the nuisances of their logs: the descent knows none
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)

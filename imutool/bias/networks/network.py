@@ -109,6 +109,9 @@ class BiasNetwork(nn.Module, ABC):
     def begin_at(self, sensor: Sensor, W: Float[Tensor, "3 3"]) -> None:
         """Set the calibration matrix, solved in closed form, from which the training starts."""
 
+    def take_covariance(self, sensor: Sensor, covariance: Float[Tensor, "9 9"]) -> None:
+        """Take the covariance of that matrix, row by row: of use where the matrix is the whole model."""
+
     def frozen(self) -> BiasModel:
         """Model that infers with copies of the present weights, in numpy."""
         kind = registry.load("imutool.bias", self.method).Model
