@@ -45,7 +45,7 @@ DISK_BYTES = 200_000  # less than any log here, more than any message
 WAIT_S = 120.0  # for the middle of a run, on a machine busy with other things
 TRIES = 20  # the middle may pass between two looks
 QUICK_S = 13.0  # of the flight that is trained on
-QUICK_SETTINGS = ("steps=40", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
+QUICK_SETTINGS = ("steps=40", "model.loads=[]", "samples=400", "gyro_window_s=[0.5]", "accel_window_s=[0.5]")
 QUICK = ["--method", "neural_ode", *(word for setting in QUICK_SETTINGS for word in ("--set", setting))]
 
 

@@ -117,9 +117,9 @@ def messages(path: Path) -> Iterator[tuple[str, str, str, int, int, int, bytes]]
 def originals(path: Path) -> dict[str, str]:
     """One digest a topic over everything its messages are, in order."""
     digests: dict[str, Any] = {}
-    for topic, *rest in messages(path):
+    for topic, *rest, data in messages(path):
         if topic not in NEW:
-            digests.setdefault(topic, hashlib.sha256()).update(repr(rest).encode())
+            digests.setdefault(topic, hashlib.sha256()).update(repr((*rest, len(data))).encode() + data)
     return {topic: digest.hexdigest() for topic, digest in digests.items()}
 
 

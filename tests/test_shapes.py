@@ -18,7 +18,7 @@ from imutool.inertial.preintegration import hat
 
 SOURCE = """
 from __future__ import annotations
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 import numpy as np
 from jaxtyping import Float64
@@ -38,6 +38,21 @@ def outer(width: int) -> object:
 class Samples:
     t: Float64[np.ndarray, " n"]
     x: Float64[np.ndarray, "n 3"]
+
+@dataclass(frozen=True)
+class Others:
+    t: Float64[np.ndarray, " n"]
+    x: Float64[np.ndarray, "n 4"]
+
+@dataclass(frozen=True)
+class Rest:
+    x: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    t: Float64[np.ndarray, " n"] = field(default_factory=lambda: np.zeros(2))
+
+Shorter = Float64[np.ndarray, " n-1"]
+
+def steps(t: Float64[np.ndarray, " n"]) -> Shorter:
+    return np.zeros(99)
 """
 
 
@@ -63,6 +78,33 @@ def test_a_wrong_shape_is_refused_after_right_ones(package: ModuleType) -> None:
     for wrong in ((t, x[:4]), (t, x[:, :2]), (t.astype(np.float32), x), (t, list(x))):
         with pytest.raises(TypeCheckError):
             package.scaled(*wrong)
+
+
+def test_wrong_lengths_are_refused_after_right_ones_of_other_lengths(package: ModuleType) -> None:
+    for n in (100, 200, 64, 4):
+        package.scaled(np.ones(n), np.ones((n, 3)))
+    for wrong in ((300, 400), (3, 400), (400, 3), (64, 65)):
+        with pytest.raises(TypeCheckError):
+            package.scaled(np.ones(wrong[0]), np.ones((wrong[1], 3)))
+    with pytest.raises(TypeCheckError, match="return value"):
+        package.scaled(np.ones(300), -np.ones((300, 3)), wrong=True)
+
+
+def test_a_computed_length_is_checked_for_each_length(package: ModuleType) -> None:
+    package.steps(np.zeros(100))
+    with pytest.raises(TypeCheckError, match="return value"):
+        package.steps(np.zeros(101))
+
+
+def test_classes_with_the_same_fields_are_checked_apart_and_factories_of_fields_are_not(package: ModuleType) -> None:
+    t = np.ones(5)
+    package.Samples(t, np.ones((5, 3))), package.Others(t, np.ones((5, 4)))
+    for kind, columns in ((package.Samples, 4), (package.Others, 3)):
+        with pytest.raises(TypeCheckError):
+            kind(t, np.ones((5, columns)))
+    package.Rest(), package.Rest(np.zeros(3)), package.Rest(t=t)
+    with pytest.raises(TypeCheckError):
+        package.Rest(t)
 
 
 def test_a_wrong_result_is_refused_after_right_ones(package: ModuleType) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -31,11 +33,8 @@ def motion_of(imu: Imu) -> Motion:
 def turned(omega: np.ndarray, a_w: np.ndarray | None = None, noise: float = 0.002) -> tuple[Imu, Poses]:
     """IMU and poses of a body that turns at the given rates, and accelerates in the world."""
     t_ns = np.arange(len(omega)) * (1_000_000_000 // RATE_HZ)
-    steps = Rotation.from_rotvec(omega / RATE_HZ)
-    R = [Rotation.identity()]
-    for step in steps[:-1]:
-        R.append(R[-1] * step)
-    R_wb = Rotation.concatenate(R)
+    steps = Rotation.from_rotvec(omega / RATE_HZ).as_matrix()
+    R_wb = Rotation.from_matrix(list(accumulate(steps[:-1], np.matmul, initial=np.eye(3))))
     a_w = np.zeros_like(omega) if a_w is None else a_w
     rng = np.random.default_rng(5)
     accel = R_wb.inv().apply(a_w + np.array([0.0, 0.0, GRAVITY_M_S2])) + 10 * noise * rng.normal(size=omega.shape)

@@ -46,17 +46,21 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
 
 
 def play(x: Float64[np.ndarray, "n 3"], width: float) -> Float64[np.ndarray, "n 3"]:
-    """Play of columns: from turn to turn of a column, it is what the last turn left, clipped."""
+    """Play of columns: from turn to turn of a column, it is what the last turn left, clipped.
+
+    Two clips in a row are one clip, so that those of all turns take as many steps as their number has binary digits.
+    """
     out = np.empty_like(x)
     for column, reading in zip(x.T, out.T, strict=True):
         rises = np.diff(column) > 0.0
         turns = np.concatenate([[0], np.flatnonzero(rises[1:] != rises[:-1]) + 1])
-        left, at_turns = float(column[0]), []
-        for value in column[turns].tolist():
-            left = min(max(left, value - width), value + width)
-            at_turns.append(left)
-        since = np.repeat(at_turns, np.diff(np.append(turns, len(column))))
-        np.clip(since, column - width, column + width, out=reading)
+        low, high = column[turns] - width, column[turns] + width
+        low[0] = high[0] = column[0]
+        step = 1
+        while step < len(turns):
+            low[step:], high[step:] = (np.clip(left[:-step], low[step:], high[step:]) for left in (low, high))
+            step *= 2
+        np.clip(np.repeat(low, np.diff(np.append(turns, len(column)))), column - width, column + width, out=reading)
     return out
 
 

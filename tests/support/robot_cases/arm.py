@@ -83,20 +83,21 @@ def moved(
     data.qpos[:] = course["q"][0]
     waiting = deque([np.zeros(2)] * round(own.delay_s / STEP_S))
     rows, times = [], []
-    for k in range(len(course["q"])):
-        angle = data.qpos + np.array(own.encoder)
-        angle += np.array([a * np.sin(q) + b * np.cos(q) for (a, b), q in zip(own.eccentric, data.qpos, strict=True)])
+    encoder, eccentric, acting, forces = np.array(own.encoder), np.array(own.eccentric), _acting(own), _forces(own)
+    for k, (q, dq, ddq) in enumerate(zip(*(course[name] for name in ("q", "dq", "ddq")), strict=True)):
+        angle = data.qpos + encoder
+        if eccentric.any():
+            angle += eccentric[:, 0] * np.sin(data.qpos) + eccentric[:, 1] * np.cos(data.qpos)
         model.qpos[:], model.qvel[:] = angle, data.qvel
-        error, slope = course["q"][k] - angle, course["dq"][k] - data.qvel
-        model.qacc[:] = course["ddq"][k] + BANDWIDTH**2 * error + 2.0 * BANDWIDTH * slope
+        model.qacc[:] = ddq + BANDWIDTH**2 * (q - angle) + 2.0 * BANDWIDTH * (dq - data.qvel)
         mujoco.mj_inverse(plan, model)
         command = model.qfrc_inverse.copy()
         if k % EACH == 0:
             rows.append(np.concatenate([angle, data.qvel, command]))
             times.append(k * STEP_S)
         waiting.append(command)
-        data.ctrl[:] = _acting(waiting.popleft(), own)
-        data.qfrc_applied[:] = _forces(data.qpos, data.qvel, own)
+        data.ctrl[:] = acting(waiting.popleft())
+        data.qfrc_applied[:] = forces(data.qpos, data.qvel)
         mujoco.mj_step(body, data)
     return _noisy(np.array(times), np.array(rows), noise)
 
@@ -110,19 +111,32 @@ def _noisy(
     return t_s[kept], rows + std * noise.normal(size=rows.shape)
 
 
-def _acting(command: Float64[np.ndarray, " 2"], own: LeftOut) -> Float64[np.ndarray, " 2"]:
-    command = command - np.clip(command, -np.array(own.dead_band), np.array(own.dead_band))
-    return np.asarray(np.clip(np.array(own.gain) * command, -np.array(own.limit), np.array(own.limit)))
+def _acting(own: LeftOut) -> Callable[[Float64[np.ndarray, " 2"]], Float64[np.ndarray, " 2"]]:
+    """What the motors give of a command; numbers are arrays once, for every step of a millisecond asks."""
+    dead, gain, limit = np.array(own.dead_band), np.array(own.gain), np.array(own.limit)
+
+    def acting(command: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
+        if dead.any():
+            command = command - np.clip(command, -dead, dead)
+        return np.minimum(np.maximum(gain * command, -limit), limit)
+
+    return acting
 
 
-def _forces(q: Any, dq: Any, own: LeftOut) -> Float64[np.ndarray, " 2"]:
-    out = np.zeros(2)
-    for k in range(2):
-        level, slow = own.stribeck[k]
-        sine, cosine, per_turn = own.ripple[k]
-        out[k] -= level * np.exp(-((dq[k] / slow) ** 2)) * np.tanh(dq[k] / 1e-3)
-        out[k] -= sine * np.sin(per_turn * q[k]) + cosine * np.cos(per_turn * q[k])
-    return out if own.unnamed is None else out - own.unnamed(q, dq)
+def _forces(own: LeftOut) -> Callable[[Any, Any], Float64[np.ndarray, " 2"]]:
+    """Torques that are left out, of angles and velocities."""
+    level, slow = np.array(own.stribeck).T
+    sine, cosine, per_turn = np.array(own.ripple).T
+
+    def forces(q: Any, dq: Any) -> Float64[np.ndarray, " 2"]:
+        out = np.zeros(2)
+        if level.any():
+            out -= level * np.exp(-((dq / slow) ** 2)) * np.tanh(dq / 1e-3)
+        if sine.any() or cosine.any():
+            out -= sine * np.sin(per_turn * q) + cosine * np.cos(per_turn * q)
+        return out if own.unnamed is None else out - own.unnamed(q, dq)
+
+    return forces
 
 
 def course(rng: np.random.Generator, duration_s: float) -> dict[str, Float64[np.ndarray, "_ 2"]]:

@@ -61,9 +61,8 @@ class _Cdr:
         self.data = bytearray(b"\0\1\0\0")
 
     def number(self, kind: str, *values: float | int) -> None:
-        size = struct.calcsize(kind)
-        for value in values:
-            self.data += b"\0" * (-(len(self.data) - 4) % size) + struct.pack(f"<{kind}", value)
+        if values:
+            self.data += b"\0" * (-(len(self.data) - 4) % struct.calcsize(kind)) + struct.pack(f"<{len(values)}{kind}", *values)
 
     def text(self, value: str) -> None:
         self.number("I", len(value) + 1)
