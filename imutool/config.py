@@ -30,6 +30,7 @@ WORDS = {
     "bool": "true or false",
     "array": "a list",
     "object": "a table",
+    "null": "nothing",
 }
 MOST_NESTED = 32  # tables and lists in each other; ours have five
 MOST_BYTES = 1 << 20  # of a TOML file: a physics.toml of twenty curves has 50 kB, and a megabyte takes a second to parse
@@ -103,13 +104,18 @@ def build(cls: type[S], values: dict[str, Any], where: str | Path | None = None)
 
 def _of_value(said: str, where: str | Path | None) -> ConfigError:
     """Error of msgspec in our words: the setting, what it is, and what was expected."""
-    what, _, place = said.rstrip(".`").partition(" - at `$.")
+    what, _, place = said.rstrip(".").removesuffix(" - at `$`").partition(" - at `$.")
+    place = place.rstrip("`")
     expected, got = "", ""
     if what.startswith("Expected "):
         expected, _, got = what.removeprefix("Expected ").partition(", got ")
-        what = f"is {got}" if got else "is out of range"
-    what, expected = (re.sub(r"`(\w+)`", lambda name: WORDS.get(name[1], name[0]), text) for text in (what, expected))
+        what = f"has {got} items" if got.isdigit() else f"is {got}" if got else "is out of range"
+    what, expected = (re.sub(r"`([\w |]+)`", _in_words, text) for text in (what, expected))
     return ConfigError(what, where=f"{where or 'settings'}{': ' * bool(place)}{place}", expected=expected)
+
+
+def _in_words(types: re.Match[str]) -> str:
+    return " or ".join(WORDS.get(name, f"`{name}`") for name in types[1].split(" | "))
 
 
 def plain(settings: Settings) -> dict[str, Any]:

@@ -203,8 +203,8 @@ def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
     unknown = np.where((shown > before) & (std > np.abs(start.rest[:3])), std, 0.0)
     axis = int(np.argmax(unknown))
     if unknown[axis] > MOST_UNKNOWN:
-        bias = f"{start.rest[axis]:+.2g} ± {std[axis]:.2g} rad/s, from the start,"
-        yield f"neither stops nor gravity shows the gyro's bias about {'xyz'[axis]}: {bias} may do more harm than good"
+        bias = f"the start's {start.rest[axis]:+.2g} ± {std[axis]:.2g} rad/s"
+        yield f"neither stops nor gravity shows the gyro's bias about {'xyz'[axis]}; {bias} may do more harm than good"
 
 
 def _deviations(found: _Evidence, prior: BiasPrior) -> Vector6:

@@ -85,7 +85,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
             transforms(log, topic.name) if topic.schema_name == schemas.TF else [(topic.name, clocks[topic.name])]
         )
     ]
-    misread = bool(own) and isinstance(own[0].conventions, list) and any(c.subject == QUATERNIONS for c in own[0].conventions)
+    misread = any(found.subject == QUATERNIONS for imu in own[:1] for found in imu.conventions or ())
     if check and own and truths and log.topics[own[0].topic].is_read and not misread:  # such poses turn as no body does
         samples = sound_samples(log, own[0].topic)
         truths = [_against_gyro(log, truth, samples) for truth in truths]

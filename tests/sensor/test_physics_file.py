@@ -94,7 +94,7 @@ CURVE = '[[unknown]]\nsignal = "accel"\nvariable = "omega_x"\nunit = "rad/s"\nx 
         (LEVER + "colour = 1\n", "colour"),
         (CURVE.replace("[0.0, 1.0]", "[1.0, 1.0]"), r"unknown\[0\].x does not rise"),
         (CURVE.replace("[0.0, 1.0]", "[0.0, 1.0, 2.0]"), r"unknown\[0\].y has 2 rows"),
-        ("[bias]\ngyro = [0, 0]\n", "bias.gyro"),
+        ("[bias]\ngyro = [0, 0]\n", r"bias\.gyro: has 2 items; expected a list of length 3"),
         ('schema = "imutool.physics/9"\n', "schema"),
     ],
     ids=lambda value: value.strip().splitlines()[-1][:30],
