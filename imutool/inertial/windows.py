@@ -3,21 +3,26 @@
 A window is n + 1 samples, the first and last at the two true poses. Samples are points of the signal, so the rate over a step
 is the mean of its two ends. The paper's Euler rule, which keeps each sample until the next, is late by half a step: 2.3 to
 2.5 ms against the truth of EuRoC, where the mean is late by less than 0.2 ms (`tests/bench/truth_delay.py`). Products over a
-window are a tree, so a thousand samples cost ten batched multiplications and no Python loop.
+window are a tree, so a thousand samples cost ten batched multiplications and no Python loop. Samples that many windows share
+are integrated once (`Pieces`).
 
-Users: the constant bias (`bias_start.bias_from_truth`), the calibration (`training.closed_form`), and the training loss.
+Users: the calibration (`training.closed_form`, `training.normal_equations`), the training loss, and the noise of a log.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
 
-from imutool.array_types import Float
+from imutool.array_types import Float, Int
 from imutool.geometry import so3
+from imutool.units import Sensor
 
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
@@ -33,15 +38,23 @@ def step_means(u: Samples) -> Float[Tensor, "batch n-1 3"]:
 def running_product(increments: Float[Tensor, "batch n 3 3"]) -> Float[Tensor, "batch n 3 3"]:
     """Products `increments[0] @ ... @ increments[k]` for every k, two for each.
 
-    Blelloch's scan.
+    Blelloch's scan, on arrays of each entry: they are multiplied in a seventh of the time of small matrices.
     """
-    if increments.shape[1] < 2:
+    return _running(increments.permute(2, 3, 0, 1).contiguous()).permute(2, 3, 0, 1)
+
+
+def _running(increments: Float[Tensor, "3 3 batch n"]) -> Float[Tensor, "3 3 batch n"]:
+    if increments.shape[-1] < 2:
         return increments
     products = torch.empty_like(increments)
-    products[:, 1::2] = odd = running_product(increments[:, :-1:2] @ increments[:, 1::2])
-    products[:, :1], later = increments[:, :1], increments[:, 2::2]
-    products[:, 2::2] = odd[:, : later.shape[1]] @ later
+    products[..., 1::2] = odd = _running(_product(increments[..., :-1:2], increments[..., 1::2]))
+    products[..., :1], later = increments[..., :1], increments[..., 2::2]
+    products[..., 2::2] = _product(odd[..., : later.shape[-1]], later)
     return products
+
+
+def _product(A: Float[Tensor, "3 3 batch n"], B: Float[Tensor, "3 3 batch n"]) -> Float[Tensor, "3 3 batch n"]:
+    return torch.addcmul(torch.addcmul(A[:, 0:1] * B[0:1], A[:, 1:2], B[1:2]), A[:, 2:3], B[2:3])
 
 
 def whole_turn(xi: Float[Tensor, "batch n 3"]) -> Float[Tensor, "batch 3 3"]:
@@ -80,10 +93,26 @@ class _WholeTurn(torch.autograd.Function):
         return so3.by_vector(xi, by_turn)
 
 
+def turns_from_start(gyro: Samples, dt: Steps) -> Float[Tensor, "batch n 3 3"]:
+    """Attitude at each sample, in the frame of the first."""
+    later = running_product(so3.exp(step_means(gyro) * dt[..., None]))
+    return torch.cat([torch.eye(3).to(later).expand(len(later), 1, 3, 3), later], dim=1)
+
+
+def derivative_by_sample(sensor: Sensor, turns: Float[Tensor, "batch n 3 3"], dt: Steps) -> Float[Tensor, "batch n 3 3"]:
+    """Derivative of the turn by the rate at each sample, or of the velocity by the specific force, in the frame of the first.
+
+    Either counts half for both of its steps: the turn at a step's end, and the force at the sample (the trapezoidal rule).
+    """
+    if sensor == "accel":
+        return 0.5 * (pad(dt, (0, 1)) + pad(dt, (1, 0)))[..., None, None] * turns
+    by_step = 0.5 * dt[..., None, None] * turns[:, 1:]
+    return pad(by_step, (0, 0, 0, 0, 1, 0)) + pad(by_step, (0, 0, 0, 0, 0, 1))
+
+
 def attitudes(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch n 3 3"]:
     """Attitude (body to world) at each sample, from `R_start` at the first."""
-    later = R_start[:, None] @ running_product(so3.exp(step_means(gyro) * dt[..., None]))
-    return torch.cat([R_start[:, None], later], dim=1)
+    return R_start[:, None] @ turns_from_start(gyro, dt)
 
 
 def end_attitude(R_start: Float[Tensor, "batch 3 3"], gyro: Samples, dt: Steps) -> Float[Tensor, "batch 3 3"]:
@@ -115,9 +144,63 @@ def velocity_residual(
         e = dv_true - sum_k (R_k a_k + g) h_k, h the weights of the trapezoidal rule (s), and A_k = R_k h_k, so that
         e(accel + d) = e - sum_k A_k d_k exactly.
     """
-    h = 0.5 * (torch.nn.functional.pad(dt, (0, 1)) + torch.nn.functional.pad(dt, (1, 0)))
-    A = R_wb * h[..., None, None]
+    A = derivative_by_sample("accel", R_wb, dt)
     return dv_true - (A @ accel[..., None]).sum(1)[..., 0] - g_w * dt.sum(1, keepdim=True), A
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Stretches of samples between the ends of windows: each window is a row of whole stretches.
+
+    Windows of several lengths that overlap share their samples, which are integrated once. With G the turn before each stretch
+    and C the sum of G_k x_k of all before, x_k what a stretch adds, a window from a to e turns by G_a^T G_e and adds
+    G_a^T (C_e - C_a).
+    """
+
+    begin: Int[Tensor, " c"]
+    steps: Int[Tensor, " c"]
+
+    @classmethod
+    def between(cls, windows: Sequence[tuple[Int[Tensor, " _"], int]], longest: int) -> Pieces:
+        """The stretches of windows (first samples, steps), of at most `longest` steps; what no window covers is left out."""
+        ends = torch.cat([first + k for first, n in windows for k in (0, n)])
+        opens = torch.cat([torch.full_like(first, sign) for first, _ in windows for sign in (1, -1)])
+        cuts, at = torch.unique(ends, return_inverse=True)
+        covered = torch.zeros_like(cuts).index_add(0, at, opens).cumsum(0)[:-1] > 0
+        begin, steps = cuts[:-1][covered], cuts.diff()[covered]
+        parts = -(-steps // longest)
+        of, before = torch.repeat_interleave(parts), torch.cumsum(parts, 0) - parts
+        k = torch.arange(len(of), device=of.device) - before[of]
+        start, end = (steps[of] * j // parts[of] for j in (k, k + 1))
+        return cls(begin[of] + start, end - start)
+
+    def row(self, first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
+        """First stretch of each window of n steps, and the one after its last."""
+        return torch.searchsorted(self.begin, first), torch.searchsorted(self.begin, first + n)
+
+    def index(self) -> Int[Tensor, "c _"]:
+        """Samples of each stretch, as many for all: the last one repeats, which is a step that takes no time."""
+        k = torch.arange(int(self.steps.max()) + 1, device=self.steps.device)
+        return self.begin[:, None] + torch.minimum(k, self.steps[:, None])
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """Turn G and sum C before each stretch of `Pieces`, and after the last."""
+
+    turn: Float[Tensor, "c 3 3"]
+    total: Float[Tensor, "c 3 k"]
+
+    @classmethod
+    def of(cls, turns: Float[Tensor, "p 3 3"], adds: Float[Tensor, "p 3 k"]) -> Prefix:
+        """From the turn of each stretch, and from what it adds in the frame of its first sample."""
+        turn = torch.cat([torch.eye(3).to(turns)[None], running_product(turns[None])[0]])
+        return cls(turn, pad(torch.cumsum(turn[:-1] @ adds, 0), (0, 0, 0, 0, 1, 0)))
+
+    def across(self, start: Int[Tensor, " m"], end: Int[Tensor, " m"]) -> tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3 k"]]:
+        """Turn of each window, and what it adds in the frame of its first sample."""
+        back = self.turn[start].mT
+        return back @ self.turn[end], back @ (self.total[end] - self.total[start])
 
 
 def huber_weight(size: Float[Tensor, " m"], delta: Float[Tensor, " m"]) -> Float[Tensor, " m"]:

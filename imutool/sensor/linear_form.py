@@ -23,7 +23,7 @@ from imutool.units import Sensor, Three
 # Size of the parameters with which `forward` is asked for an error: beside that error the reading is lost in rounding, and to
 # divide by a power of two is exact. So the error has all its digits, and not only those that a reading leaves to it.
 SCALE = 2.0**100
-PROBE_ROWS = 128
+PROBE_ROWS, TERM_ROWS = 128, 20_000
 SAME = 1e-9  # an effect's own basis may differ by rounding from what `forward` says
 
 
@@ -138,6 +138,15 @@ def patterns(forms: Sequence[LinearForm]) -> Float64[np.ndarray, "3 q p"]:
         _, dq, dp = form.pattern.shape
         out[:, q : q + dq, p : p + dp] = form.pattern
         q, p = q + dq, p + dp
+    return out
+
+
+def terms_of(forms: Sequence[LinearForm], signals: Signals) -> Float64[np.ndarray, "n q"]:
+    """Terms of several effects side by side, some samples at a time."""
+    out = np.empty((len(signals.t_s), sum(form.pattern.shape[1] for form in forms)))
+    for rows in (slice(k, k + TERM_ROWS) for k in range(0, len(out), TERM_ROWS)):
+        some = signals.rows(rows)
+        np.concatenate([np.zeros((len(some.t_s), 0)), *(form.terms(some) for form in forms)], axis=1, out=out[rows])
     return out
 
 

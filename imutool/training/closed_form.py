@@ -175,6 +175,12 @@ def nuisance_jacobian(
     return torch.cat([tilt, -force, change + force @ w_start[..., None], by_lever], dim=2)
 
 
+def end_samples(first: Int[Tensor, " m"], n: int) -> Int[Tensor, "m _"]:
+    """The samples at both ends of windows of n steps that `nuisance_jacobian` reads."""
+    k = torch.arange(min(END_SAMPLES, n + 1), device=first.device)
+    return first[:, None] + torch.cat([k, n - k.flip(0)])
+
+
 def widest(sensor: Sensor, like: Tensor) -> Float[Tensor, " o"]:
     """One over the plausible variance of each of a log's own unknowns."""
     return torch.tensor([REST_PRIOR[sensor]] * 3 + list(NUISANCE_STD[sensor])).to(like) ** -2

@@ -4,36 +4,36 @@ Unknowns are theta, the effect parameters that all logs share, and a few of each
 (`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
 the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's complement),
 so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the parameters: with a
-window's residual and Jacobian (`imutool.inertial.windows`), the rest is a product of matrices.
+window's residual and Jacobian (sums of pieces, `imutool.inertial.windows`), the rest is a product of matrices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
-from imutool.array_types import Float, Float64, Int
+from imutool.array_types import Float, Int
 from imutool.bias.networks.threads import of_each
 from imutool.errors import DataError
+from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
-from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, velocity_residual
-from imutool.sensor.linear_form import LinearForm, patterns
+from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_by_sample, huber_weight, turns_from_start
+from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import median_per_log, nuisance_jacobian, shown_by_logs, widest
+from imutool.training.closed_form import end_samples, median_per_log, nuisance_jacobian, shown_by_logs, widest
 from imutool.training.settings import SensorPrior
-from imutool.training.training_windows import Part, Pool, Windows
+from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
 
 WINDOW_S: Mapping[Sensor, tuple[float, ...]] = {"gyro": (1.0, 4.0, 15.0, 40.0), "accel": (0.5, 2.0, 5.0)}
 JUDGED_FROM_S: Mapping[Sensor, float] = {"gyro": 4.0, "accel": 2.0}  # drift over short windows does not rank calibrations
 FREE: Mapping[Sensor, int] = {"gyro": 3, "accel": 5}  # a log's own unknowns that its prediction leaves free: rest bias, tilt
-MAX_SAMPLES, CHUNK = 150_000, 20_000  # samples of one window length, and at a time
+MAX_SAMPLES, CHUNK, PIECE = 150_000, 20_000, 128  # samples of one window length, at a time, and steps of a piece
 REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of made-up logs without effects
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
@@ -48,11 +48,6 @@ class Equations:
     H: Float[Tensor, "logs k k"]
     g: Float[Tensor, "logs k"]
     c: Float[Tensor, " logs"]
-
-    @classmethod
-    def none(cls, like: Tensor, logs: int, unknowns: int) -> Equations:
-        """Equations without any sample."""
-        return cls(*(like.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
 
     def __add__(self, other: Equations) -> Equations:
         return Equations(self.H + other.H, self.g + other.g, self.c + other.c)
@@ -156,14 +151,12 @@ class Seen:
     sensors: SensorPrior
 
 
-@dataclass(frozen=True)
-class WindowSet:
+class WindowSet(NamedTuple):
     """Windows of n steps, by first sample; `judged` if they rank calibrations."""
 
     first: Int[Tensor, " m"]
     n: int
     judged: bool
-    R_wb: dict[int, Tensor] = field(default_factory=dict)  # under the accelerometer, by a chunk's first sample: they stay
 
 
 def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: Float[Tensor, " o"] | None = None) -> Problem:
@@ -179,14 +172,21 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     prior = torch.from_numpy(np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)]) ** -2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
-    terms = torch.from_numpy(_terms(seen.signals, effects)).to(seen.pool.t)
+    terms = torch.from_numpy(terms_of(effects, seen.signals)).to(seen.pool.t)
     pattern = torch.from_numpy(patterns(effects)).to(seen.pool.t)
+    pieces, turned, samples = (
+        Pieces.between([w[:2] for w in sets], PIECE),
+        dict[int, Tensor](),
+        seen.pool.of_sensor(seen.sensor),
+    )
+    rows, unknowns = [pieces.row(windows.first, windows.n) for windows in sets], len(prior) + len(width)
     for step in range(len(sets) + MOST_STEPS):
-        fit = judged = Equations.none(prior, logs, len(prior) + len(width))
+        fit = judged = Equations(*(prior.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
         size = seen.pool.least(seen.sensor)
-        error = terms @ torch.einsum("iqp,p->qi", pattern, theta)
-        for windows in sets[: step + 1]:
-            equations, size = _equations(seen, terms, pattern, error, own, windows, size)
+        true_u = samples - terms @ torch.einsum("iqp,p->qi", pattern, theta) - own[seen.pool.log, :3]
+        prefix = _prefix(seen, pieces, terms, pattern, true_u, turned)
+        for windows, row in list(zip(sets, rows, strict=True))[: step + 1]:
+            equations, size = _equations(seen, windows, prefix.across(*row), true_u, own, size)
             fit = fit + equations
             judged = judged + equations if windows.judged else judged
         if own_prior is None and step >= len(sets) - 1:
@@ -223,54 +223,61 @@ def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
     return sets
 
 
-def _equations(
+def _prefix(
     seen: Seen,
+    pieces: Pieces,
     terms: Float[Tensor, "n q"],
     pattern: Float[Tensor, "3 q p"],
-    error: Float[Tensor, "n 3"],
-    own: Float[Tensor, "logs o"],
+    true_u: Float[Tensor, "n 3"],
+    turned: dict[int, Tensor],
+) -> Prefix:
+    """Turn and sum of pieces: minus the derivative by theta and by the rest bias, and the samples under that derivative.
+
+    `turned` keeps the turns under an accelerometer, which stay from step to step.
+    """
+    rates = true_u if seen.sensor == "gyro" else seen.gyro
+
+    def added(numbered: tuple[int, Int[Tensor, "m s"]]) -> tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3 k"]]:
+        number, index = numbered
+        dt = torch.diff(seen.pool.t[index], dim=1)
+        turns = turned[number] if number in turned else turns_from_start(rates[index], dt)
+        if seen.sensor == "accel":
+            turned[number] = turns
+        A = derivative_by_sample(seen.sensor, turns, dt)
+        S = A.flatten(2).mT @ terms[index]
+        by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
+        by_all = torch.einsum("mkij,mkj->mi", A, true_u[index])
+        return turns[:, -1], torch.cat([by_theta, A.sum(1), by_all[..., None]], dim=2)
+
+    chunks = enumerate(torch.split(pieces.index(), max(1, CHUNK // PIECE)))
+    turns, adds = zip(*of_each(added, chunks), strict=True)
+    return Prefix.of(torch.cat(turns), torch.cat(adds))
+
+
+def _equations(
+    seen: Seen,
     windows: WindowSet,
+    crossed: tuple[Float[Tensor, "m 3 3"], Float[Tensor, "m 3 k"]],
+    true_u: Float[Tensor, "n 3"],
+    own: Float[Tensor, "logs o"],
     shorter: Float[Tensor, " logs"],
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
-    """Normal equations of the windows of one length, and their usual residual; `shorter` is that of shorter windows."""
-    pool, n = seen.pool, windows.n
-
-    def derived(some: Int[Tensor, " m"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 k"]]:
-        index = some[:, None] + torch.arange(n + 1, device=some.device)
-        cut = pool.windows(some, n, pool.t.new_zeros(len(some), 6))
-        true_u = (pool.gyro if seen.sensor == "gyro" else pool.accel)[index] - error[index] - own[cut.log, None, :3]
-        e, A, by_nuisance = _residual(seen, cut, true_u, index, own, windows.R_wb)
-        by_sample = A.flatten(2)
-        if seen.sensor == "gyro":  # rates hold between samples
-            by_sample = 0.5 * (pad(by_sample, (0, 0, 0, 1)) + pad(by_sample, (0, 0, 1, 0)))
-        S = by_sample.mT @ terms[index]
-        by_theta = torch.einsum("mijq,jqp->mip", S.reshape(len(S), 3, 3, S.shape[2]), pattern)
-        return e, torch.cat([by_theta, A.sum(1), by_nuisance], dim=2)
-
-    residuals, slopes = zip(*of_each(derived, torch.split(windows.first, max(1, CHUNK // n))), strict=True)
-    equations, usual = _summed(torch.cat(residuals), torch.cat(slopes), pool.log[windows.first], shorter)
-    return equations.times(1.0 / design_effect(pool)), usual
-
-
-def _residual(
-    seen: Seen,
-    windows: Windows,
-    true_u: Float[Tensor, "m n 3"],
-    index: Int[Tensor, "m n"],
-    own: Float[Tensor, "logs o"],
-    known: dict[int, Tensor],
-) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m k 3 3"], Float[Tensor, "m 3 _"]]:
-    """Residual, its Jacobian by minus each sample, and its Jacobian by the log's nuisances."""
+    """Normal equations of the windows of one length (`crossed`: `Prefix.across`) and their usual residual, `shorter` before."""
+    pool, (turn, added) = seen.pool, crossed
+    index = end_samples(windows.first, windows.n)
+    ends = pool.at(index, own.new_zeros(len(index), 6))
     if seen.sensor == "gyro":
-        e, A = rotation_residual(true_u, windows.dt, windows.R_start.mT @ windows.R_end)
-        by_nuisance = nuisance_jacobian("gyro", windows, true_u, true_u)
+        e, to_frame = so3.log(turn.mT @ ends.R_start.mT @ ends.R_end), turn.mT
+        by_nuisance = nuisance_jacobian("gyro", ends, true_u[index], true_u[index])
     else:
-        gyro, dv_w, first = seen.gyro[index], windows.v_end - windows.v_start, int(index[0, 0])
-        if first not in known:
-            known[first] = attitudes(windows.R_start, gyro, windows.dt)
-        e, A = velocity_residual(true_u, windows.dt, known[first], dv_w, true_u.new_tensor(GRAVITY_W))
-        by_nuisance = nuisance_jacobian("accel", windows, gyro, true_u)
-    return e + (by_nuisance @ own[windows.log, 3:, None])[..., 0], A, by_nuisance
+        to_frame = ends.R_start
+        fallen = true_u.new_tensor(GRAVITY_W) * ends.dt.sum(1, keepdim=True)
+        e = ends.v_end - ends.v_start - fallen - (to_frame @ added[..., -1:])[..., 0]
+        by_nuisance = nuisance_jacobian("accel", ends, seen.gyro[index], true_u[index])
+    e = e + (by_nuisance @ own[ends.log, 3:, None])[..., 0]
+    slopes = torch.cat([to_frame @ added[..., :-1], by_nuisance], dim=2)
+    equations, usual = _summed(e, slopes, ends.log, shorter)
+    return equations.times(1.0 / design_effect(pool)), usual
 
 
 def _summed(
@@ -289,12 +296,3 @@ def _summed(
         return H, g, (w * e_i.square().sum(1)).sum()
 
     return Equations(*(torch.stack(parts) for parts in zip(*of_each(of_log, range(len(shorter))), strict=True))), usual
-
-
-def _terms(signals: Signals, effects: Sequence[LinearForm]) -> Float64[np.ndarray, "n q"]:
-    """Terms of the effects at all samples, a chunk at a time."""
-    out = np.empty((len(signals.t_s), sum(effect.pattern.shape[1] for effect in effects)))
-    for rows in (slice(k, k + CHUNK) for k in range(0, len(out), CHUNK)):
-        some = signals.rows(rows)
-        np.concatenate([np.zeros((len(some.t_s), 0)), *(effect.terms(some) for effect in effects)], axis=1, out=out[rows])
-    return out

@@ -130,6 +130,10 @@ class Pool:
             **{name: torch.tensor(x, device=device) for name, x in zip(FLAGS, flags, strict=True)},
         )
 
+    def of_sensor(self, sensor: Sensor) -> Float[Tensor, "n 3"]:
+        """The samples of a sensor."""
+        return self.gyro if sensor == "gyro" else self.accel
+
     def least(self, sensor: Sensor) -> Float[Tensor, " logs"]:
         """Least residual of each log's windows."""
         return self.floors[:, SENSORS.index(sensor)]
@@ -170,9 +174,11 @@ class Pool:
 
     def windows(self, first: Int[Tensor, " batch"], n: int, rest: Float[Tensor, "batch 6"]) -> Windows:
         """The windows of n steps that start at some samples, each from its own rest bias."""
-        index = first[:, None] + torch.arange(n + 1, device=first.device)
-        last, log = first + n, self.log[first]
-        t = self.t[index]
+        return self.at(first[:, None] + torch.arange(n + 1, device=first.device), rest)
+
+    def at(self, index: Int[Tensor, "batch samples"], rest: Float[Tensor, "batch 6"]) -> Windows:
+        """The windows of these samples: all between their ends, or some."""
+        first, last, t = index[:, 0], index[:, -1], self.t[index]
         return Windows(
             segment=Segment(t - t[:, :1], self.gyro[index], self.accel[index], rest),
             dt=torch.diff(t, dim=1),
@@ -182,7 +188,7 @@ class Pool:
             v_end=self.v_w[last],
             p_start=self.p_wb[first],
             p_end=self.p_wb[last],
-            log=log,
+            log=self.log[first],
         )
 
 

@@ -9,13 +9,17 @@ from hypothesis import strategies as st
 
 from imutool.geometry import so3
 from imutool.inertial.windows import (
+    Pieces,
+    Prefix,
     attitudes,
+    derivative_by_sample,
     end_attitude,
     huber,
     huber_weight,
     rotation_residual,
     running_product,
     step_means,
+    turns_from_start,
     velocity_residual,
     whole_turn,
 )
@@ -185,3 +189,31 @@ def test_huber_joins_smoothly_each_row_has_its_own_width_and_zero_is_harmless() 
     torch.testing.assert_close(loss[1:], torch.full((4,), 0.5, dtype=torch.float64), rtol=0, atol=2e-9)
     torch.testing.assert_close(slope * width, torch.tensor([0.0, 1, 1, 1, 1], dtype=torch.float64), rtol=0, atol=2e-9)
     assert torch.equal(huber_weight(torch.zeros(1), torch.zeros(1)), torch.ones(1))
+
+
+@given(seed=st.integers(0, 2**31), longest=st.integers(1, 30), hops=st.tuples(st.integers(1, 9), st.integers(5, 40)))
+@settings(max_examples=30, deadline=None)
+def test_windows_from_shared_pieces_are_those_of_their_samples(seed: int, longest: int, hops: tuple[int, int]) -> None:
+    """A hole that no window covers holds no number, and some windows overlap."""
+    (gyro,), (dt,) = samples(seed, 1, 200)
+    (accel,), _ = samples(seed + 1, 1, 200)
+    t = torch.cat([torch.zeros(1).double(), dt.cumsum(0)])
+    gyro[95:105] = torch.nan
+    sets = [(torch.arange(0, 95 - n, hop), n) for n, hop in zip((7, 40), hops, strict=True)] + [(torch.tensor([110, 120]), 60)]
+    pieces = Pieces.between(sets, longest)
+    index = pieces.index()
+    steps = torch.diff(t[index], dim=1)
+    turns = turns_from_start(gyro[index], steps)
+    by_rate, by_force = (derivative_by_sample(sensor, turns, steps) for sensor in ("gyro", "accel"))
+    added = torch.cat([by_rate.sum(1), (by_force @ accel[index][..., None]).sum(1)], dim=2)
+    prefix = Prefix.of(turns[:, -1], added)
+    assert index.shape[1] <= longest + 1
+    assert not bool(torch.isin(torch.arange(95, 105), index).any())
+    for first, n in sets:
+        turn, total = prefix.across(*pieces.row(first, n))
+        whole = first[:, None] + torch.arange(n + 1)
+        R = attitudes(torch.eye(3).double().expand(len(first), 3, 3), gyro[whole], torch.diff(t[whole], dim=1))
+        _, A = rotation_residual(gyro[whole], torch.diff(t[whole], dim=1), R[:, -1])
+        e, _ = velocity_residual(accel[whole], torch.diff(t[whole], dim=1), R, torch.zeros(len(first), 3).double(), 0 * G_W)
+        for found, expected in ((turn, R[:, -1]), (turn.mT @ total[..., :3], A.sum(1)), (-total[..., 3], e)):
+            torch.testing.assert_close(found, expected, rtol=0, atol=100 * PRODUCT[torch.float64])
