@@ -176,7 +176,8 @@ class Pieces:
 
     def row(self, first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
         """First stretch of each window of n steps, and the one after its last."""
-        return torch.searchsorted(self.begin, first), torch.searchsorted(self.begin, first + n)
+        start, end = torch.searchsorted(self.begin, torch.stack([first, first + n]))
+        return start, end
 
     def index(self) -> Int[Tensor, "c _"]:
         """Samples of each stretch, as many for all: the last one repeats, which is a step that takes no time."""
