@@ -9,6 +9,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 # uv installs in an eighth of pip's time. It reads no settings of pip's: those of the environment are passed on
 UV := UV_FIND_LINKS="$${UV_FIND_LINKS-$$PIP_FIND_LINKS}" UV_DEFAULT_INDEX="$${UV_DEFAULT_INDEX-$$PIP_INDEX_URL}" \
 	UV_INDEX="$${UV_INDEX-$$PIP_EXTRA_INDEX_URL}" $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt
+INSTALL = { $(PIP) uv && $(UV) -e '.[$(EXTRAS)]'; } || \
+	{ echo "set-up: uv could not; once more with pip, which takes minutes" >&2; $(PIP) -e '.[$(EXTRAS)]'; }
 READY_DEMO := $(VENV)/.ready-demo
 READY_TEST := $(VENV)/.ready-test
 
@@ -64,14 +66,14 @@ $(BIN)/python:
 	@echo "set-up: a virtual environment in $(VENV)"
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 
+$(READY_TEST): EXTRAS := dev
 $(READY_TEST): pyproject.toml constraints.txt | $(BIN)/python
-	@echo "set-up: imutool and what its tests need, into $(VENV) (some minutes the first time: torch is large)"
-	@$(PIP) uv
-	@$(UV) -e '.[dev]' || { echo "set-up: uv could not; once more with pip, which takes minutes" >&2; $(PIP) -e '.[dev]'; }
+	@echo "set-up: imutool and what its tests need, into $(VENV) (the first time it may take minutes: torch is large)"
+	@$(INSTALL)
 	@touch $(READY_DEMO) $@  # what the demo needs is part of it
 
+$(READY_DEMO): EXTRAS := train,view,report
 $(READY_DEMO): pyproject.toml constraints.txt | $(BIN)/python
-	@echo "set-up: imutool with viewer and report, into $(VENV) (some minutes the first time: torch is large)"
-	@$(PIP) uv
-	@$(UV) -e '.[train,view,report]' || { echo "set-up: uv could not; once more with pip" >&2; $(PIP) -e '.[train,view,report]'; }
+	@echo "set-up: imutool with viewer and report, into $(VENV) (the first time it may take minutes: torch is large)"
+	@$(INSTALL)
 	@touch $@
