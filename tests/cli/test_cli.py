@@ -138,7 +138,7 @@ def test_a_slip_of_the_pen_is_met_with_the_nearest_name(
     [
         ["convert", "seq", "seq.mcap"],
         ["info", "{}/flight_1.mcap"],
-        ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
+        ["train", "short.mcap", "--method", "linear", "-o", "m.safetensors"],
         ["debias", "{}/flight_2.mcap", "out.mcap"],
         ["evaluate", "{}/flight_2.mcap", "--model", "static"],
         ["models"],
@@ -147,6 +147,7 @@ def test_a_slip_of_the_pen_is_met_with_the_nearest_name(
 )
 def test_json_to_stdout_is_json_alone(tmp_path: Path, logs: Path, imutool: Run, words: Sequence[str]) -> None:
     write_asl(flight(1, duration_s=1.0), tmp_path / "seq")
+    write(flight(1, duration_s=13.0, rate_hz=100.0), tmp_path / "short.mcap")
     done = imutool(*(word.format(logs) for word in words), "--json", "-", "-v", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["schema"].startswith("imutool.")
