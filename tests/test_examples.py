@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -84,10 +85,21 @@ def test_a_debiased_log_is_read_without_imutool(tmp_path: Path, logs: Path, exam
     assert abs(corrected) < 0.01 < abs(raw)  # at rest; the bias of this sensor is some 0.04 rad/s
 
 
+def begin(source: Path, target: Path, rows: int) -> None:
+    """Copies the first rows of every table of a sequence."""
+    for table in source.rglob("data.csv"):
+        copy = target / table.relative_to(source)
+        copy.parent.mkdir(parents=True)
+        with table.open() as lines:
+            copy.write_text("".join(islice(lines, rows)))
+
+
 def test_the_papers_tables_are_made_in_one_command(tmp_path: Path, data: Path, example: Example) -> None:
-    """On the smallest data set, by the quickest method; the raw column is the published one."""
+    """On the smallest data set, by the quickest method, trained on the beginnings; the raw column is the published one."""
+    for sequence in (data / "fetch").iterdir():
+        begin(sequence, tmp_path / "data" / "fetch" / sequence.name, 10**6 if sequence.name == "05_random" else 3000)
     words = ("--set", "fetch", "--method", "linear", "--seeds", "1", "--workers", "1")
-    printed = example("reproduce_tables.py", data, "-o", "out", *words)
+    printed = example("reproduce_tables.py", "data", "-o", "out", *words)
     row = next(line for line in printed.splitlines() if line.startswith("| 05_random"))
     raw, linear = (re.search(r"\((\d+\.\d+) / \d+\) (\d+\.\d+) / ", cell) for cell in row.split("|")[2:4])
     assert raw is not None
@@ -98,7 +110,7 @@ def test_the_papers_tables_are_made_in_one_command(tmp_path: Path, data: Path, e
     assert page.count("<table>") == 3
     assert page.count("data:image/png;base64,") == 1
     assert "http" not in page
-    assert example("reproduce_tables.py", data, "-o", "out", *words) == printed  # nothing is made twice
+    assert example("reproduce_tables.py", "data", "-o", "out", *words) == printed  # nothing is made twice
 
 
 def test_a_log_is_looked_at_and_a_page_is_left(

@@ -41,7 +41,7 @@ def modules(folder: Path, package: str) -> dict[str, ast.Module]:
         parts = (*package.split("."), *path.relative_to(folder).with_suffix("").parts)
         is_package = parts[-1] == "__init__"
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
+        for node in nodes(tree):
             if isinstance(node, ast.ImportFrom) and node.level:
                 assert node.level == 1, "a relative import stays in its folder"
                 base = ".".join(parts[:-1])

@@ -18,6 +18,7 @@ import pytest
 
 from imutool import __version__
 from imutool.cli.demo import write_asl
+from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 
 ROOT = Path(__file__).parents[1]
@@ -91,7 +92,8 @@ for line in sys.argv[1:]:
 
 def test_commands_that_infer_need_no_torch(tmp_path: Path, logs: Path) -> None:
     """Every command but those that train, one after another in one process, with every method that ships a network."""
-    log, cut = logs / "flight_2.mcap", tmp_path / "cut.mcap"
+    log, cut = tmp_path / "log.mcap", tmp_path / "cut.mcap"
+    write(flight(2, duration_s=8.0), log)
     cut.write_bytes(log.read_bytes()[:-1000])
     lines = [
         f"debias {log} linear.mcap --model {logs / 'linear.safetensors'}",

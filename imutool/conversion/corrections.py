@@ -133,9 +133,10 @@ class Corrections:
         return message._replace(payload=bytes(patch.data))
 
     @cached_property
-    def _turns(self) -> tuple[Float64[np.ndarray, "1 4"], Float64[np.ndarray, "1 4"]]:
-        """Rotations of the world, and from the IMU to the poses' body."""
-        return quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
+    def _turns(self) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "4 4"]]:
+        """Rotations of the world, and from the IMU to the poses' body, as matrices by which a quaternion is multiplied."""
+        turn, body = quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
+        return quaternion.multiply(turn, np.eye(4)).T, quaternion.multiply(np.eye(4), body).T
 
     def _correct_poses(self, topic: MessageTopic, patch: MessagePatch) -> None:
         """Correct the poses or the velocity in the judged poses' frame."""
@@ -153,13 +154,13 @@ class Corrections:
             judged = topic.name == self.pose_topic or (named == 2 and patch.layout.texts[2 * which + 1] in self.copies)
             factor = POSITIONS[self.unit] if judged else 1.0
             numbers[schemas.POSITION] = factor * self.world @ numbers[schemas.POSITION]
-            q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW][None].astype(np.float64)
+            q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW]
             if judged and self.quaternions:
                 rows, signs = MISREAD[self.quaternions]
-                q_wxyz = q_wxyz[:, rows] * signs
+                q_wxyz = q_wxyz[list(rows)] * signs
             if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
-                q_wxyz = quaternion.multiply(q_wxyz, body)
-            numbers[schemas.XYZW] = quaternion.multiply(turn, q_wxyz)[0][XYZW_FROM_WXYZ]
+                q_wxyz = body @ q_wxyz
+            numbers[schemas.XYZW] = (turn @ q_wxyz)[XYZW_FROM_WXYZ]
 
 
 def _is_pose(topic: MessageTopic) -> bool:

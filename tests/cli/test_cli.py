@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +19,7 @@ from imutool import cli, errors, registry
 from imutool.cli import terminal
 from imutool.cli.demo import write_asl
 from imutool.cli.terminal import epoch_line, tell_error
+from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 from imutool.training.fit import Epoch
 
@@ -136,7 +138,7 @@ def test_a_slip_of_the_pen_is_met_with_the_nearest_name(
     [
         ["convert", "seq", "seq.mcap"],
         ["info", "{}/flight_1.mcap"],
-        ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
+        ["train", "short.mcap", "--method", "linear", "-o", "m.safetensors"],
         ["debias", "{}/flight_2.mcap", "out.mcap"],
         ["evaluate", "{}/flight_2.mcap", "--model", "static"],
         ["models"],
@@ -145,6 +147,7 @@ def test_a_slip_of_the_pen_is_met_with_the_nearest_name(
 )
 def test_json_to_stdout_is_json_alone(tmp_path: Path, logs: Path, imutool: Run, words: Sequence[str]) -> None:
     write_asl(flight(1, duration_s=1.0), tmp_path / "seq")
+    write(flight(1, duration_s=13.0, rate_hz=100.0), tmp_path / "short.mcap")
     done = imutool(*(word.format(logs) for word in words), "--json", "-", "-v", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["schema"].startswith("imutool.")
@@ -157,8 +160,9 @@ def test_json_to_a_file_leaves_the_table_on_stdout(tmp_path: Path, logs: Path, i
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
-def test_results_go_to_stdout_and_the_rest_to_stderr_as_much_as_is_asked_for(tmp_path: Path, logs: Path, imutool: Run) -> None:
-    words = ["train", logs / "flight_1.mcap", "--method", "linear", "-o", "m.safetensors", "--overwrite"]
+def test_results_go_to_stdout_and_the_rest_to_stderr_as_much_as_is_asked_for(tmp_path: Path, imutool: Run) -> None:
+    write(flight(1, duration_s=13.0, rate_hz=100.0), tmp_path / "log.mcap")
+    words = ["train", "log.mcap", "--method", "linear", "-o", "m.safetensors", "--overwrite"]
     loud, quiet = (imutool(*words, option, cwd=tmp_path) for option in ("-v", "-q"))
     assert loud.stdout == quiet.stdout == "m.safetensors\n"
     assert quiet.stderr == ""
@@ -166,10 +170,6 @@ def test_results_go_to_stdout_and_the_rest_to_stderr_as_much_as_is_asked_for(tmp
 
 
 def test_warnings_of_a_log_are_results(tmp_path: Path, imutool: Run) -> None:
-    from dataclasses import replace
-
-    from imutool.mcap_io.write import write
-
     recording = flight(1, duration_s=10.0)
     in_g = replace(recording.imu, accel=recording.imu.accel / 9.81)
     write(replace(recording, imu=in_g), tmp_path / "g.mcap")

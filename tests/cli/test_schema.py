@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from imutool.cli import load
 from imutool.cli.demo import write_asl
+from imutool.mcap_io.write import write
 from imutool.report import REPORTS, json_schema
 from imutool.sensor.made_up_flight import flight
 
@@ -31,7 +32,7 @@ LINES: dict[str, Sequence[str]] = {
     "export-rosbag2": ["export", "{}/flight_1.mcap", "out", "--format", "rosbag2"],
     "repair": ["repair", "damaged.mcap", "out.mcap"],
     "debias": ["debias", "{}/flight_2.mcap", "out.mcap", "--clean", "--save-view", "out.rrd", "--report", "out.html"],
-    "train": ["train", "{}/flight_1.mcap", "--method", "linear", "-o", "m.safetensors"],
+    "train": ["train", "short.mcap", "--method", "linear", "-o", "m.safetensors"],
     "evaluate": ["evaluate", "{}/flight_2.mcap", "--model", "static", "--aid", "stops,ground"],
     "view": ["view", "{}/flight_2.mcap", "--html", "out.html"],
     "live": ["live", "--from", "{}/flight_2.mcap", "--speed", "100", "--no-view"],
@@ -50,6 +51,7 @@ def folder(tmp_path: Path, logs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Folder with a raw sequence and a log cut short."""
     monkeypatch.chdir(tmp_path)
     write_asl(flight(1, duration_s=1.0), tmp_path / "seq")
+    write(flight(1, duration_s=13.0, rate_hz=100.0), tmp_path / "short.mcap")
     raw = (logs / "flight_1.mcap").read_bytes()
     (tmp_path / "damaged.mcap").write_bytes(raw[: len(raw) // 2])
     return tmp_path

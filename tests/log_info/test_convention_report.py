@@ -58,8 +58,12 @@ def stop(done: int, total: int, text: str) -> None:
         raise StopError
 
 
+def stop_training(epoch: object) -> None:
+    raise StopError
+
+
 def trained(log: Path) -> None:
-    train([log], log.with_suffix(".safetensors"), method="linear", overwrite=True)
+    train([log], log.with_suffix(".safetensors"), method="linear", overwrite=True, progress=stop_training)
 
 
 USES: dict[str, Callable[[Path], object]] = {
