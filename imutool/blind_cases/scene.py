@@ -15,8 +15,8 @@ from scipy.interpolate import make_interp_spline
 from imutool.array_types import Float64, Int64
 from imutool.blind_cases import catalogue
 from imutool.blind_cases.effects import Model, Reading, Six, Stage, Theta, Times
-from imutool.blind_cases.motion import Kinematics, Motion, Smoother
-from imutool.errors import ConfigError
+from imutool.blind_cases.motion import SHORTEST_S, Kinematics, Motion, Smoother
+from imutool.errors import ConfigError, DataError
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Poses
 
@@ -168,6 +168,7 @@ def place_scene(smoother: Smoother, noise: Noise, rng: Generator, longest_s: flo
 
     Raises:
         ConfigError: unknown or zero noise.
+        DataError: a scene too short for its poses to be smoothed when the case is opened.
     """
     density = np.concatenate([noise.values("gyro_density"), noise.values("accel_density")])
     if not (np.isfinite(density).all() and (density > 0.0).all()):
@@ -179,6 +180,12 @@ def place_scene(smoother: Smoother, noise: Noise, rng: Generator, longest_s: flo
     motion = smoother.motion()
     room = motion.last_s - motion.first_s - 2.0 * MARGIN_S
     duration = np.floor(min(longest_s, room))
+    if duration < SHORTEST_S:
+        raise DataError(
+            f"a case of {duration:g} s",
+            expected=f"at least {SHORTEST_S:g} s, and {MARGIN_S:g} s of the trajectory before and after it",
+            fix="Choose a longer trajectory, or a larger `longest_s`",
+        )
     start = motion.first_s + MARGIN_S + rng.uniform(0.0, max(room - duration, 0.0))
     channel_t = np.arange(int(duration * catalogue.RATE_HZ) + 1) / catalogue.RATE_HZ
     scene = Scene(smoother, motion, float(start), float(duration), density * np.sqrt(RATE_HZ), channel_t)

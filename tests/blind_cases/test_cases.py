@@ -592,9 +592,11 @@ def test_noise_of_nothing_is_refused(trajectory: Path, tmp_path: Path) -> None:
         conceal(trajectory, tmp_path / "case", seed=1, noise="none")
 
 
-def test_a_trajectory_too_short_is_refused(tmp_path: Path) -> None:
-    write(flight(1, duration_s=8.0), tmp_path / "short.mcap")
-    with pytest.raises(DataError, match="true poses"):
+@pytest.mark.parametrize(("duration_s", "what"), [(8.0, "true poses"), (24.0, "a case of 19 s.*at least 20 s, and 2.5 s")])
+def test_a_trajectory_too_short_is_refused(tmp_path: Path, duration_s: float, what: str) -> None:
+    """Also where the case alone would be too short to be opened."""
+    write(flight(1, duration_s=duration_s), tmp_path / "short.mcap")
+    with pytest.raises(DataError, match=what):
         conceal(tmp_path / "short.mcap", tmp_path / "case", seed=1)
 
 

@@ -90,9 +90,8 @@ def here(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def brief(here: Path, name: str) -> Path:
     """As `here`, with logs that are quickly done: in.mcap just long enough for the command, and a shorter one."""
     write(flight(1, duration_s=0.4 * BRIEF_S, rate_hz=100.0), here / "short.mcap")
-    if name != "conceal":  # it asks for twenty seconds
-        (here / "in.mcap").unlink()
-        write(flight(1, duration_s=BRIEF_S, rate_hz=100.0), here / "in.mcap")
+    (here / "in.mcap").unlink()
+    write(flight(1, duration_s=26.0 if name == "conceal" else BRIEF_S, rate_hz=100.0), here / "in.mcap")
     return here
 
 
