@@ -292,7 +292,7 @@ def _normal(
         for axis in range(log.pair.columns):
             where, A = jacobians.on_axis(k, axis, mask)
             constant, at = problem.constants[k][axis], p + log.pair.columns * k + axis
-            N[np.ix_(where, where)] += A @ A.T
+            N[where[:, None], where] += A @ A.T
             N[where, at] = N[at, where] = A @ constant
             N[at, at] = constant @ constant + 1.0 / log.pair.bias_std[axis] ** 2
             if residuals is not None:
