@@ -51,7 +51,7 @@ class Fit:
     logs: tuple[WhitenedLog, ...]
     part: str
     passes: tuple[ForwardPass, ...]
-    residuals: tuple[Float64[np.ndarray, "n k"], ...]  # white, bias included
+    residuals: tuple[Float64[np.ndarray, "_ k"], ...]  # white, bias included; each log has its own rows
     prior: Float64[np.ndarray, " p"]
 
     @property
