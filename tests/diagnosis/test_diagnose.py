@@ -232,8 +232,8 @@ def test_a_lag_of_another_signal_shows_by_the_clock_of_the_imu_where_the_logs_sh
 
 def test_impacts_and_noise_of_both_are_no_mismatch(tmp_path: Path) -> None:
     """A body that is thrown: its forces last for a sample, and its rates jump."""
-    rng, t_s = np.random.default_rng(3), planted.clock(30.0, 240.0)
-    path = planted.moving(3, 30.0)
+    rng, t_s = np.random.default_rng(3), planted.clock(12.0, 240.0)
+    path = planted.moving(3, 12.0)
     imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
     felt, hits = np.concatenate([0.1 * imu.gyro, 0.01 * imu.accel], axis=1), np.arange(60, len(t_s), 120)
     felt[hits, 3:] += rng.normal(scale=200.0, size=(len(hits), 3))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imutool.converters import euroc
@@ -130,6 +130,7 @@ def test_vibration_is_left_out_and_the_noise_below_it_found() -> None:
         assert slopes.seen["density"] == pytest.approx(DENSITY, rel=0.3)
 
 
+@settings(max_examples=20)
 @given(scale=st.floats(1e-6, 1e6), seed=st.integers(0, 3))
 def test_what_is_read_scales_with_the_samples(scale: float, seed: int) -> None:
     part = noisy(seed, 150.0, walk=10.0 * WALK)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,10 +86,8 @@ class _Linear(NamedTuple):
 
     def short(self) -> _Linear:
         """The same in half of the memory, to guess scores beside other fits."""
-        half = [
-            (k, js, b.astype(np.float32), None if added is None else added.astype(np.float32)) for k, js, b, added in self.rows
-        ]
-        return self._replace(rows=half)
+        half, rows = np.float32, self.rows
+        return self._replace(rows=[(k, js, b.astype(half), x if x is None else x.astype(half)) for k, js, b, x in rows])
 
 
 class CandidateScore:
@@ -105,15 +105,16 @@ class CandidateScore:
                 axis = _Axis(fitted, direction(log.constants[fitted, k]), where, A, residual[:, k])
                 axis = axis._replace(A=axis.free(A), r=axis.free(residual[:, k]))
                 self.axes.append(axis)
-                self.N[np.ix_(where, where)] += axis.A @ axis.A.T
+                self.N[where[:, None], where] += axis.A @ axis.A.T
                 self.g[where] += axis.A @ axis.r
                 self.total += float(axis.r @ axis.r)
-        self.left = self.total - float(self.g @ np.linalg.solve(self.N, self.g))
+        self.solved_g = np.linalg.solve(self.N, self.g)
+        self.left = self.total - float(self.g @ self.solved_g)
         self.short = [axis.short() for axis in self.axes]
 
     def linear(self, effect: Effect, start: Theta) -> _Linear:
         """Derivatives of a candidate beside the fit, and what its start adds."""
-        rows, N = [], np.zeros((len(start), len(start)))
+        rows, N = [], np.diag(1.0 / priors(((effect, start),), self.now.settings)[1] ** 2)
         for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
             with_it = forward if effect.linear else ForwardPass(log.pair, (*self.now.chosen, (effect, start)), forward)
             B, added = effect_jacobian(log.whiten, with_it, effect, onsets=False), with_it.added(forward)  # they are searched
@@ -121,7 +122,7 @@ class CandidateScore:
                 axis, on = self.axes[log.pair.columns * k + column], B.on(column)
                 if len(on) or column in added:
                     js, b = B.parameters[on], axis.free(B.rows[on])
-                    N[np.ix_(js, js)] += b @ b.T
+                    N[js[:, None], js] += b @ b.T
                     more = axis.free(log.whiten.rows([added[column]], np.array([column]))[0]) if column in added else None
                     rows.append((log.pair.columns * k + column, js, b, more))
         return _Linear(start, rows, N)
@@ -132,26 +133,25 @@ class CandidateScore:
         No positive parameter changes by more than a factor of e.
         """
         p = len(linear.start)
-        N_ab, g_b, g_a, total = np.zeros((len(self.N), p)), np.zeros(p), self.g.copy(), self.total
+        N_ab, g_b, g_a, total = np.zeros((len(self.N), p)), np.zeros(p), self.g, self.total
         for k, js, b, added in linear.rows:
             axis, r = self.axes[k], self.axes[k].r
             if added is not None:
                 r = r - added
                 total += float(r @ r - axis.r @ axis.r)
-                g_a[axis.where] += axis.A @ (r - axis.r)
+                g_a = g_a - np.bincount(axis.where, axis.A @ added, len(g_a))
             if len(js):
                 like = self.short[k] if b.dtype == np.float32 else axis
-                N_ab[np.ix_(axis.where, js)] += like.A @ b.T
+                N_ab[axis.where[:, None], js] += like.A @ b.T
                 g_b[js] += b @ (like.r if added is None else r)
-        _, std = priors(((effect, linear.start),), self.now.settings)
-        solved = np.linalg.solve(self.N, np.concatenate([N_ab, g_a[:, None]], axis=1))
-        S, g = linear.N + np.diag(1.0 / std**2) - N_ab.T @ solved[:, :p], g_b - N_ab.T @ solved[:, p]
+        solved_g = self.solved_g if g_a is self.g else np.linalg.solve(self.N, g_a)
+        S, g = linear.N - N_ab.T @ np.linalg.solve(self.N, N_ab), g_b - N_ab.T @ solved_g
         try:
             step = np.linalg.solve(S, g)
         except np.linalg.LinAlgError:  # of a log against itself, float32 rows of 1e7 leave S singular
             step = np.linalg.lstsq(S, g)[0]
         far = float(np.abs(step[[parameter.positive for parameter in effect.parameters]]).max(initial=1.0))
-        return float(self.left - total + g_a @ solved[:, p] + (2.0 / far - 1.0 / far**2) * (g @ step))
+        return float(self.left - total + g_a @ solved_g + (2.0 / far - 1.0 / far**2) * (g @ step))
 
 
 class Scored(NamedTuple):
@@ -219,7 +219,7 @@ class Candidates:
                 break
             if effect.key not in self.scores:
                 self._derive(self.score, [effect], derived)
-            best = sorted([*best, self.scores[effect.key]], key=lambda entry: entry.log_p)
+            insort(best, self.scores[effect.key], key=attrgetter("log_p"))
         return best
 
     def jump_on_trend(self, now: Fit, best: Fit, named: Sequence[Effect], threshold: float) -> Fit:

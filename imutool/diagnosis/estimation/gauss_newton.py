@@ -51,7 +51,7 @@ class Fit:
     logs: tuple[WhitenedLog, ...]
     part: str
     passes: tuple[ForwardPass, ...]
-    residuals: tuple[Float64[np.ndarray, "n k"], ...]  # white, bias included
+    residuals: tuple[Float64[np.ndarray, "_ k"], ...]  # white, bias included; each log has its own rows
     prior: Float64[np.ndarray, " p"]
 
     @property
@@ -292,7 +292,7 @@ def _normal(
         for axis in range(log.pair.columns):
             where, A = jacobians.on_axis(k, axis, mask)
             constant, at = problem.constants[k][axis], p + log.pair.columns * k + axis
-            N[np.ix_(where, where)] += A @ A.T
+            N[where[:, None], where] += A @ A.T
             N[where, at] = N[at, where] = A @ constant
             N[at, at] = constant @ constant + 1.0 / log.pair.bias_std[axis] ** 2
             if residuals is not None:

@@ -67,13 +67,11 @@ class SpatialChain:
             along = np.einsum("cdn,d->cn", R, axis)
             spin = spin + along * ddq + _cross(speed, along) * dq
             speed = speed + along * dq
-            turned = [np.einsum("cdn,d->cn", R, v) for v in np.eye(3)]
             c, s, fixed = np.cos(q), np.sin(q), along * (1.0 - np.cos(q))
-            R = np.stack([c * v + s * _cross(along, v) + fixed * axis[j] for j, v in enumerate(turned)], axis=1)
-            axes[k] = along
-            for j, v in enumerate(basis.T):
-                E[2 * k + j] = e = np.einsum("cdn,d->cn", R, v)
-                bent[2 * k + j] = _cross(spin, e) + _cross(speed, _cross(speed, e))
+            R = c * R + s * _cross(along[:, None], R) + fixed[:, None] * axis[:, None]
+            axes[k], e = along, np.einsum("cdn,dj->cjn", R, basis)
+            turning = _cross(spin[:, None], e) + _cross(speed[:, None], _cross(speed[:, None], e))
+            E[2 * k : 2 * k + 2], bent[2 * k : 2 * k + 2] = e.swapaxes(0, 1), turning.swapaxes(0, 1)
         return Moved(axes, E, bent)
 
     def efforts(self, moved: Moved, S: Float64[np.ndarray, "u u"], A: Float64[np.ndarray, " u"]) -> Float64[np.ndarray, "n k"]:
@@ -89,15 +87,15 @@ class SpatialChain:
         """Efforts for each coefficient: rows, joints, coefficients."""
         moved, n = self.moved(state), len(self.axes)
         a, b = np.triu_indices(2 * n)
-        weights = np.where(a == b, 0.5, 1.0)
-        out = np.zeros((moved.E.shape[2], n, self.moments))
+        weights, length = np.where(a == b, 0.5, 1.0)[:, None], moved.E.shape[2]
+        out = np.zeros((n, self.moments, length))  # samples last: what is gathered lies in one piece
         for k in range(n):
-            arm = _cross(moved.axes[k][:, None], moved.E[2 * k :].swapaxes(0, 1)).transpose(2, 1, 0)
-            G = np.zeros((len(arm), 2 * n, 2 * n))
-            G[:, 2 * k :] = arm @ moved.bent.transpose(2, 1, 0)
-            out[:, k, : len(a)] = weights * (G + G.swapaxes(1, 2))[:, a, b]
-            out[:, k, len(a) + 2 * k :] = GRAVITY_M_S2 * arm[:, :, 2]
-        return out
+            arm, G = _cross(moved.axes[k][:, None], moved.E[2 * k :].swapaxes(0, 1)), np.zeros((2 * n, 2 * n, length))
+            for own, bent in zip(arm, moved.bent.swapaxes(0, 1), strict=True):
+                G[2 * k :] += own[:, None] * bent
+            out[k, : len(a)] = weights * (G[a, b] + G[b, a])
+            out[k, len(a) + 2 * k :] = GRAVITY_M_S2 * arm[2]
+        return out.transpose(2, 0, 1)
 
     def of_link(self, x: Float64[np.ndarray, " 3"], link: int = -1) -> Float64[np.ndarray, " u"]:
         """A vector of a link, the last one, in the directions of all links."""
@@ -213,4 +211,10 @@ def _neighbours(axes: Axes) -> Iterator[Axes]:
 
 
 def _cross(a: Float64[np.ndarray, "..."], b: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    """Products along the first axis; each element is looked at where it lies, without a copy."""
+    x = a[1] * b[2]
+    out = np.empty((3, *x.shape))
+    np.subtract(x, a[2] * b[1], out=out[0])
+    np.subtract(a[2] * b[0], a[0] * b[2], out=out[1])
+    np.subtract(a[0] * b[1], a[1] * b[0], out=out[2])
+    return out

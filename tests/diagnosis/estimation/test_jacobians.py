@@ -14,7 +14,7 @@ from imutool.diagnosis.estimation import unnamed_effects
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.candidate_score import CandidateScore
 from imutool.diagnosis.estimation.gauss_newton import fit
-from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, priors, step_of
+from imutool.diagnosis.estimation.jacobians import ForwardPass, Jacobians, bound, effect_jacobian, free, step_of
 from imutool.diagnosis.estimation.whitening import Band, Whitener
 from imutool.diagnosis.settings import FitSettings
 from imutool.sensor import catalogue
@@ -174,9 +174,9 @@ def test_a_candidate_that_single_precision_leaves_singular_gains_nothing() -> No
     """So are the rows of a recording that is compared with itself: 1e7 in float32 against the prior's ones."""
     (effect,) = catalogue.effects(["lever_arm"])
     start = np.zeros(3)
-    _, std = priors(((effect, start),), FitSettings())
     score = object.__new__(CandidateScore)
     score.N, score.g, score.left, score.total, score.axes = np.zeros((0, 0)), np.zeros(0), 2.0, 2.0, []
+    score.solved_g = score.g
     score.now = SimpleNamespace(settings=FitSettings())  # type: ignore[assignment]
-    singular = SimpleNamespace(start=start, rows=[], N=-np.diag(1.0 / std**2))
+    singular = SimpleNamespace(start=start, rows=[], N=np.zeros((3, 3)))  # the prior's ones are lost
     assert score.gain(effect, singular) == 0.0  # type: ignore[arg-type]

@@ -83,21 +83,25 @@ def moved(
     data.qpos[:] = course["q"][0]
     waiting = deque([np.zeros(2)] * round(own.delay_s / STEP_S))
     rows, times = [], []
-    encoder, eccentric, acting, forces = np.array(own.encoder), np.array(own.eccentric), _acting(own), _forces(own)
-    for k, (q, dq, ddq) in enumerate(zip(*(course[name] for name in ("q", "dq", "ddq")), strict=True)):
-        angle = data.qpos + encoder
-        if eccentric.any():
-            angle += eccentric[:, 0] * np.sin(data.qpos) + eccentric[:, 1] * np.cos(data.qpos)
-        model.qpos[:], model.qvel[:] = angle, data.qvel
-        model.qacc[:] = ddq + BANDWIDTH**2 * (q - angle) + 2.0 * BANDWIDTH * (dq - data.qvel)
+    encoder, (sine, cosine), acting, forces = np.array(own.encoder), np.array(own.eccentric).T, _acting(own), _forces(own)
+    wanted, eccentric = course["ddq"] + BANDWIDTH**2 * course["q"] + 2.0 * BANDWIDTH * course["dq"], bool(np.any(own.eccentric))
+    qpos, qvel, qacc, effort = model.qpos, model.qvel, model.qacc, model.qfrc_inverse  # views of what MuJoCo works on
+    true_q, true_dq, given, applied = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
+    for k, ahead in enumerate(wanted):
+        angle = true_q + encoder
+        if eccentric:
+            angle += sine * np.sin(true_q) + cosine * np.cos(true_q)
+        qpos[:], qvel[:] = angle, true_dq
+        qacc[:] = ahead - BANDWIDTH**2 * angle - 2.0 * BANDWIDTH * true_dq
         mujoco.mj_inverse(plan, model)
-        command = model.qfrc_inverse.copy()
+        command = effort.copy()
         if k % EACH == 0:
-            rows.append(np.concatenate([angle, data.qvel, command]))
+            rows.append(np.concatenate([angle, true_dq, command]))
             times.append(k * STEP_S)
         waiting.append(command)
-        data.ctrl[:] = acting(waiting.popleft())
-        data.qfrc_applied[:] = forces(data.qpos, data.qvel)
+        given[:] = acting(waiting.popleft())
+        if forces is not None:
+            applied[:] = forces(true_q, true_dq)
         mujoco.mj_step(body, data)
     return _noisy(np.array(times), np.array(rows), noise)
 
@@ -114,25 +118,29 @@ def _noisy(
 def _acting(own: LeftOut) -> Callable[[Float64[np.ndarray, " 2"]], Float64[np.ndarray, " 2"]]:
     """What the motors give of a command; numbers are arrays once, for every step of a millisecond asks."""
     dead, gain, limit = np.array(own.dead_band), np.array(own.gain), np.array(own.limit)
+    holds = bool(dead.any())
 
     def acting(command: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, " 2"]:
-        if dead.any():
+        if holds:
             command = command - np.clip(command, -dead, dead)
         return np.minimum(np.maximum(gain * command, -limit), limit)
 
     return acting
 
 
-def _forces(own: LeftOut) -> Callable[[Any, Any], Float64[np.ndarray, " 2"]]:
-    """Torques that are left out, of angles and velocities."""
+def _forces(own: LeftOut) -> Callable[[Any, Any], Float64[np.ndarray, " 2"]] | None:
+    """Torques that are left out, of angles and velocities, if any are."""
     level, slow = np.array(own.stribeck).T
     sine, cosine, per_turn = np.array(own.ripple).T
+    sticks, ripples = bool(level.any()), bool(sine.any() or cosine.any())
+    if not sticks and not ripples and own.unnamed is None:
+        return None
 
     def forces(q: Any, dq: Any) -> Float64[np.ndarray, " 2"]:
         out = np.zeros(2)
-        if level.any():
+        if sticks:
             out -= level * np.exp(-((dq / slow) ** 2)) * np.tanh(dq / 1e-3)
-        if sine.any() or cosine.any():
+        if ripples:
             out -= sine * np.sin(per_turn * q) + cosine * np.cos(per_turn * q)
         return out if own.unnamed is None else out - own.unnamed(q, dq)
 

@@ -405,6 +405,7 @@ def test_a_missing_matplotlib_says_how_to_get_it(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_paths_of_a_closed_loop_are_those_of_the_first_ideal_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples of the second simulation have a bias: integrated, it would drift away."""
     drawn: list[np.ndarray | None] = []
