@@ -100,9 +100,10 @@ def turns_from_start(gyro: Samples, dt: Steps) -> Float[Tensor, "batch n 3 3"]:
 
 
 def derivative_by_sample(sensor: Sensor, turns: Float[Tensor, "batch n 3 3"], dt: Steps) -> Float[Tensor, "batch n 3 3"]:
-    """Derivative of the turn by the rate at each sample, or of the velocity by the specific force, in the frame of the first.
+    """Derivative of turn or velocity by the samples of the gyro or accelerometer.
 
-    Either counts half for both of its steps: the turn at a step's end, and the force at the sample (the trapezoidal rule).
+    It is in the frame of the first sample. Each sample counts half for both of its steps: a rate turns by the step's end, a
+    force acts at the sample (the trapezoidal rule).
     """
     if sensor == "accel":
         return 0.5 * (pad(dt, (0, 1)) + pad(dt, (1, 0)))[..., None, None] * turns
