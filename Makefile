@@ -5,13 +5,12 @@ DEMO ?= demo-out
 # one more than the cores: a test often waits for a process of its own
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(min(4, (os.cpu_count() or 1) + 1))')
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 # uv installs in an eighth of pip's time. It reads no settings of pip's: those that say where packages are get passed on
-PIP_SAYS = $$($(BIN)/python -m pip config get global.$(1) 2>/dev/null | tr -s ' \n' '$(2)')
-UV = UV_FIND_LINKS="$${UV_FIND_LINKS-$${PIP_FIND_LINKS-$(call PIP_SAYS,find-links,$(comma))}}" \
-	UV_DEFAULT_INDEX="$${UV_DEFAULT_INDEX-$${PIP_INDEX_URL-$(call PIP_SAYS,index-url, )}}" \
+PIP_SAYS = $$($(BIN)/python -m pip config get global.$(1) 2>/dev/null)
+UV = UV_FIND_LINKS="$${UV_FIND_LINKS-$${PIP_FIND_LINKS-$(call PIP_SAYS,find-links)}}" \
+	UV_DEFAULT_INDEX="$${UV_DEFAULT_INDEX-$${PIP_INDEX_URL-$(call PIP_SAYS,index-url)}}" \
 	UV_INDEX="$${UV_INDEX-$$PIP_EXTRA_INDEX_URL}" $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt
-comma := ,
 INSTALL = { $(PIP) uv && $(UV) -e '.[$(EXTRAS)]'; } || \
 	{ echo "set-up: uv could not; once more with pip, which takes minutes" >&2; $(PIP) -e '.[$(EXTRAS)]'; }
 READY_DEMO := $(VENV)/.ready-demo

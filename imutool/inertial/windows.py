@@ -100,10 +100,9 @@ def turns_from_start(gyro: Samples, dt: Steps) -> Float[Tensor, "batch n 3 3"]:
 
 
 def derivative_by_sample(sensor: Sensor, turns: Float[Tensor, "batch n 3 3"], dt: Steps) -> Float[Tensor, "batch n 3 3"]:
-    """Derivative of turn or velocity by the samples of the gyro or accelerometer.
+    """Derivative of the turn or the velocity by each sample, in the frame of the first.
 
-    It is in the frame of the first sample. Each sample counts half for both of its steps: a rate turns by the step's end, a
-    force acts at the sample (the trapezoidal rule).
+    Half of each step belongs to either of its samples. A rate acts at the end of its step, a specific force at its sample.
     """
     if sensor == "accel":
         return 0.5 * (pad(dt, (0, 1)) + pad(dt, (1, 0)))[..., None, None] * turns
@@ -151,11 +150,11 @@ def velocity_residual(
 
 @dataclass(frozen=True)
 class Pieces:
-    """Stretches of samples between the ends of windows: each window is a row of whole stretches.
+    """Pieces of logs between the ends of windows: each window is a row of whole pieces.
 
-    Windows of several lengths that overlap share their samples, which are integrated once. With G the turn before each stretch
-    and C the sum of G_k x_k of all before, x_k what a stretch adds, a window from a to e turns by G_a^T G_e and adds
-    G_a^T (C_e - C_a).
+    Windows of several lengths overlap, and the samples that they share are integrated once. Let x_k be what piece k adds, G_k
+    the turn before it, and C_k the sum of G_j x_j over all pieces j before it. A window from piece a to piece e turns by
+    G_a^T G_e and adds G_a^T (C_e - C_a).
     """
 
     begin: Int[Tensor, " c"]
@@ -163,7 +162,7 @@ class Pieces:
 
     @classmethod
     def between(cls, windows: Sequence[tuple[Int[Tensor, " _"], int]], longest: int) -> Pieces:
-        """The stretches of windows (first samples, steps), of at most `longest` steps; what no window covers is left out."""
+        """Pieces of windows (first samples, steps), of at most `longest` steps; samples in no window are left out."""
         ends = torch.cat([first + k for first, n in windows for k in (0, n)])
         opens = torch.cat([torch.full_like(first, sign) for first, _ in windows for sign in (1, -1)])
         cuts, at = torch.unique(ends, return_inverse=True)
@@ -176,26 +175,26 @@ class Pieces:
         return cls(begin[of] + start, end - start)
 
     def row(self, first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"]]:
-        """First stretch of each window of n steps, and the one after its last."""
+        """First piece of each window of n steps, and the one after its last."""
         start, end = torch.searchsorted(self.begin, torch.stack([first, first + n]))
         return start, end
 
     def index(self) -> Int[Tensor, "c _"]:
-        """Samples of each stretch, as many for all: the last one repeats, which is a step that takes no time."""
+        """Samples of each piece. A shorter piece repeats its last one: a step without duration adds nothing."""
         k = torch.arange(int(self.steps.max()) + 1, device=self.steps.device)
         return self.begin[:, None] + torch.minimum(k, self.steps[:, None])
 
 
 @dataclass(frozen=True)
 class Prefix:
-    """Turn G and sum C before each stretch of `Pieces`, and after the last."""
+    """Turn G and sum C before each of the `Pieces`, and after the last."""
 
     turn: Float[Tensor, "c 3 3"]
     total: Float[Tensor, "c 3 k"]
 
     @classmethod
     def of(cls, turns: Float[Tensor, "p 3 3"], adds: Float[Tensor, "p 3 k"]) -> Prefix:
-        """From the turn of each stretch, and from what it adds in the frame of its first sample."""
+        """From the turn of each piece, and from what it adds in the frame of its first sample."""
         turn = torch.cat([torch.eye(3).to(turns)[None], running_product(turns[None])[0]])
         return cls(turn, pad(torch.cumsum(turn[:-1] @ adds, 0), (0, 0, 0, 0, 1, 0)))
 

@@ -174,11 +174,8 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
     terms = torch.from_numpy(terms_of(effects, seen.signals)).to(seen.pool.t)
     pattern = torch.from_numpy(patterns(effects)).to(seen.pool.t)
-    pieces, turned, samples = (
-        Pieces.between([w[:2] for w in sets], PIECE),
-        dict[int, Tensor](),
-        seen.pool.of_sensor(seen.sensor),
-    )
+    pieces, turned = Pieces.between([windows[:2] for windows in sets], PIECE), dict[int, Tensor]()
+    samples = seen.pool.of_sensor(seen.sensor)
     rows, unknowns = [pieces.row(windows.first, windows.n) for windows in sets], len(prior) + len(width)
     for step in range(len(sets) + MOST_STEPS):
         fit = judged = Equations(*(prior.new_zeros(logs, *shape) for shape in ((unknowns, unknowns), (unknowns,), ())))
@@ -262,20 +259,22 @@ def _equations(
     own: Float[Tensor, "logs o"],
     shorter: Float[Tensor, " logs"],
 ) -> tuple[Equations, Float[Tensor, " logs"]]:
-    """Normal equations of the windows of one length (`crossed`: `Prefix.across`) and their usual residual, `shorter` before."""
+    """Normal equations of the windows of one length, and their usual residual.
+
+    `crossed` is what `Prefix.across` says of them, `shorter` the usual residual of shorter windows.
+    """
     pool, (turn, added) = seen.pool, crossed
     index = end_samples(windows.first, windows.n)
     ends = pool.at(index, own.new_zeros(len(index), 6))
     if seen.sensor == "gyro":
-        e, to_frame = so3.log(turn.mT @ ends.R_start.mT @ ends.R_end), turn.mT
+        e, by_shared = so3.log(turn.mT @ ends.R_start.mT @ ends.R_end), turn.mT @ added[..., :-1]
         by_nuisance = nuisance_jacobian("gyro", ends, true_u[index], true_u[index])
     else:
-        to_frame = ends.R_start
-        fallen = true_u.new_tensor(GRAVITY_W) * ends.dt.sum(1, keepdim=True)
-        e = ends.v_end - ends.v_start - fallen - (to_frame @ added[..., -1:])[..., 0]
+        by_shared, dv = (ends.R_start @ added).tensor_split((-1,), dim=2)
+        e = ends.v_end - ends.v_start - true_u.new_tensor(GRAVITY_W) * ends.dt.sum(1, keepdim=True) - dv[..., 0]
         by_nuisance = nuisance_jacobian("accel", ends, seen.gyro[index], true_u[index])
     e = e + (by_nuisance @ own[ends.log, 3:, None])[..., 0]
-    slopes = torch.cat([to_frame @ added[..., :-1], by_nuisance], dim=2)
+    slopes = torch.cat([by_shared, by_nuisance], dim=2)
     equations, usual = _summed(e, slopes, ends.log, shorter)
     return equations.times(1.0 / design_effect(pool)), usual
 

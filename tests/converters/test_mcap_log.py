@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imutool.converters import mcap_log
 from imutool.mcap_io.codec.flatbuffer import FlatBuffer
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -276,3 +277,21 @@ def test_a_log_without_an_imu_is_converted_with_a_note(convert, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "note: out.mcap: no topic is an IMU" in done.stderr
     assert "no topic is an IMU" not in convert(write_log(tmp_path / "imu.mcap", "json"), tmp_path / "with.mcap").stderr
+
+
+def test_chunks_that_overlap_come_in_the_order_of_their_log_times(tmp_path):
+    """As the library's own reader has them, also where times are equal."""
+    path, times = tmp_path / "in.mcap", np.random.default_rng(1).integers(0, 40, 300)
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=500)
+        writer.start("", "test")
+        schema = writer.register_schema("robot/Number", "jsonschema", b'{"type": "object"}')
+        channels = [writer.register_channel(topic, "json", schema) for topic in ("/a", "/b")]
+        for n, time in enumerate(times.tolist()):
+            writer.add_message(channels[n % 2], START_NS + time, json.dumps({"n": n}).encode(), START_NS + n)
+        writer.finish()
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert len(reader.get_summary().chunk_indexes) > 10
+        expected = [(channel.topic, message.data) for _, channel, message in reader.iter_messages()]
+    assert [(message.topic.name, message.payload) for message in mcap_log._messages(path, images=True)] == expected

@@ -101,7 +101,7 @@ class Network(BiasNetwork):
         if self.config.paper:
             return torch.zeros_like(u)
         curve = _part(self.curve, sensor, Curve)
-        if _gives_zero(curve.net[-1]):
+        if _skipped(curve.net[-1]):
             return u @ curve.W.mT
         motion: Float[Tensor, "batch n 3"] = curve(u, self._filtered(u, SLOW_S))
         return motion
@@ -111,7 +111,7 @@ class Network(BiasNetwork):
         u, rest = segment.of(sensor)
         if self.config.paper:
             return self.paper_ode(sensor, segment.t, u).bias(rest, self.config.solver, adjoint=self.config.adjoint)
-        if sensor not in self.config.drift or _gives_zero(_part(self.drift, sensor, Drift).out):
+        if sensor not in self.config.drift or _skipped(_part(self.drift, sensor, Drift).out):
             return super().rest_bias(sensor, segment)
         return self._rest_path(segment.t, u, rest, _part(self.drift, sensor, Drift))
 
@@ -170,8 +170,8 @@ def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str
     return solved
 
 
-def _gives_zero(last: nn.Module) -> bool:
-    """Whether a network with this last layer is zero, as before its descent, and nobody asks for its slope."""
+def _skipped(last: nn.Module) -> bool:
+    """Whether a network need not run: its last layer is zero, as before its descent, and no derivative is asked for."""
     return not torch.is_grad_enabled() and not any(bool(weight.any()) for weight in last.parameters())
 
 
