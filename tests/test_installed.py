@@ -22,7 +22,7 @@ from imutool.mcap_io.write import write
 from imutool.sensor.made_up_flight import flight
 
 ROOT = Path(__file__).parents[1]
-HEAVY = {"torch", "torchdiffeq", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
+HEAVY = {"scipy", "torch", "torchdiffeq", "rerun", "ray", "matplotlib", "rosbags", "fsspec", "upath"}
 HELP_SHARE = 0.4  # of the time `import torch` takes; the command itself takes about a tenth of it
 ROUNDS = 4
 
@@ -56,12 +56,10 @@ def test_help_imports_nothing_heavy(imported: Callable[..., set[str]], words: li
     assert imported(*words) == set()
 
 
-def test_info_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Path) -> None:
-    assert imported("info", logs / "flight_1.mcap") == set()
-
-
-def test_clean_that_only_looks_imports_nothing_heavy(imported: Callable[..., set[str]], logs: Path) -> None:
-    assert imported("clean", logs / "flight_1.mcap") == set()
+@pytest.mark.parametrize("line", ["info LOG", "clean LOG", "evaluate LOG --model MODEL", "debias LOG o.mcap --model MODEL"])
+def test_commands_that_look_or_infer_import_nothing_heavy(imported: Callable[..., set[str]], logs: Path, line: str) -> None:
+    given = {"LOG": logs / "flight_1.mcap", "MODEL": logs / "linear.safetensors"}
+    assert imported(*(given.get(word, word) for word in line.split())) == set()
 
 
 def test_convert_imports_nothing_heavy(imported: Callable[..., set[str]], tmp_path: Path) -> None:
@@ -70,8 +68,10 @@ def test_convert_imports_nothing_heavy(imported: Callable[..., set[str]], tmp_pa
     assert (tmp_path / "out.mcap").is_file()
 
 
-def test_view_without_a_model_imports_the_viewer_alone(imported: Callable[..., set[str]], tmp_path: Path, logs: Path) -> None:
-    assert imported("view", logs / "flight_1.mcap", "--save", "out.rrd") == {"rerun"}
+def test_view_without_a_model_imports_the_viewer_and_scipy(
+    imported: Callable[..., set[str]], tmp_path: Path, logs: Path
+) -> None:
+    assert imported("view", logs / "flight_1.mcap", "--save", "out.rrd") == {"rerun", "scipy"}
     assert (tmp_path / "out.rrd").is_file()
 
 

@@ -90,11 +90,12 @@ def evaluate(
     A model that does not apply to a log is named at the end, after the scores of the others.
     """
     from imutool.evaluation import evaluate as run
-    from imutool.viewing.html import report as pages
-    from imutool.viewing.html.drawing import require_matplotlib
-    from imutool.viewing.model.load_view import load
 
     if report is not None:
+        from imutool.viewing.html import report as pages
+        from imutool.viewing.html.drawing import require_matplotlib
+        from imutool.viewing.model.load_view import load
+
         require_matplotlib()
     results: list[dict[str, Any]] = []
     loaded, asked = [], aid or ("stops" if zupt else None)

@@ -257,7 +257,8 @@ def _same_path(poses: Poses, truth: Poses) -> bool:
     motion = align(p, p_true) if len(p) > 2 else None
     if motion is None or float(quaternion.length(np.diff(p, axis=0)).sum()) < LEAST_PATH_M:
         return False
-    return float(np.sqrt(((motion[0].apply(p) + motion[1] - p_true) ** 2).sum(axis=1).mean())) < SAME_M
+    R, shift = motion
+    return float(np.sqrt(((p @ R.T + shift - p_true) ** 2).sum(axis=1).mean())) < SAME_M
 
 
 def _mounted(poses: Poses, imu: Imu, name: str) -> Odometry:

@@ -77,11 +77,10 @@ def absolute(estimate: Poses, truth: Poses, valid: Mask) -> dict[str, float | No
         motion = align(p_est, p_true)
         aligned: tuple[float | None, float | None] = (None, None)
         if motion is not None:
-            turn, shift = motion
-            q_turn = turn.as_quat(scalar_first=True)[None]
+            R, shift = motion
             aligned = (
-                _rms(np.degrees(quaternion.angle_between(quaternion.multiply(q_turn, q_est), q_true))),
-                _rms(p_est @ turn.as_matrix().T + shift - p_true),
+                _rms(np.degrees(quaternion.angle_between(quaternion.multiply(quaternion.of_matrix(R), q_est), q_true))),
+                _rms(p_est @ R.T + shift - p_true),
             )
         v_est, v_true = estimate.v_w, truth.v_w
         figures = {
@@ -130,7 +129,7 @@ def relative(
     return {"roe_deg": roe, "rpe_m": rpe}
 
 
-def align(p: Points, p_target: Points) -> tuple[Any, Float64[np.ndarray, "3"]] | None:
+def align(p: Points, p_target: Points) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]] | None:
     """Rotation and shift of the least-squares alignment of points.
 
     Umeyama 1991, eq. 40-42, scale 1.
@@ -148,10 +147,8 @@ def align(p: Points, p_target: Points) -> tuple[Any, Float64[np.ndarray, "3"]] |
     if np.count_nonzero(size > FLAT) < 2:
         return None
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # a rotation, not a reflection
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix(u @ mirror @ vt)
-    return turn, centre_target - turn.apply(centre)
+    R = u @ mirror @ vt
+    return R, centre_target - R @ centre
 
 
 def pairs_by_distance(

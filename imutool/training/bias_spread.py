@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.stats import chi2
+from scipy.special import chdtri
 from torch import Tensor
 
 from imutool.array_types import Float, Float64
@@ -175,7 +175,7 @@ def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float6
     for first, count in ((0, 3), (3, 1)):  # rest shows one direction of the accelerometer's bias
         columns, whole = slice(first, first + count), slice(first, first + 3)
         chi_square = float((stops[:, columns] ** 2 / (seen[:, columns] ** 2 + AT_REST_STD[columns] ** 2)).sum())
-        if len(stops) and chi_square > chi2.isf(BY_CHANCE, len(stops) * count):
+        if len(stops) and chi_square > chdtri(len(stops) * count, BY_CHANCE):
             out[whole] = np.maximum(MAD_TO_STD * np.median(np.abs(stops[:, whole]), axis=0), out[whole])
     return out
 

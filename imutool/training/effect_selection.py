@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import torch
-from scipy.stats import chi2
+from scipy.special import chdtri
 from torch import Tensor
 
 from imutool.array_types import Float
@@ -187,7 +187,7 @@ def _beyond_chance(problem: Problem, effects: Sequence[LinearForm], names: Seque
     last, block = theta[columns][own], covariance[own][:, own]
     wald = problem.design_effect * float(last @ torch.linalg.solve(block, last))
     shown = float((1 - block.diagonal() * problem.prior[columns][own]).sum())
-    return wald > float(chi2.isf(BY_CHANCE / len(effects), max(shown, 1.0)))
+    return wald > float(chdtri(max(shown, 1.0), BY_CHANCE / len(effects)))
 
 
 def _unseen(effects: Sequence[LinearForm], problem: Problem, covariance: Float[Tensor, "p p"]) -> tuple[str, ...]:

@@ -13,11 +13,10 @@ from typing import ClassVar, TypeVar
 import msgspec
 import torch
 from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
 
 from imutool.array_types import Float
 from imutool.bias.networks.network import BiasNetwork, Segment
-from imutool.bias.networks.ode import HermitePath
+from imutool.bias.networks.ode import HermitePath, solve
 from imutool.bias.networks.paper_ode import BiasOde
 from imutool.bias.networks.perceptron import Drift, asinh, by_rows
 from imutool.bias.neural_ode import DRIFT_FILTER_S, HIDDEN, NEAR_ZERO, SLOW_S, Config, Model
@@ -135,7 +134,8 @@ class Network(BiasNetwork):
             beta = drift.euler(knots, knots[:, 0], step_s, rest)
         else:
             path = HermitePath(torch.arange(steps + 1, device=u.device), torch.cat([knots, knots[:, -1:]], dim=1))
-            beta = _solve(_OnGrid(drift, path, step_s), rest, steps, self.config.solver, self.config.adjoint)
+            grid = torch.arange(steps + 1, device=rest.device, dtype=rest.dtype)
+            beta = solve(_OnGrid(drift, path, step_s), rest, grid, self.config.solver, adjoint=self.config.adjoint)
         index = torch.arange(n, device=u.device) / stride
         j = index.long().clamp(max=steps - 1)
         return torch.lerp(beta[j], beta[j + 1], (index - j)[:, None, None].to(u)).transpose(0, 1)
@@ -162,12 +162,6 @@ class _OnGrid(nn.Module):
         u, du = self.path.value(index), self.path.derivative(index) / self.step_s
         rate: Tensor = self.drift(beta, u, du)
         return self.step_s * rate
-
-
-def _solve(field: nn.Module, rest: Float[Tensor, "b 3"], steps: int, solver: str, adjoint: bool) -> Float[Tensor, "m b 3"]:
-    grid = torch.arange(steps + 1, device=rest.device, dtype=rest.dtype)
-    solved: Tensor = (odeint_adjoint if adjoint else odeint)(field, rest, grid, method=solver, rtol=1e-6, atol=1e-9)
-    return solved
 
 
 def _skipped(last: nn.Module) -> bool:

@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
 
 from imutool.array_types import Bool, Float, Num
 from imutool.errors import DataError, NumericsError
@@ -23,11 +22,29 @@ from imutool.geometry import so3
 Method = Literal["euler", "rk4", "dopri5"]
 Field = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
+TOLERANCES = {"rtol": 1e-6, "atol": 1e-9}
 FIXED_STEP: tuple[Method, ...] = ("euler", "rk4")
 FIRST_STRETCH, LONGEST_STRETCH = 32, 128  # outputs per call of a fixed-step solver. A call costs a third of a step, and
 # a chart change wastes the rest of its stretch: stretches double without chart changes, and end at the next one
 MAX_STEPS_PER_OUTPUT = 10_000  # an adaptive solver that needs more steps is at a singularity
 REDUCE = "Reduce the step, or ask for output more often"
+
+
+def solve(
+    field: nn.Module,
+    start: Float[Tensor, "*batch m"],
+    times: Float[Tensor, " n"],
+    method: Method,
+    *,
+    adjoint: bool = False,
+    **how: Any,
+) -> Float[Tensor, "n *batch m"]:
+    """States at the times by torchdiffeq, which takes half a second to import; `how` are its options."""
+    import torchdiffeq
+
+    solver = torchdiffeq.odeint_adjoint if adjoint else torchdiffeq.odeint
+    states: Tensor = solver(field, start, times, method=method, **TOLERANCES | how)
+    return states
 
 
 class HermitePath:
@@ -194,24 +211,15 @@ class _Solver:
         """
         local = times - times[0]
         options, backward = self._options(local)
-        tolerances = {"rtol": self.rtol, "atol": self.atol}
+        how: dict[str, Any] = {"rtol": self.rtol, "atol": self.atol, "options": options}
         try:
             if not self.adjoint:
                 chart, y0 = _Chart(self.field, times[0], R0), torch.cat([xi0, state0], dim=-1)
-                plain: Tensor = odeint(chart, y0, local, method=self.method, options=options, **tolerances)
-                return plain
+                return solve(chart, y0, local, self.method, **how)
             chart = _Chart(self.field, times[0], None)
             y0 = torch.cat([xi0, state0, R0.flatten(-2)], dim=-1)
-            solution: Tensor = odeint_adjoint(
-                chart,
-                y0,
-                local,
-                method=self.method,
-                options=options,
-                adjoint_options=backward,
-                adjoint_params=(*chart.parameters(), *self.parameters),
-                **tolerances,
-            )
+            how |= {"adjoint_options": backward, "adjoint_params": (*chart.parameters(), *self.parameters)}
+            solution = solve(chart, y0, local, self.method, adjoint=True, **how)
         except AssertionError as error:  # torchdiffeq: the step underflowed, or the state is not finite
             raise NumericsError(
                 f"{self.method} failed after t = {float(times[0]):.6g} s ({str(error).splitlines()[0][:80]})",

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
 
 from imutool.array_types import Float
-from imutool.bias.networks.ode import HermitePath, Method, integrate
+from imutool.bias.networks.ode import HermitePath, Method, integrate, solve
 from imutool.bias.networks.perceptron import Drift
 
 Samples = Float[Tensor, "b n 3"]
@@ -55,8 +54,7 @@ class BiasOde(nn.Module):
         if solver == "euler":
             known = (x.to(self.drift.units) for x in (self.u[:, :-1], self.before, self.step_s, start))
             return self.drift.euler(*known).to(start).transpose(0, 1)
-        solved: Tensor = (odeint_adjoint if adjoint else odeint)(self, start, self.grid, method=solver, rtol=1e-6, atol=1e-9)
-        return solved.transpose(0, 1)
+        return solve(self, start, self.grid, solver, adjoint=adjoint).transpose(0, 1)
 
     def attitudes(
         self, start: Start, R_start: Float[Tensor, "b 3 3"], solver: Method, *, adjoint: bool

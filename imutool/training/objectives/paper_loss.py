@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
-from scipy.signal import savgol_filter
 from torch import Tensor
 
 from imutool.array_types import Bool, Float, Int
@@ -132,6 +131,8 @@ def biases_from_poses(pool: Pool, smoothed: int) -> tuple[Biases, Bool[Tensor, "
     known[pool.starts(1, "all")] = True
     biases = torch.where(known[:, None], biases, torch.zeros_like(biases))
     if smoothed > CUBIC:
+        from scipy.signal import savgol_filter  # half a second to import
+
         ends = (torch.nonzero(~known)[:, 0] + 1).tolist()
         for first, end in itertools.pairwise([0, *ends]):
             if end - 1 - first >= smoothed:

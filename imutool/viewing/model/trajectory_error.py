@@ -144,7 +144,8 @@ def _motion(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], alignm
         raise DataError(
             "positions lie on a line and leave the turn about it open", where="align", fix="Use yaw, origin or none for `align`"
         )
-    return RigidMotion(*motion)
+    R, shift_m = motion
+    return RigidMotion(Rotation.from_matrix(R), shift_m)
 
 
 def _about(rotation: Rotation, centre: Float64[np.ndarray, "3"], goal: Float64[np.ndarray, "3"]) -> RigidMotion:
