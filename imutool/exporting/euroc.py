@@ -16,7 +16,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
-from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
+from imutool.mcap_io.topics import VELOCITY_KEY
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.recording import Frames, Poses, Recording, Scalars, unit_quaternions
@@ -83,7 +83,7 @@ def _best_imu(log: Log) -> str:
         LogError: none, or several.
     """
     every = log.with_schema((schemas.IMU,))
-    derived = [t.name for t in every if DERIVED_KEY in t.metadata]
+    derived = [t.name for t in every if t.is_derived]
     found = derived or [t.name for t in every]
     if len(found) != 1:
         listed = ", ".join(found) or "none"

@@ -47,8 +47,10 @@ def _check_readable(log: Log) -> None:
     Raises:
         LogError: the profile is another, or a topic is not in CDR or has no schema.
     """
-    if log.profile != "ros2":
-        raise LogError(f"the log's profile is {log.profile!r}", where=log.path, expected="'ros2', the only one rosbag2 holds")
+    if log.index.header.profile != "ros2":
+        raise LogError(
+            f"the log's profile is {log.index.header.profile!r}", where=log.path, expected="'ros2', the only one rosbag2 holds"
+        )
     for topic in log.topics.values():
         if topic.message_encoding != "cdr" or not topic.schema_name:
             what = (

@@ -16,7 +16,7 @@ from imutool.errors import DataError, LogError
 from imutool.file_location import Location, to_location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
-from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch, decode_image
+from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch
 from imutool.mcap_io.codec.joined_imu import choice_of, no_imu_fix, parse_parts, whole_of
 from imutool.mcap_io.codec.records import HEAD, keep_buffers
 from imutool.mcap_io.index import LogIndex
@@ -57,6 +57,7 @@ class Log:
         self._source = place if isinstance(place, Source) else Source(place)
         self._owns_source, self.path = True, self._source.path
         self.kept: KeptChunks | None = None
+        self._begun: tuple[MessageBlock, messages.Messages | None] | None = None
         try:
             with self.named():
                 self.index = self._read_index(self._source)
@@ -71,9 +72,7 @@ class Log:
     def _read_topics(self) -> None:
         """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
         self.topics = MappingProxyType(topics_of(self.index))
-        more = reflected_topics(
-            self.index, self.topics, lambda topic: next((bytes(rows.payload[0]) for _, rows in self.rows([topic])), None)
-        )
+        more = reflected_topics(self.index, self.topics, self.first)
         self.topics = MappingProxyType({**self.topics, **more})
 
     def __enter__(self) -> Log:
@@ -102,11 +101,6 @@ class Log:
                 raise
             where = f"{self.path} {topic}" if topic else self.path
             raise LogError(error.what, where=where, expected=error.expected, fix=error.fix) from error
-
-    @property
-    def profile(self) -> str:
-        """Profile in the header: `ros2`, `ros1` or nothing."""
-        return str(self.index.header.profile)
 
     @property
     def imu_topics(self) -> list[str]:
@@ -248,12 +242,16 @@ class Log:
             with self.named(topic):
                 yield from described.decode_poses(rows)
 
-    def images(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[tuple[int, bytes]]:
-        """Stamp and encoded bytes of every image of a CompressedImage topic, in file order; LogError as `imu_batches`."""
-        encoding = self.topic(topic, (schemas.IMAGE,)).message_encoding
-        for _, rows in self.rows([topic], start_ns, end_ns):
-            with self.named(topic):
-                yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)
+    def first(self, topic: str) -> bytes | None:
+        """First message of a topic; its chunk stays unpacked, for many topics begin in one."""
+        channels = self.channel_ids(topic)
+        with self.named(topic):
+            for block in (block for block in self.index.blocks if block.may_hold(channels)):
+                if self._begun is None or self._begun[0] is not block:
+                    self._begun = block, self.index.unpack_or_lose(block)
+                for _, rows in self._cut(self._begun[1], {topic: channels}) if self._begun[1] else ():
+                    return bytes(rows.payload[0])
+        return None
 
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
@@ -291,7 +289,7 @@ class Log:
                 yield from self._cut(found, wanted, first, last)
 
     def _cut(
-        self, found: messages.Messages, wanted: Mapping[str, set[int]], first: int, last: int
+        self, found: messages.Messages, wanted: Mapping[str, set[int]], first: int = -1, last: int = 2**63 - 1
     ) -> Iterator[tuple[str, messages.Rows]]:
         times = found.times()
         inside = (times >= first) & (times <= last)

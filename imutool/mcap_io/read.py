@@ -19,7 +19,6 @@ from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.topics import (
     CLEAN_FIX,
-    DERIVED_KEY,
     ENCODINGS,
     MESSAGE_POSES,
     SCALARS,
@@ -93,11 +92,8 @@ def read_recordings(
     own, metadata = own_and_user_metadata(log.metadata_records())
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
-    scalars = [
-        t.name
-        for t in log.with_schema(SCALARS)
-        if t.name not in velocities and t.message_encoding in ENCODINGS and (derived or DERIVED_KEY not in t.metadata)
-    ]
+    numbers = [t for t in log.with_schema(SCALARS) if t.message_encoding in ENCODINGS and (derived or not t.is_derived)]
+    scalars = [t.name for t in numbers if t.name not in velocities]
     used = {name: of for name, of in velocities.items() if of in truths}
     others = {t: k for t in (*log.pose_topics, *truths) if (k := log.topics[t].pose_kind) in DOUBTFUL or t not in truths}
     columns = _Columns(log, imu_topic, truths, used, scalars, refused)
@@ -287,7 +283,7 @@ def _frames(log: Log, start_ns: int | None, end_ns: int | None) -> dict[str, Fra
 
 def _format(log: Log, topic: str) -> str | None:
     """Image format, from the first image; None where it is no image."""
-    payload = next((rows.payload[0].tobytes() for _, rows in log.rows([topic])), None)
+    payload = log.first(topic)
     try:
         return "" if payload is None else decode_image(payload, log.topics[topic].message_encoding)[1]
     except LogError as error:
@@ -297,4 +293,7 @@ def _format(log: Log, topic: str) -> str | None:
 
 def _images(path: Location, topic: str, start_ns: int | None, end_ns: int | None) -> Iterator[tuple[int, bytes]]:
     with Log(path) as log:
-        yield from log.images(topic, start_ns, end_ns)
+        encoding = log.topic(topic, (schemas.IMAGE,)).message_encoding
+        for _, rows in log.rows([topic], start_ns, end_ns):
+            with log.named(topic):
+                yield from (decode_image(payload.tobytes(), encoding)[::2] for payload in rows.payload)

@@ -19,7 +19,7 @@ from imutool.mcap_io.codec.decode import decode_scalars
 from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.fields import Reader, numeric_fields
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import DERIVED_KEY, ENCODINGS, UNIT_KEY, Topic
+from imutool.mcap_io.topics import ENCODINGS, UNIT_KEY, Topic
 from imutool.recording import Recording, Scalars
 
 WORD = "temperature"
@@ -55,7 +55,7 @@ def temperatures(
     found: dict[str, list[Scalars]] = {}
     readers: dict[str, Reader | None] = {}
     for name, topic in log.topics.items():
-        if name not in skip and DERIVED_KEY not in topic.metadata and topic.message_encoding in ENCODINGS:
+        if name not in skip and not topic.is_derived and topic.message_encoding in ENCODINGS:
             if topic.schema_name == schemas.FLOAT:
                 if is_temperature(name):
                     readers[name] = None

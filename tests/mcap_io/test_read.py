@@ -62,7 +62,7 @@ def test_every_layout_reads_the_same(foreign: Foreign, flight: list[Message], la
     path = foreign(flight, layout, metadata={"vehicle": {"id": "7"}}, attachments=(b"a" * 70_000, b""))
     with Log(path) as log:
         assert {t.name: t.count for t in log.topics.values()} == {"/imu/data": 900, "/mocap": 100, "/height": 180}
-        assert (log.profile, log.imu_topics, log.pose_topics) == ("ros2", ["/imu/data"], ["/mocap"])
+        assert (log.index.header.profile, log.imu_topics, log.pose_topics) == ("ros2", ["/imu/data"], ["/mocap"])
         assert log.topics["/imu/data"].schema_encoding == "ros2msg"
         assert log.topics["/imu/data"].metadata == {"frame": "x"}
         assert log.metadata() == {"vehicle": {"id": "7"}}
@@ -134,7 +134,7 @@ def test_ros1_messages_in_mcap_read_as_ros2_ones_do(foreign: Foreign, make: Make
     path = foreign(messages, ros1=True)
     twin = foreign(imu_messages(make) + poses(make, "/vicon", schemas.TRANSFORM), name="twin")
     with Log(path) as log:
-        assert (log.profile, log.imu_topics) == ("ros1", ["/imu"])
+        assert (log.index.header.profile, log.imu_topics) == ("ros1", ["/imu"])
         topic = log.topics["/imu"]
         assert (topic.schema_name, topic.schema_encoding, topic.message_encoding) == (schemas.IMU, "ros1msg", "ros1")
     assert read(path).imu == read(twin).imu

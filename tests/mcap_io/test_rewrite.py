@@ -271,7 +271,7 @@ def test_ros1_logs_get_cdr_channels_beside_their_own(foreign: Foreign, make: Cal
     rewrite(source, target, [Debias("/imu")], metadata={})
     assert digest(target, {"/imu"}) == digest(source)
     with Log(target) as log:
-        assert (log.profile, log.topics["/imu/debiased"].message_encoding) == ("ros1", "cdr")
+        assert (log.index.header.profile, log.topics["/imu/debiased"].message_encoding) == ("ros1", "cdr")
     assert np.array_equal(read(target, imu="/imu/debiased").imu.gyro, read(source).imu.gyro - BIAS)
 
 

@@ -39,8 +39,8 @@ def solve(
     adjoint: bool = False,
     **how: Any,
 ) -> Float[Tensor, "n *batch m"]:
-    """States at the times by torchdiffeq, which takes half a second to import; `how` are its options."""
-    import torchdiffeq
+    """States at the times by torchdiffeq; `how` are its options."""
+    import torchdiffeq  # half a second
 
     solver = torchdiffeq.odeint_adjoint if adjoint else torchdiffeq.odeint
     states: Tensor = solver(field, start, times, method=method, **TOLERANCES | how)

@@ -19,7 +19,7 @@ from imutool.file_location import Location
 from imutool.mcap_io.codec.messages import Rows
 from imutool.mcap_io.fields.decoders import decoder_of
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.topics import DERIVED_KEY, UNIT_KEY, StampCheck, Topic, topics_of
+from imutool.mcap_io.topics import UNIT_KEY, StampCheck, Topic, topics_of
 
 __all__ = ["Fields", "PlainLog", "Reader", "decoder_of", "listed", "numbers", "numeric_fields", "others", "read_field", "split"]
 
@@ -176,11 +176,9 @@ def numeric_fields(log: Log, topic: str, *, long: bool = True) -> list[str]:
     Raises:
         LogError: no schema, or another encoding.
     """
-    decoder = decoder_of(log, log.topics[topic])
-    for _, rows in log.rows([topic]):
-        with log.named(topic):
-            return decoder.paths(rows.payload[0].tobytes(), long)
-    return []
+    decoder, message = decoder_of(log, log.topics[topic]), log.first(topic)
+    with log.named(topic):
+        return [] if message is None else decoder.paths(message, long)
 
 
 def others(
@@ -197,7 +195,7 @@ def others(
     with PlainLog(path) as log:
         readers, left = dict[str, Reader](), READ_FACTOR * most
         for name, topic in log.topics.items():
-            paths = [] if name in skip or DERIVED_KEY in topic.metadata else _offered(log, name)
+            paths = [] if name in skip or topic.is_derived else _offered(log, name)
             paths = [inside for inside in paths if f"{name}.{inside}" != signal and not _NO_CHANNEL.search(inside)][:left]
             if paths:
                 readers[name], left = Reader(log, topic, tuple(paths), strict=False), left - len(paths)
