@@ -36,6 +36,7 @@ from imutool.diagnosis.estimation.significance import (
     estimate_onsets,
     gain_for,
     gain_of,
+    leaves_as_little,
     scatter,
     unnamed_count,
     with_onsets_of,
@@ -248,14 +249,13 @@ class _Search:
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
         """Fits with another effect of the catalogue in the place of one, that leave about as little (Akaike's criterion)."""
-        share, rivals = self.settings.rival_share, self.settings.rivals
-        others, found = (*now.chosen[:k], *now.chosen[k + 1 :]), dict[str, Fit]()
+        others, found, most = (*now.chosen[:k], *now.chosen[k + 1 :]), dict[str, Fit](), self.settings.rivals
         without = fit(self.logs, others, iterations=2, near=now)
-        gain, aic = without.objective - now.objective, now.objective + 2 * len(now.chosen[k][1])
-        for _, effect, start, promised in self.candidates.ranked(without, self.named, rivals)[:rivals]:
-            if effect.name != now.chosen[k][0].name and promised > share * gain:
-                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - share * gain)
-                if trial.objective + 2 * len(start) < aic + self.settings.clearly_better:
+        least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(now.chosen[k][1])
+        for _, effect, start, promised in self.candidates.ranked(without, self.named, most)[:most]:
+            if effect.name != now.chosen[k][0].name and promised > least:
+                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
+                if leaves_as_little(trial, effect.key, aic):
                     found.setdefault(effect.name, trial)
         return found
 

@@ -54,6 +54,20 @@ def bic(found: Fit) -> float:
     return found.objective + parameter_cost(found, found.chosen)
 
 
+def leaves_as_little(found: Fit, key: str, least: float) -> bool:
+    """Whether a fit with an effect is as good as another one, whose Akaike's criterion is `least`.
+
+    If the log shows few parameters of many (one of the nine of a g-sensitivity), the others cost no more than they explain.
+    """
+    (theta,) = (theta for effect, theta in found.chosen if effect.key == key)
+    if found.objective + 2.0 * len(theta) < least + found.logs[0].pair.settings.search.clearly_better:
+        return True
+    if found.objective > least:
+        return False
+    cost = np.minimum(2.0, (theta / found.stds()[key]) ** 2).sum()
+    return bool(found.objective + cost < least + 2.0)
+
+
 def parameter_cost(like: Fit, chosen: Chosen) -> float:
     """Squares that parameters cost by the BIC on a fit's logs; more outside the catalogue."""
     search, unnamed = like.logs[0].pair.settings.search, sum(effect.kind != "catalogue" for effect, _ in chosen)
