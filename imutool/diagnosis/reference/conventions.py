@@ -20,6 +20,7 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
 
 EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless the mount is turned by 10 degrees besides
+UNLIKE = 0.1  # of a correlation: by so much other axes may follow the motion less, where it does not tell them apart
 CONSTANT = 0.1  # of the squares of the specific force, for a bias and a tilt: more of gravity is left by a wrong convention
 Readings = Float64[np.ndarray, "n 3"]
 
@@ -50,11 +51,18 @@ def _convention(sensor: Sensor, y: Readings, x: Readings) -> tuple[float, Matrix
     other = OTHER_UNIT[sensor]
     factor = next((by for by in (other, 1.0 / other) if like.unit(y, by) != 1.0), 1.0)
     _, P = like.frame(y * factor)
-    left = factor * y @ P - x
+    turned = y @ P
+    left = factor * turned - x
     size = max(float((x**2).mean(axis=0).sum()), np.finfo(np.float64).tiny)
     shown = float(left.var(axis=0).sum()) < EXPLAINED * size
     shown &= sensor == "gyro" or float((left.mean(axis=0) ** 2).sum()) < CONSTANT * size
-    return (factor, P) if shown else same
+    return (factor, P) if shown and _correlation(turned, x) > _correlation(y, x) - UNLIKE else same
+
+
+def _correlation(y: Readings, x: Readings) -> float:
+    """Correlation of all axes together."""
+    y, x = y - y.mean(axis=0), x - x.mean(axis=0)
+    return float((y * x).sum() / max(np.sqrt((y**2).sum() * (x**2).sum()), np.finfo(np.float64).tiny))
 
 
 def _converted(pair: Pair, changes: dict[Sensor, tuple[float, Matrix]]) -> Pair:

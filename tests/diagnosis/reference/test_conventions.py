@@ -48,11 +48,12 @@ def test_a_convention_is_named_and_undone(pair, gyro: np.ndarray, accel: np.ndar
         assert one.share > 0.9
 
 
-def test_a_large_constant_of_one_axis_is_no_unit() -> None:
-    """As a battery's voltage leaves it: in g its samples would hardly move, but gravity would be gone as well."""
+@pytest.mark.parametrize("constant", [60.0, 90.0])
+def test_a_large_constant_of_one_axis_is_no_unit(constant: float) -> None:
+    """As a battery's voltage leaves it: in g it would be a motionless sensor, with the other constant even one turned aside."""
     calm = planted.pair(planted.planar(SECONDS))
     read = calm.real.copy()
-    read[:, 3] += 60.0 + np.sin(np.linspace(0.0, 6.0, len(read)))
+    read[:, 3] += constant + np.sin(np.linspace(0.0, 6.0, len(read)))
     (after,), found = with_common_conventions([replace(calm, real=read)])
     assert found == []
     assert after.real == pytest.approx(read)
