@@ -55,7 +55,7 @@ def bic(found: Fit) -> float:
 
 
 def leaves_as_little(found: Fit, key: str, least: float) -> bool:
-    """Whether a fit with an effect is as good as another one, whose Akaike's criterion is `least`.
+    """Whether a fit with an effect is as good as one whose Akaike criterion is `least`.
 
     If the log shows few parameters of many (one of the nine of a g-sensitivity), the others cost no more than they explain.
     """
