@@ -243,7 +243,7 @@ class Log:
                 yield from described.decode_poses(rows)
 
     def first(self, topic: str) -> bytes | None:
-        """First message of a topic; its chunk stays unpacked, for many topics begin in one."""
+        """First message of a topic; its chunk stays unpacked until `rows`, as many topics begin in one."""
         channels = self.channel_ids(topic)
         with self.named(topic):
             for block in (block for block in self.index.blocks if block.may_hold(channels)):
@@ -267,6 +267,7 @@ class Log:
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[tuple[str, messages.Rows]]:
         """The messages of some topics in file order; each chunk is unpacked once for all topics."""
+        self._begun = None  # one chunk in memory
         wanted = {topic: self.channel_ids(topic) for topic in topics}
         every = set().union(*wanted.values()) if wanted else set()
         first, last = -1 if start_ns is None else start_ns, 2**63 - 1 if end_ns is None else end_ns

@@ -57,7 +57,8 @@ def bic(found: Fit) -> float:
 def leaves_as_little(found: Fit, key: str, least: float) -> bool:
     """Whether a fit with an effect is as good as one whose Akaike criterion is `least`.
 
-    If the log shows few parameters of many (one of the nine of a g-sensitivity), the others cost no more than they explain.
+    A parameter costs two squares. Where the log shows few of many (one of the nine of a g-sensitivity), the others cost no more
+    than they explain, and the effect may be worse by the cost of one.
     """
     (theta,) = (theta for effect, theta in found.chosen if effect.key == key)
     if found.objective + 2.0 * len(theta) < least + found.logs[0].pair.settings.search.clearly_better:

@@ -20,8 +20,8 @@ from imutool.diagnosis.result import Estimate, Finding, HeldOut
 from imutool.units import ASCII_UNITS, AXES, SENSORS, Sensor
 
 EXPLAINED = 0.03  # of the motion's squares: a convention leaves less, unless the mount is turned by 10 degrees besides
-UNLIKE = 0.1  # of a correlation: by so much other axes may follow the motion less, where it does not tell them apart
-CONSTANT = 0.1  # of the squares of the specific force, for a bias and a tilt: more of gravity is left by a wrong convention
+UNLIKE = 0.1  # loss of correlation with the motion that another order of axes may bring: at rest no order correlates
+CONSTANT = 0.1  # of the squares of the specific force: a bias and a tilt leave less of them, a wrong convention most of gravity
 Readings = Float64[np.ndarray, "n 3"]
 
 
