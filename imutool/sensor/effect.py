@@ -148,6 +148,10 @@ class Effect:
         """The parameters at which the effect does nothing."""
         return np.array([parameter.null_value for parameter in self.parameters])
 
+    def meets(self, other: Effect) -> bool:
+        """Whether both act on a column in common; an effect that names none acts on all."""
+        return not self.sensors or not other.sensors or bool({*self.sensors} & {*other.sensors})
+
     def without_lag(self, theta: Theta) -> Effect:
         """The effect at these parameters, which a fit no longer changes, and without its lag."""
         lagless = self.lagless

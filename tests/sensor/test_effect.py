@@ -163,6 +163,15 @@ def test_starts_are_finite_and_positive_where_the_number_is_and_work(one: Effect
         assert np.isfinite(simulate_samples(felt, felt.t_s, [(one, start)]).accel).all()
 
 
+def test_effects_meet_where_they_share_a_column_and_one_without_columns_meets_all() -> None:
+    scale, arm, clock = catalogue.effects(["gyro_scale", "lever_arm", "clock_offset"])
+    assert not scale.meets(arm)
+    assert all(one.meets(another) for one, another in [(scale, scale), (scale, clock), (clock, arm)])
+    everywhere = replace(scale, sensors=())
+    assert arm.meets(everywhere)
+    assert everywhere.meets(arm)
+
+
 def test_the_catalogue_of_left_out_physics_is_there() -> None:
     sensor = ("scale", "scale_asymmetry", "misalignment", "quadratic", "hysteresis", "bias_drift", "bias_step")
     expected = {f"{of}_{what}" for of in ("gyro", "accel") for what in sensor}

@@ -248,12 +248,12 @@ class _Search:
         return {now.keys[k]: tuple(self._rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
 
     def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
-        """Fits with another effect of the catalogue in the place of one, that leave about as little (Akaike's criterion)."""
-        others, found, most = (*now.chosen[:k], *now.chosen[k + 1 :]), dict[str, Fit](), self.settings.rivals
-        without = fit(self.logs, others, iterations=2, near=now)
-        least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(now.chosen[k][1])
+        """Fits with another effect on the same sensor in the place of one, that leave about as little (Akaike's criterion)."""
+        found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
+        without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
+        least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
         for _, effect, start, promised in self.candidates.ranked(without, self.named, most)[:most]:
-            if effect.name != now.chosen[k][0].name and promised > least:
+            if effect.name != mine.name and effect.meets(mine) and promised > least:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
                 if leaves_as_little(trial, effect.key, aic):
                     found.setdefault(effect.name, trial)

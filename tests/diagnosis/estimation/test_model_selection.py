@@ -451,6 +451,15 @@ def test_a_temperature_that_rises_as_the_bias_does_is_named_beside_the_drift() -
     assert told(20.0 + np.sin(felt.t_s)) == {"gyro_bias_drift": ()}
 
 
+def test_an_effect_on_the_other_sensor_that_explains_as_much_is_no_rival() -> None:
+    """A search that may find one effect leaves the other one unexplained, and that puts no name in doubt."""
+    pair = planted.pair(planted.shaken(2, DURATION_S), {"gyro_scale": [0.02] * 3, "lever_arm": [0.01, 0.0, 0.0]}, 5)
+    one = msgspec.structs.replace(pair.settings, search=msgspec.structs.replace(pair.settings.search, most_effects=1))
+    log = planted.weighed(replace(pair, settings=one))
+    arm, scale = planted.acting({"lever_arm": [0.0] * 3, "gyro_scale": [0.0] * 3})
+    assert select_effects([log], (arm[0], scale[0]), begin=(arm,)).similar() == {"lever_arm": ()}
+
+
 @pytest.mark.parametrize("t_jump", [4.8, 9.1])
 def test_the_time_of_a_jump_is_found_also_beside_another_effect_and_between_fitted_rows(t_jump: float) -> None:
     pair = planted.pair(planted.rich(3, DURATION_S), {"clock_jump": [t_jump, -0.02], "gyro_scale": [0.02, -0.03, 0.01]}, 3)
