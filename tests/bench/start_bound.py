@@ -1,4 +1,4 @@
-"""What a start from fifteen seconds of truth must cost: `python tests/bench/start_bound.py LOG... --model M`.
+"""What a start must cost, from fifteen seconds of truth and without: `python tests/bench/start_bound.py LOG... --model M`.
 
 The truth's attitude differs from the integrated gyro, of which the model and the log's own best constant are taken, by an error
 that wanders: its variogram over the whole log says how far. In the first seconds it hides the bias. The best linear unbiased
@@ -10,6 +10,12 @@ Printed for each log, in degrees:
     start     root mean square of what the covariance of the start adds
     heading   the mean error that stays if gravity told the biases of both tilts exactly, from the first sample on
     reached   AOE of `evaluate --init truth`
+    auto      the mean error of the heading that the filter of `--init auto` expects, by its covariance
+    smooth    the same of `--smooth`
+
+Without truth a stop shows the bias that turns the heading, and nothing else does. The filter knows the heading at least as well
+as its bias integrated, and no other estimate knows it better if the model's statistics are right: the prior, the walk and the
+offset between rest and motion.
 
 The variogram also holds the walk of the bias within the log, which hides the log's constant as the truth's error does.
 """
@@ -27,7 +33,8 @@ from starts import aoe, own_bias, samples, with_best_truth
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load
 from imutool.bias_start import bias_from_truth, initial_bias
-from imutool.bias_start.initial_bias import InitialBias
+from imutool.bias_start.bias_tracking import filter_blocks, smooth_blocks
+from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
@@ -36,7 +43,8 @@ from imutool.recording import Imu, Recording, seconds
 START_S = 15.0
 STEP_S = 0.25
 TIMES_S = np.geomspace(0.05, 500.0, 30)  # the longest is a random walk over these seconds
-COLUMNS = ("own", "start", "heading", "reached")
+COLUMNS = ("own", "start", "heading", "reached", "auto", "smooth")
+MEAN_SIZE = np.sqrt(2.0 / np.pi)  # of a normal variable, in its standard deviations
 
 
 def main() -> None:
@@ -67,10 +75,19 @@ def bound(model: BiasModel, recording: Recording, own: InitialBias) -> tuple[lis
     first = t_s <= t_s[0] + START_S
     P = covariance(turned[first], gamma, np.diag(initial_bias.bias_prior(model).std[:3] ** 2))
     up = turned[-1, 2] / np.linalg.norm(turned[-1, 2])  # the bias that turns the heading
-    heading = np.sqrt(2.0 / np.pi) * rms_deg((turned @ up) / np.sqrt(up @ np.linalg.solve(P, up)))  # mean of a normal's size
+    heading = MEAN_SIZE * rms_deg((turned @ up) / np.sqrt(up @ np.linalg.solve(P, up)))
     start = rms_deg(turned @ np.linalg.cholesky(P))
     reached = aoe(model, bias_from_truth.from_truth(model, recording), recording)
-    return [aoe(model, own, recording), start, float(heading), reached], np.sqrt(np.diag(P))
+    row = [aoe(model, own, recording), start, float(heading), reached, *without_truth(model, recording)]
+    return row, np.sqrt(np.diag(P))
+
+
+def without_truth(model: BiasModel, recording: Recording) -> tuple[float, float]:
+    """Mean errors of the heading that filter and smoother expect, in degrees."""
+    filtered = list(filter_blocks(model, [model_samples(model, recording.imu)], initial_bias.bias_prior(model)))
+    states = [block.step.after for block in filtered], [state for _, state in smooth_blocks(filtered)]
+    auto, smooth = (MEAN_SIZE * rms_deg(np.array([np.sqrt(state.P[2, 2]) for state in some])) for some in states)
+    return auto, smooth
 
 
 def wander(
