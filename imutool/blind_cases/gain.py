@@ -85,10 +85,11 @@ def explained_gain(
 
     Their parameters have the catalogue's names.
 
-    At most 1; below 0 where they make it worse. None where an effect cannot be simulated, or there is none.
+    At most 1; below 0 where they make it worse. None where an effect cannot be simulated, there is none, or what is concealed
+    acts within `EDGE_S` of the ends alone, as a limit that the first second reaches.
     """
-    concealed = [effect for effect in truth.effects if effect.effect not in WITHOUT_MISFIT]
-    known = [_model(e.effect, e.driver, e.equation, {k: p.value for k, p in e.parameters.items()}) for e in concealed]
+    shown = [effect for effect in truth.effects if effect.effect not in WITHOUT_MISFIT]
+    known = [_model(e.effect, e.driver, e.equation, {k: p.value for k, p in e.parameters.items()}) for e in shown]
     acting = [_model(f.effect, f.driver, f.equation, theta) for f, theta in found if f.effect not in WITHOUT_MISFIT]
     if not known or None in known or None in acting:
         return None
@@ -100,7 +101,8 @@ def explained_gain(
         difference = (scene.misfit(some, t_s) - scene.misfit(other, t_s))[inner]
         return float(np.sum(((difference - difference.mean(axis=0)) / scene.sigma) ** 2))
 
-    return float(np.clip(1.0 - power(known, acting) / power(known, []), -1.0, 1.0))
+    concealed = power(known, [])
+    return float(np.clip(1.0 - power(known, acting) / concealed, -1.0, 1.0)) if concealed else None
 
 
 def _model(name: str, driver: str, equation: str, values: Mapping[str, float]) -> tuple[Model, Theta] | None:
