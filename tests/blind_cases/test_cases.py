@@ -565,7 +565,7 @@ def test_nothing_found_gains_nothing(case: Path) -> None:
 def test_what_acts_in_no_second_that_counts_has_no_gain(case: Path) -> None:
     """As a limit that the first second alone reaches: here none does."""
     truth = _truth(_concealed("saturation", "both", gyro=1e3, accel=1e3))
-    truth["achievable"] = dict.fromkeys(("gyro", "accel"), {"rms_before": 0.1, "rms_after": 0.1})
+    truth["achievable"] = {signal: {"rms_before": 0.1, "rms_after": 0.1} for signal in ("gyro", "accel")}
     assert as_json(score(to_truth(truth, WHERE), _findings([]), WHERE, read(case / SIM)))["gain"] is None
 
 
