@@ -15,6 +15,7 @@ from imutool.recording.columns import median
 
 MOST_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
+SLOW_S = 1.0  # of the turns that find the delay: strides, three a second, fit as well one stride later in steps of 0.1 s
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
@@ -66,38 +67,56 @@ def _clock_difference(motion: Motion, truth: Truth) -> float | None:
 
 
 def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
-    """Delay of at most `LONGEST_DELAY_S`."""
-    first, last, rate = turning(truth)
-    step, mean = motion.table()
-    start = motion.middle_ns
-    use, first_s, last_s = usable(first, last, start, step)
-    inside = (first_s > LONGEST_DELAY_S + STEP_S * step[0]) & (last_s + LONGEST_DELAY_S < STEP_S * (step[-1] + 1))
-    use, first_s, last_s = use[inside], first_s[inside], last_s[inside]
-    if len(use) < DELAY_PARTS * FEWEST:
+    """Delay of at most `LONGEST_DELAY_S`: first by slow turns, then as precisely as all show it."""
+    period_s = 1e-9 * float(median(np.diff(truth.t_ns)))
+    slow, all_turns = (_Turns.of(motion, truth, apart) for apart in (max(1, round(SLOW_S / period_s)), 1))
+    if slow is None or all_turns is None:
         return None
-    true = np.linalg.norm(rate[use], axis=1)
-    gyro = mean[:, :3] - median(mean[:, :3])
-
-    def correlations(lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:
-        rows = []
-        for lag in lags:
-            measured = np.linalg.norm(between(step, gyro, first_s - lag, last_s - lag), axis=1)
-            parts = zip(np.array_split(true, DELAY_PARTS), np.array_split(measured, DELAY_PARTS), strict=True)
-            rows.append([_correlation(true, measured), *(_correlation(*part) for part in parts)])
-        return np.array(rows)
-
     coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
-    whole = correlations(coarse)[:, 0]
+    whole = slow.correlations(coarse)[:, 0]
     at = int(np.argmax(whole))
     if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
         return None
     lags = coarse[at] + np.arange(-12, 13) * FINE_S
-    fine = correlations(lags)
+    fine = all_turns.correlations(lags)
     peaks = np.array([_peak(lags, column) for column in fine.T])
     parts = peaks[1:][np.isfinite(peaks[1:])]
     if not np.isfinite(peaks[0]) or len(parts) < DELAY_PARTS // 2:
         return None
     return Delay(float(peaks[0]), float(np.std(parts, ddof=1)) / len(parts) ** 0.5)
+
+
+class _Turns(NamedTuple):
+    """Turns by the poses, from and to (s of the IMU's clock), and the gyro's means in steps."""
+
+    size: Float64[np.ndarray, " n"]
+    first_s: Float64[np.ndarray, " n"]
+    last_s: Float64[np.ndarray, " n"]
+    step: Int64[np.ndarray, " m"]
+    gyro: Float64[np.ndarray, "m 3"]
+
+    @classmethod
+    def of(cls, motion: Motion, truth: Truth, apart: int) -> _Turns | None:
+        """Turns between poses so many rows apart; None if there are too few at every delay."""
+        first, last, rate = turning(truth, apart)
+        step, mean = motion.table()
+        longest_ns = POSES_APART_NS + int((apart - 1) * median(np.diff(truth.t_ns)))
+        use, first_s, last_s = usable(first, last, motion.middle_ns, step, longest_ns)
+        inside = (first_s > LONGEST_DELAY_S + STEP_S * step[0]) & (last_s + LONGEST_DELAY_S < STEP_S * (step[-1] + 1))
+        use, first_s, last_s = use[inside], first_s[inside], last_s[inside]
+        if len(use) < DELAY_PARTS * FEWEST:
+            return None
+        gyro = mean[:, :3] - median(mean[:, :3])
+        return cls(np.linalg.norm(rate[use], axis=1), first_s, last_s, step, gyro)
+
+    def correlations(self, lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:
+        """Correlations with the gyro at each lag: of all turns, and of each part of the log."""
+        rows = []
+        for lag in lags:
+            measured = np.linalg.norm(between(self.step, self.gyro, self.first_s - lag, self.last_s - lag), axis=1)
+            parts = zip(np.array_split(self.size, DELAY_PARTS), np.array_split(measured, DELAY_PARTS), strict=True)
+            rows.append([_correlation(self.size, measured), *(_correlation(*part) for part in parts)])
+        return np.array(rows)
 
 
 def _correlation(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> float:
@@ -136,12 +155,14 @@ def between(
 
 
 def usable(
-    first_ns: Int64[np.ndarray, " n"], last_ns: Int64[np.ndarray, " n"], start_ns: int, step: Int64[np.ndarray, " m"]
+    first_ns: Int64[np.ndarray, " n"],
+    last_ns: Int64[np.ndarray, " n"],
+    start_ns: int,
+    step: Int64[np.ndarray, " m"],
+    longest_ns: int = POSES_APART_NS,
 ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]:
-    """Pairs of neighbouring poses inside the IMU's time: rows, and their ends in seconds."""
+    """Pairs of poses less than `longest_ns` apart, inside the IMU's time: rows, ends (s)."""
     first_s, last_s = seconds(first_ns, start_ns), seconds(last_ns, start_ns)
-    use = np.flatnonzero(
-        (first_s > STEP_S * step[0]) & (last_s < STEP_S * (step[-1] + 1)) & (last_ns - first_ns < POSES_APART_NS)
-    )
+    use = np.flatnonzero((first_s > STEP_S * step[0]) & (last_s < STEP_S * (step[-1] + 1)) & (last_ns - first_ns < longest_ns))
     use = use[:: max(1, -(-len(use) // MOST_POSES))]
     return use, first_s[use], last_s[use]

@@ -83,15 +83,14 @@ def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarra
     return np.flatnonzero(step > before)
 
 
-def turning(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Angular rate (rad/s, body frame) between neighbouring poses, with start and end (ns)."""
+def turning(
+    truth: Truth, apart: int = 1
+) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
+    """Angular rate (rad/s, body) between poses so many rows apart, with start and end (ns)."""
     q_wb = quaternion.unit(truth.q_wb_wxyz)
-    dt = seconds(truth.t_ns[1:], int(truth.t_ns[0])) - seconds(truth.t_ns[:-1], int(truth.t_ns[0]))
-    return (
-        truth.t_ns[:-1],
-        truth.t_ns[1:],
-        quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-1]), q_wb[1:])) / dt[:, None],
-    )
+    first, last = truth.t_ns[:-apart], truth.t_ns[apart:]
+    dt = seconds(last, int(truth.t_ns[0])) - seconds(first, int(truth.t_ns[0]))
+    return first, last, quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-apart]), q_wb[apart:])) / dt[:, None]
 
 
 def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 3"]]:

@@ -145,6 +145,21 @@ def test_the_clock_of_poses_is_found_however_far_it_is_off(rotation: np.ndarray,
     assert (found.gyro.axes == rotation).all()
 
 
+@pytest.mark.parametrize("hz", [1.85, 2.1, 2.3, 2.6])
+def test_late_poses_of_a_walking_robot_are_not_a_stride_later(hz: float) -> None:
+    """Trot about roll and pitch, its phase wandering, and slow turns: strides are alike."""
+    rng = np.random.default_rng(1)
+    beat = np.cumsum(2 * np.pi * hz / RATE_HZ + 0.06 * np.sqrt(2 * np.pi * hz / RATE_HZ) * rng.normal(size=60 * RATE_HZ))
+    trot = np.stack([0.04 * np.sin(beat + 0.3), 0.03 * np.sin(2 * beat + 1.0) + 0.01 * np.sin(beat)], axis=1)
+    omega = np.column_stack([np.gradient(trot, axis=0) * RATE_HZ, waves(60.0, (0.0, 0.0, 0.12))[:, 2]])
+    imu, poses = turned(omega)
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    found = judge(motion_of(imu), truth._replace(t_ns=truth.t_ns + 30_000_000), 1.0)
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(0.03, abs=0.015)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_poses_of_another_motion_have_no_clock_in_common(seed: int) -> None:
     imu, _ = turned(waves(90.0, (0.5, 0.4, 0.6), seed))
