@@ -79,6 +79,8 @@ def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
         return None
     lags = coarse[at] + np.arange(-12, 13) * FINE_S
     fine = all_turns.correlations(lags)
+    if fine[:, 0].max() < LEAST_CORRELATION:
+        return None
     peaks = np.array([_peak(lags, column) for column in fine.T])
     parts = peaks[1:][np.isfinite(peaks[1:])]
     if not np.isfinite(peaks[0]) or len(parts) < DELAY_PARTS // 2:
