@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.cleaning.samples import STEP_S, Motion
+from imutool.cleaning.samples import STEP_NS, STEP_S, Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.cleaning.unit_evidence import POSES_APART_NS
 from imutool.recording import seconds
@@ -68,9 +68,9 @@ def _clock_difference(motion: Motion, truth: Truth) -> float | None:
 
 def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
     """Delay of at most `LONGEST_DELAY_S`: first by slow turns, then as precisely as all show it."""
-    period_s = 1e-9 * float(median(np.diff(truth.t_ns)))
-    slow, all_turns = (_Turns.of(motion, truth, apart) for apart in (max(1, round(SLOW_S / period_s)), 1))
-    if slow is None or all_turns is None:
+    period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
+    slow, all_turns = (_Turns.of(motion, truth, n, period_ns) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
+    if min(len(slow.size) + FEWEST, len(all_turns.size)) < DELAY_PARTS * FEWEST:
         return None
     coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
     whole = slow.correlations(coarse)[:, 0]
@@ -98,18 +98,14 @@ class _Turns(NamedTuple):
     gyro: Float64[np.ndarray, "m 3"]
 
     @classmethod
-    def of(cls, motion: Motion, truth: Truth, apart: int) -> _Turns | None:
-        """Turns between poses so many rows apart; None if there are too few at every delay."""
+    def of(cls, motion: Motion, truth: Truth, apart: int, period_ns: int) -> _Turns:
+        """Turns between poses so many rows apart that lie within the gyro's samples at every delay."""
         first, last, rate = turning(truth, apart)
         step, mean = motion.table()
-        longest_ns = POSES_APART_NS + int((apart - 1) * median(np.diff(truth.t_ns)))
-        use, first_s, last_s = usable(first, last, motion.middle_ns, step, longest_ns)
+        use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)
         inside = (first_s > LONGEST_DELAY_S + STEP_S * step[0]) & (last_s + LONGEST_DELAY_S < STEP_S * (step[-1] + 1))
-        use, first_s, last_s = use[inside], first_s[inside], last_s[inside]
-        if len(use) < DELAY_PARTS * FEWEST:
-            return None
         gyro = mean[:, :3] - median(mean[:, :3])
-        return cls(np.linalg.norm(rate[use], axis=1), first_s, last_s, step, gyro)
+        return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], step, gyro)
 
     def correlations(self, lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:
         """Correlations with the gyro at each lag: of all turns, and of each part of the log."""
