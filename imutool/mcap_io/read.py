@@ -37,20 +37,16 @@ DOUBTFUL = ("estimate", "odometry")  # kinds of poses
 
 
 def read(
-    path: Location,
-    *,
-    imu: str | None = None,
-    truth: str | None = None,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
+    path: Location, *, imu: str | None = None, truth: str | None = None, start_ns: int | None = None, end_ns: int | None = None
 ) -> Recording:
     """The recording in a log: `read(write(r)) == r`, bit for bit.
 
     Of a log whose clock was set back it is the longest stretch, and a warning says so (`stretches.read_stretches`: all).
     Poses of every pose topic are truths (/tf, by child frame, where there are no others), but not those that are an estimate or
-    odometry, unless `truth` names them; lost poses (NaN, zero quaternions) are left out with a warning. Of a log that imutool
-    did not write, the name is that of the file, and Float64 and Vector3Stamped topics are scalars; one that a recording cannot
-    hold (time going back, NaN) is left out with a warning. `start_ns` and `end_ns` select by log time.
+    odometry, unless `truth` names them; lost poses (NaN, zero quaternions) and those that lost their velocity are left out with
+    a warning. Of a log that imutool did not write, the name is that of the file, and Float64 and Vector3Stamped topics are
+    scalars; one that a recording cannot hold (time going back, NaN) is left out with a warning. `start_ns` and `end_ns` select
+    by log time.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -252,10 +248,14 @@ class _Columns:
             if away.any():  # rows that a recording takes as they are keep every bit
                 q_wb_wxyz = np.where(away[:, None], unit_quaternions(q_wb_wxyz), q_wb_wxyz)
             v_w = None
-            for topic in (t for t, of in self.velocity_topics.items() if of == name):
+            for topic in (t for t, of in self.velocity_topics.items() if of == name and t in self.kept):
                 times, (v_w,) = self.columns(topic, 3)
-                if not np.array_equal(times, stamp_ns):
+                _, both, rows = np.intersect1d(stamp_ns, times, assume_unique=True, return_indices=True)
+                if not len(both) and len(stamp_ns):
                     raise LogError(f"the velocities on {topic} have other stamps than the poses")
+                if alone := len(stamp_ns) - len(both):  # a damaged log ends between the two
+                    logger.warning("%s %s: poses without a velocity are left out: %d", self.log.path, name, alone)
+                stamp_ns, p_wb, q_wb_wxyz, v_w = stamp_ns[both], p_wb[both], q_wb_wxyz[both], v_w[rows]
             return Poses(stamp_ns, p_wb, q_wb_wxyz, v_w)
 
     def scalars(self) -> dict[str, Scalars]:

@@ -444,24 +444,43 @@ def test_nan_and_infinity_in_imu_or_truth_are_refused(foreign: Foreign, make: Ma
         read(foreign([*imu_messages(make), pose], name="pose"))
 
 
-def test_velocities_that_do_not_belong_to_their_poses_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
+def with_velocities(path: Path, times: list[int]) -> Path:
+    """A log with poses at 1, 2 and 3 ns, and velocities at these times: so many metres a second along x."""
     t_ns, zeros, q_wxyz = np.array([1, 2, 3]), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
+    v_ns = np.array(times, np.int64)
+    v_w = v_ns[:, None] * np.array([1.0, 0.0, 0.0])
     with LogWriter(path) as log:
+        velocity = log.channel("/v", schemas.VECTOR3, {VELOCITY_KEY: "/p"})
         group = [
             Series(log.channel("/imu", schemas.IMU), t_ns, (t_ns, zeros, zeros), partial(encode_imu, frame_id="b")),
             Series(log.channel("/p", schemas.POSE), t_ns, (t_ns, zeros, q_wxyz), partial(encode_pose, frame_id="w")),
-            Series(
-                log.channel("/v", schemas.VECTOR3, {VELOCITY_KEY: "/p"}),
-                t_ns,
-                (t_ns + 1, zeros),
-                partial(encode_vector3, frame_id="w"),
-            ),
+            Series(velocity, v_ns, (v_ns, v_w), partial(encode_vector3, frame_id="w")),
         ]
         for chunk in chunks(group):
             log.chunk(chunk)
+    return path
+
+
+def test_velocities_that_do_not_belong_to_their_poses_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="/p: the velocities on /v have other stamps than the poses"):
-        read(path)
+        read(with_velocities(tmp_path / "log.mcap", [4, 5, 6]))
+
+
+@pytest.mark.parametrize("times", [[1, 2], [2, 3], [1, 3, 4]])
+def test_poses_and_velocities_that_damage_parted_are_used_where_both_are_left(
+    tmp_path: Path, times: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
+    (poses,) = read(with_velocities(tmp_path / "log.mcap", times)).truths.values()
+    both = [t for t in times if t <= 3]
+    assert poses.v_w is not None
+    assert poses.t_ns.tolist() == poses.v_w[:, 0].tolist() == both
+    assert "/p: poses without a velocity are left out: 1" in caplog.text
+
+
+def test_poses_whose_velocities_are_all_lost_are_read_without(tmp_path: Path) -> None:
+    (poses,) = read(with_velocities(tmp_path / "log.mcap", [])).truths.values()
+    assert poses.t_ns.tolist() == [1, 2, 3]
+    assert poses.v_w is None
 
 
 def test_reading_leaves_the_file_as_it_is(foreign: Foreign, flight: list[Message], tmp_path: Path) -> None:
