@@ -19,12 +19,11 @@ from imutool import __version__
 from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
-from imutool.bias.model_file import shipped, shipped_for
 from imutool.bias.temperature_drift import rows_without_drift, with_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
-from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log
+from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log, model_of_log
 from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
@@ -34,7 +33,7 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
+from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic, check_new_topics
 from imutool.mcap_io.passthrough.source_digest import SourceDigest
 from imutool.mcap_io.recovery.losses import Losses
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
@@ -80,6 +79,12 @@ ENCODINGS = ("own", "cdr")  # of the new IMU topic
 BlockCallback = Callable[[DebiasedBlock], None]
 
 
+def new_topics(source_topic: str) -> Sequence[NewTopic]:
+    """Topics that an IMU gains: its debiased samples and what was subtracted."""
+    schema_of = {SUFFIX: schemas.IMU, "/bias/gyro": schemas.VECTOR3, "/bias/accel": schemas.VECTOR3, "/bias": schemas.TWIST}
+    return [NewTopic(f"{source_topic}{suffix}", schema) for suffix, schema in schema_of.items()]
+
+
 class Debiaser:
     """Debiased topics of one IMU, computed by batches during the copy (`DerivedTopics`).
 
@@ -96,12 +101,7 @@ class Debiaser:
     ) -> None:
         self.source_topic, self._watch = source_topic, watch
         self._clean = None if found is None else Cleaner(found)
-        self.topics: Sequence[NewTopic] = (
-            NewTopic(f"{source_topic}{SUFFIX}", schemas.IMU),
-            NewTopic(f"{source_topic}/bias/gyro", schemas.VECTOR3),
-            NewTopic(f"{source_topic}/bias/accel", schemas.VECTOR3),
-            NewTopic(f"{source_topic}/bias", schemas.TWIST),
-        )
+        self.topics = new_topics(source_topic)
         self._estimator, self._start_ns, self._model = BiasEstimator(model, start), -1, model
         self.sieve = Sieve(source_topic)
         self._white = np.diag(np.where(model.noise_std > 0, model.noise_std, start.noise) ** 2)
@@ -236,10 +236,10 @@ def _debias(
     model = options.model
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     topics = choose_imus(log, options.imus, given)
-    about = log.metadata().get("imutool", {})
+    check_new_topics(log, {topic: new_topics(topic) for topic in topics})
     log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
-    default = given.get("") or (None if all(topic in given for topic in topics) else _model_of_log(about))
+    default = given.get("") or (None if all(topic in given for topic in topics) else model_of_log(log, topics))
     derived, starts, models, records, fits = [], {}, {}, {}, {}
     with SourceDigest(log.index, source) as digest:
         for topic in topics:
@@ -272,11 +272,6 @@ def _debias(
 def _record_name(name: str, topic: str, records: Mapping[str, object]) -> str:
     """The name of a metadata record: with its topic where there are several IMUs."""
     return f"{name}{topic}" if len(records) > 1 else name
-
-
-def _model_of_log(about: Mapping[str, str]) -> str | Path | None:
-    """The shipped model that a log's metadata name: a log may come from anybody."""
-    return shipped(about["model"]) if about.get("model") else next(iter(shipped_for(about)), None)
 
 
 def _provenance(topic: str, model: BiasModel, start: InitialBias, init: str, smooth: bool) -> dict[str, str]:

@@ -496,6 +496,15 @@ def test_two_imus_with_a_model_each_are_what_each_alone_would_be(recording: Reco
     assert dict(mixed.models) == {"/imu0": "static", "/imu1": "neural_ode"}
 
 
+def test_an_imu_does_not_get_the_model_that_the_log_names_for_another(
+    recording: Recording, tmp_path: Path, model_file: Path
+) -> None:
+    log, first, out = tmp_path / "two.mcap", tmp_path / "first.mcap", tmp_path / "out.mcap"
+    write_two_imus(recording, log)
+    debias(log, first, model=model_file, imus=["/imu1"])
+    assert dict(debias(first, out, imus=["/imu0"]).models) == {"/imu0": "static"}
+
+
 def test_models_that_contradict_one_another_are_refused(recording: Recording, tmp_path: Path, model_file: Path) -> None:
     log, out = tmp_path / "two.mcap", tmp_path / "out.mcap"
     write_two_imus(recording, log)
@@ -587,8 +596,9 @@ def test_of_a_truncated_log_what_is_left_is_debiased_and_without_anything_left_n
 
 
 def test_a_debiased_log_is_not_debiased_again(target: Path, model_file: Path, tmp_path: Path) -> None:
-    with pytest.raises(LogError, match="debiased is in this log already"):
-        debias(target, tmp_path / "twice.mcap", model=model_file, imus=["/imu0"])
+    for model in (model_file, None):  # the log names a model that does not ship
+        with pytest.raises(LogError, match="debiased is in this log already"):
+            debias(target, tmp_path / "twice.mcap", model=model, imus=["/imu0"])
     assert not (tmp_path / "twice.mcap").exists()
 
 

@@ -201,7 +201,7 @@ def model_file(name: str | Path) -> Path:
     return path if path.suffix in (".toml", ".safetensors") or path.exists() else shipped(str(name))
 
 
-def shipped(name: str) -> Path:
+def shipped(name: str, where: object = None) -> Path:
     """File of a shipped model by name only: a name from a log cannot reach other files.
 
     Raises:
@@ -211,6 +211,7 @@ def shipped(name: str) -> Path:
     if name not in files:
         raise ModelError(
             f"no model {name[:200]!r}",
+            where=where,
             expected=f"a file, or one of {', '.join(sorted(files)) or '(none ship)'}",
             fix=did_you_mean(name, files, "{!r}"),
         )

@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
-from imutool.bias.model_file import check_rate, shared_model
+from imutool.bias.model_file import check_rate, shared_model, shipped, shipped_for
 from imutool.bias.temperature_drift import bound, rows_without_drift, without_drift
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest, auto, over_all_rest
@@ -119,6 +119,15 @@ def choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) 
             fix="Leave it out, or name the other IMUs in `imus`",
         )
     return topics
+
+
+def model_of_log(log: Log, topics: Sequence[str]) -> str | Path | None:
+    """Model that a log's metadata name for these IMUs; it ships, as anybody may write a log."""
+    about = log.metadata().get("imutool", {})
+    name = about.get("model") if about.get("source_topic", topics[0]) in topics else None  # that of another IMU
+    if name == static.Model.method:
+        return name
+    return shipped(name, f"{log.path}, metadata imutool") if name else next(iter(shipped_for(about)), None)
 
 
 def choose_model_and_start(

@@ -93,7 +93,7 @@ def rewrite(
         raise ConfigError("the target is the source", where=target, fix="Choose another name")
     place = (path.resolve() if isinstance(path, Path) else path) if target is None else target
     with nullcontext(source) if isinstance(source, Log) else Log(source) as log:
-        check_new_topics(log, derived)
+        check_new_topics(log, {topics.source_topic: topics.topics for topics in derived})
         crc, packing = bool(stated_crc(log.index)), _compression(log.index)
         header, replace = log.index.header_bytes, overwrite or target is None
         with LogWriter(place, compression=packing, overwrite=replace, header=header, data_crc=crc) as out:

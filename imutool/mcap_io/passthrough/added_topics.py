@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -57,15 +57,15 @@ class DerivedTopics(Protocol):
         """Messages for a batch: the source messages that stay, and CDR payloads per new topic."""
 
 
-def check_new_topics(log: Log, derived: Sequence[DerivedTopics]) -> None:
-    """Refuses a new topic that the log has already.
+def check_new_topics(log: Log, added: Mapping[str, Sequence[NewTopic]]) -> None:
+    """Refuses a new topic that the log has already; `added` has the new ones by source topic.
 
     Raises:
         LogError: it has, or lacks a source topic.
     """
-    for topics in derived:
-        log.topic(topics.source_topic, (schemas.IMU,))
-        for new in topics.topics:
+    for source, topics in added.items():
+        log.topic(source, (schemas.IMU,))
+        for new in topics:
             if new.name in log.topics:
                 raise LogError(
                     f"{new.name} is in this log already",
