@@ -72,7 +72,7 @@ def _run(
             tell=tell,
         )
     if not common.write(done.summary(), replace=resume):
-        _show(done, report)
+        _show(done, target, report)
     raise typer.Exit(done.progress.exit_code)
 
 
@@ -175,7 +175,7 @@ def diagnose(
     )
 
 
-def _show(done: FleetReport, report: str | None) -> None:
+def _show(done: FleetReport, target: str, report: str | None) -> None:
     for result in done.not_whole[:SHOWN]:
         why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
         why = why if result.source in why else f"{result.source}: {why}"
@@ -186,7 +186,7 @@ def _show(done: FleetReport, report: str | None) -> None:
         say(done.comparison.summary)
         for outlier in done.comparison.outliers:
             say(outlier.sentence)
-    made = [str(done.out / "fleet.parquet"), *([report] if report else [])]
+    made = [f"{target.rstrip('/')}/fleet.parquet", *([report] if report else [])]
     say(f"{done.progress.line()}; {', '.join(made)}")
 
 

@@ -125,6 +125,7 @@ def _open(served: Catalog, segments: Sequence[Segment], web: bool) -> None:
     from imutool.viewing.rerun.web import Server, catalog_site, policy_with
 
     urls = [served.url, *(segment.url for segment in reversed(segments))]  # the last one is in front
+    say(f"The catalog: {served.url}")
     if web:
         with Server() as page:
             page.policy = policy_with(served.origin)
@@ -133,7 +134,6 @@ def _open(served: Catalog, segments: Sequence[Segment], web: bool) -> None:
             sys.stdout.flush()
             page.serve()
         return
-    say(f"The catalog: {served.url}")
     if not viewer.has_display():
         say("There is no display here. `--web` shows the fleet in a browser, `--list` only lists it. Ctrl-C ends it.")
         sys.stdout.flush()

@@ -116,26 +116,31 @@ def test_what_cannot_be_shown_is_named(tmp_path: Path, out: Path) -> None:
         logs_of([tmp_path])
 
 
-def test_the_command_lists_the_worst_and_serves_until_it_is_interrupted(out: Path, command: str, imutool: Imutool) -> None:
+@pytest.mark.parametrize("web", [[], ["--web"]])
+def test_the_command_lists_the_worst_and_serves_until_it_is_interrupted(
+    out: Path, command: str, imutool: Imutool, web: list[str]
+) -> None:
     listed = imutool("fleet", "view", str(out), "--list", "--worst", "1", "--json", "-", cwd=out.parent)
     assert listed.returncode == 0, listed.stderr
     report = json.loads(listed.stdout)
     assert_valid(report)
     assert (report["segments"], len(report["worst"]), report["by"], report["not_shown"]) == (2, 1, "aoe", [])
-    words = [command, "fleet", "view", str(out), "--quiet"]
+    words = [command, "fleet", "view", str(out), "--quiet", *web]
     env = {name: value for name, value in os.environ.items() if name not in {"DISPLAY", "WAYLAND_DISPLAY"}}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=env) as process:
         assert process.stdout is not None
         lines: list[str] = []
-        while not lines or "no display" not in lines[-1]:
+        while not lines or "Ctrl-C ends it" not in lines[-1]:
             lines.append(process.stdout.readline())
             assert lines[-1], lines
         url = re.search(r"rerun\+http://127\.0\.0\.1:\d+", "".join(lines))
-        assert url is not None
-        from rerun.catalog import CatalogClient
+        try:
+            assert url is not None
+            from rerun.catalog import CatalogClient
 
-        assert sorted(CatalogClient(url[0]).get_dataset(rerun_catalog.DATASET).segment_ids()) == ["flight_1", "flight_2"]
-        process.send_signal(signal.SIGINT)
+            assert sorted(CatalogClient(url[0]).get_dataset(rerun_catalog.DATASET).segment_ids()) == ["flight_1", "flight_2"]
+        finally:
+            process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
 
 
