@@ -181,11 +181,8 @@ class _Asl:
         lines = [note + "sensor_type: imu", f"comment: {json.dumps(named or 'unknown')}", "T_BS:", IDENTITY.rstrip("\n")]
         lines.append(f"rate_hz: {1.0 / self.recording.imu.period_s:.6g}")
         if given is None:
-            origin = (
-                f"the sensor's, {named}"
-                if named in datasheet.SHEETS
-                else f"{DEFAULT_SHEET}'s, as the log does not name its sensor"
-            )
+            why = f"there is none of {_line(named)}" if named else "the log does not name its sensor"
+            origin = f"the sensor's, {named}" if named in datasheet.SHEETS else f"{DEFAULT_SHEET}'s, as {why}"
             lines.append(f"# Noise: defaults of a data sheet ({origin}), not measured on this sensor")
         for key, (quantity, unit) in DENSITIES.items():
             axes = sheet.values(quantity)

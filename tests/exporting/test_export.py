@@ -166,9 +166,13 @@ def test_sensor_yaml_says_where_its_noise_is_from(log: Path, tmp_path: Path) -> 
         tmp_path / "named/mav0/imu0/sensor.yaml"
     ).read_text(encoding="utf-8")
 
-    write(replace(whole(), metadata={}), tmp_path / "nameless.mcap")
-    export(tmp_path / "nameless.mcap", tmp_path / "nameless", format="euroc")
-    assert "as the log does not name its sensor" in (tmp_path / "nameless/mav0/imu0/sensor.yaml").read_text(encoding="utf-8")
+    for name, own, why in (
+        ("nameless", {}, "the log does not name its sensor"),
+        ("other", {"imutool": {"sensor": "fetch"}}, "there is none of fetch"),
+    ):
+        write(replace(whole(), metadata=own), tmp_path / f"{name}.mcap")
+        export(tmp_path / f"{name}.mcap", tmp_path / name, format="euroc")
+        assert f"adis16448's, as {why}), not" in (tmp_path / name / "mav0/imu0/sensor.yaml").read_text(encoding="utf-8")
 
     measured = datasheet.Noise(gyro_density=(3e-4, None, 4e-4), sources={"gyro_density": "4.2 h at rest"})
     datasheet.write(measured, tmp_path / "imu.toml")
