@@ -147,9 +147,8 @@ def compare(results: Iterable[Result]) -> Comparison:
     pooled = {robot: _pooled([result.parameters for result in own]) for robot, own in sorted(logs.items())}
     units = {(p.effect, p.name): p.unit for own in logs.values() for result in own for p in result.parameters}
     names = list(units)
-    values = np.array([[pooled[robot].get(name, (np.nan, np.nan)) for name in names] for robot in pooled]).reshape(
-        -1, len(names), 2
-    )
+    values = np.array([[pooled[robot].get(name, (np.nan, np.nan)) for name in names] for robot in pooled])
+    values = values.reshape(len(pooled), len(names), 2)  # also where every log has failed
     x, std = values[..., 0], values[..., 1]
     shared: list[SharedParameter] = []
     outliers: list[Outlier] = []

@@ -45,6 +45,11 @@ def test_two_that_are_far_off_are_found_and_ranked() -> None:
     assert np.mean([one == [("r3", "effect_1", "y"), ("r11", "effect_0", "x")] for one in right]) > FOUND
 
 
+def test_a_fleet_whose_logs_all_failed_has_nothing_to_compare() -> None:
+    found = compare([Result(key="a.mcap", source="", target="", status="failed", robot="a")])
+    assert (found.robots, found.outliers, found.shared) == (0, (), ())
+
+
 def test_few_robots_are_not_compared() -> None:
     found = compare(fleet(np.random.default_rng(2), FEWEST - 1, {(0, 0): 100.0}))
     assert not found.outliers
