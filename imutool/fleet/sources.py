@@ -43,13 +43,13 @@ class _File(NamedTuple):
 
 
 def find(text: str, out: Location, *, bags: bool = False) -> Found:
-    """Find the logs of a path, a glob, a folder or a URL; logs below `out` are left out, whatever link leads there.
+    """Find the logs of a path, a glob, a folder or a URL; logs below `out` are left out.
 
     With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
-    keeps its own name. Links are followed. A log without a usable name below OUT is refused, as is a folder that cannot be read,
-    and the others go on.
+    keeps its own name. Links are followed, also to find what lies below `out`. A log without a usable name below OUT is
+    refused, as is a folder that cannot be read, and the others go on.
 
     Raises:
         ConfigError: nothing there, or no log in it.

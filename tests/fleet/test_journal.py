@@ -52,10 +52,9 @@ def test_a_full_disk_is_told_with_the_journal_and_what_to_do(tmp_path: Path) -> 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     told = re.escape(f"{tmp_path / NAME}: cannot be written (File too large). Make room, and go on with `resume`")
     try:
-        with pytest.raises(ConfigError, match=told), Journal(tmp_path, SETTINGS) as journal:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
-            for key in range(100):
-                journal.begin(str(key), f"{key}.mcap")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+        with pytest.raises(ConfigError, match=told):
+            fill(tmp_path, *map(str, range(100)))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert (tmp_path / NAME).read_bytes().endswith(b"}\n")
