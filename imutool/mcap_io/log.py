@@ -58,6 +58,7 @@ class Log:
         self._owns_source, self.path = True, self._source.path
         self.kept: KeptChunks | None = None
         self._begun: tuple[MessageBlock, messages.Messages | None] | None = None
+        self._ids, self._ids_of = dict[str, set[int]](), (-1, -1)  # channels by topic, of an index and its number of channels
         try:
             with self.named():
                 self.index = self._read_index(self._source)
@@ -256,7 +257,12 @@ class Log:
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
         name = (found.gyro_topic if (found := self.topics.get(topic)) else "") or topic
-        return {i for i, channel in self.index.channels.items() if channel.topic == name}
+        state = id(self.index), len(self.index.channels)
+        if self._ids_of != state:  # asked for each of many topics
+            self._ids, self._ids_of = {}, state
+            for i, channel in self.index.channels.items():
+                self._ids.setdefault(channel.topic, set()).add(i)
+        return set(self._ids.get(name, ()))
 
     def keep(self, topics: Collection[str]) -> None:
         """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""
