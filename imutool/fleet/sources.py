@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob as globs
 import logging
 import os
@@ -11,6 +12,8 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import msgspec
 
 from imutool.errors import ConfigError, redact
 from imutool.file_location import Location, identity, io_errors, reason, size_and_etag, to_location
@@ -88,6 +91,33 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)
     logs.sort(key=lambda source: source.name)
     return Found(logs, sorted(refused))
+
+
+def simulation(folder: Location, name: str) -> Location:
+    """Simulation of a log: the same name in another folder, or one file for all.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = folder if folder.suffix == ".mcap" else folder / name
+    if not found.is_file():
+        raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
+    return found
+
+
+def with_simulations(found: Found, sim: str | None) -> Found:
+    """Logs with the identity of their simulations: a log whose simulation has changed is not done."""
+    if sim is None:
+        return found
+    folder = to_location(sim)
+
+    def compared(source: Source) -> Source:
+        with contextlib.suppress(ConfigError):  # the task of the log says why
+            size, stamp = identity(simulation(folder, source.name))
+            return msgspec.structs.replace(source, simulation=f"{size} {stamp}")
+        return source
+
+    return Found([compared(source) for source in found.logs], found.refused)
 
 
 def relative(file: str, root: str) -> str:

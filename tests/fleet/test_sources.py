@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.file_location import identity, to_location
-from imutool.fleet.sources import LONGEST, find, partial_files, relative, remove_files, within
+from imutool.fleet.sources import LONGEST, find, partial_files, relative, remove_files, with_simulations, within
+from imutool.fleet.task import Settings
 
 NOWHERE = Path("/nowhere")
 
@@ -165,6 +166,23 @@ def test_a_link_in_out_is_not_followed_elsewhere(tmp_path: Path) -> None:
     assert within(out, "there/b.mcap") == out / "there" / "b.mcap"
     with pytest.raises(ConfigError, match="outside OUT"):
         within(out, "a/b.mcap")
+
+
+def test_another_simulation_is_another_key(tmp_path: Path) -> None:
+    """The result of a log was skipped once although what it is compared with had changed."""
+    logs, sims = tree(tmp_path / "logs", "a.mcap", "b.mcap"), tree(tmp_path / "sims", "a.mcap")
+    settings = Settings(command="diagnose", sim=str(sims))
+
+    def keys(sim: str | None) -> list[str]:
+        return [log.key(settings) for log in with_simulations(find(str(logs), NOWHERE), sim).logs]
+
+    before = keys(str(sims))
+    assert keys(str(sims)) == before
+    assert keys(None)[1] == before[1], "b has no simulation"
+    (sims / "a.mcap").write_bytes(b"another one")
+    assert keys(str(sims))[0] != before[0]
+    assert keys(str(sims))[1] == before[1]
+    assert keys(str(sims / "a.mcap"))[1] != before[1], "one for all"
 
 
 def test_another_content_is_another_identity(tmp_path: Path) -> None:
