@@ -106,7 +106,10 @@ def simulation(folder: Location, name: str) -> Location:
 
 
 def with_simulations(found: Found, sim: str | None) -> Found:
-    """Logs with the identity of their simulations: a log whose simulation has changed is not done."""
+    """Logs with the identity of their simulations.
+
+    A log whose simulation has changed is not done.
+    """
     if sim is None:
         return found
     folder = to_location(sim)

@@ -275,10 +275,8 @@ class _Rewrite:
         index, contents = self.index, self.out.contents
         known_schemas, known_channels = len(index.schemas), len(index.channels)
         index.define(opcode, body, offset)
-        new_schemas, new_channels = (
-            {i: defined[i] for i in islice(reversed(defined), len(defined) - known)}
-            for defined, known in ((index.schemas, known_schemas), (index.channels, known_channels))
-        )
+        new_schemas = {i: index.schemas[i] for i in islice(reversed(index.schemas), len(index.schemas) - known_schemas)}
+        new_channels = {i: index.channels[i] for i in islice(reversed(index.channels), len(index.channels) - known_channels)}
         if new_schemas.keys() & contents.schemas.keys() or new_channels.keys() & contents.channels.keys():
             raise LogError(f"the chunk at byte {offset} defines an id that the rest of the log does not mention")
         contents.schemas.update(new_schemas)
