@@ -207,6 +207,6 @@ def identity(where: Location) -> tuple[int, str]:
 
 def size_and_etag(about: Mapping[str, Any]) -> tuple[int, str]:
     """Size and etag from a store's description, whatever names it uses."""
-    names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "mtime", "created")
+    names = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "last_modified", "Last-Modified", "mtime", "created")
     stamp = next((str(about[name]) for name in names if about.get(name)), "")
     return int(about["size"]), stamp.strip('"')

@@ -85,9 +85,9 @@ class Journal:
         try:
             if isinstance(out, Path):
                 out.mkdir(parents=True, exist_ok=True)
-                self._file: IO[bytes] = (out / NAME).open("a+b")
+                self._file: IO[bytes] = (out / NAME).open("a+b", buffering=0)
             else:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed with the journal
+                self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  closed with the journal
                 self._pieces = _Pieces(self.path, self._file)
         except io_errors(out) as error:
             raise ConfigError(f"cannot be written ({reason(error)})", where=self.path, fix="Choose another OUT") from error
@@ -146,11 +146,13 @@ class Journal:
         self._done[result.key] = self._append(result)
 
     def _append(self, line: _Line) -> tuple[int, int]:
-        raw = _encoded(line)
+        return self._append_bytes(_encoded(line))
+
+    def _append_bytes(self, raw: bytes) -> tuple[int, int]:
+        """Append without a buffer: on a full disk it would keep what it could not write, for whatever comes next."""
         at = self._file.seek(0, os.SEEK_END)
         try:
-            self._file.write(raw)
-            self._file.flush()
+            _write_whole(self._file, raw)
             if self._pieces is None:
                 os.fsync(self._file.fileno())
             else:
@@ -187,35 +189,33 @@ class Journal:
                     self._begun.add(line.target)
                     self._done[line.key] = at, length
         end = self._file.seek(0, os.SEEK_END)
-        if end and self._read_at(end - 1, 1) != b"\n":
-            self._file.write(b"\n")  # what comes now stands in a line of its own
+        self._file.seek(max(end - 1, 0))
+        if end and self._file.read(1) != b"\n":
+            self._append_bytes(b"\n")  # what comes now stands in a line of its own
         if run is None and end:  # hit: the keys of the results say whether the settings fit
             return Run(Settings(command="info"), digest or self._digest)
         return run
-
-    def _read_at(self, at: int, length: int) -> bytes:
-        self._file.seek(at)
-        return self._file.read(length)
 
     def _lines(self) -> Iterator[tuple[int, int, _Line]]:
         """Offset, length and content of every sound line; two that have lost the end between them count both.
 
         Lines of earlier versions have no CRC. Behind one that has, a line without has lost it.
         """
-        self._file.seek(0)
-        at, checked = 0, False
-        for raw in self._file:
-            has_crc = CRC.search(raw) is not None
-            checked |= has_crc
-            line = _decoded(raw) if has_crc or not checked else None
-            if line is not None:
-                yield at, len(raw), line
-            else:
-                for start, piece in _pieces(raw):
-                    line = _decoded(piece)
-                    if line is not None:
-                        yield at + start, len(piece), line
-            at += len(raw)
+        with os.fdopen(os.dup(self._file.fileno()), "rb") as lines:  # with a buffer
+            lines.seek(0)
+            at, checked = 0, False
+            for raw in lines:
+                has_crc = CRC.search(raw) is not None
+                checked |= has_crc
+                line = _decoded(raw) if has_crc or not checked else None
+                if line is not None:
+                    yield at, len(raw), line
+                else:
+                    for start, piece in _pieces(raw):
+                        line = _decoded(piece)
+                        if line is not None:
+                            yield at + start, len(piece), line
+                at += len(raw)
 
     def _refuse(self, known: Run, settings: Settings, resume: bool, overwrite: bool) -> None:
         if overwrite:
@@ -232,6 +232,13 @@ class Journal:
                 where=self.path.parent,
                 fix="Give the same ones, choose another `out`, or add `overwrite` to do all logs again",
             )
+
+
+def _write_whole(file: IO[bytes], raw: bytes) -> None:
+    """Write all bytes to a file without a buffer, which may take fewer at once."""
+    left = memoryview(raw)
+    while left:
+        left = left[file.write(left) :]
 
 
 def _encoded(line: _Line) -> bytes:
@@ -267,7 +274,7 @@ class _Pieces:
         pieces: list[Location] = sorted(folder.glob("*.jsonl"), key=str)
         for piece in pieces:
             raw = piece.read_bytes()
-            file.write(raw if raw.endswith(b"\n") or not raw else raw + b"\n")
+            _write_whole(file, raw if raw.endswith(b"\n") or not raw else raw + b"\n")
         self._number = 1 + max((int(piece.stem) for piece in pieces if piece.stem.isdecimal()), default=-1)
 
     def append(self, raw: bytes) -> None:

@@ -16,7 +16,7 @@ import msgspec
 from imutool.cleaning import UntrustedError
 from imutool.errors import LOST, ConfigError, ImutoolError, LogError, ModelError
 from imutool.file_location import Location, identity, to_location
-from imutool.fleet.sources import partial_files, remove_files, within
+from imutool.fleet.sources import partial_files, remove_files, simulation, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.losses import unchecked
@@ -234,7 +234,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
 
     s = job.settings
     robot = robot_of(job.name, s.robot_from, job.source)
-    sim = None if s.sim is None else _simulation(to_location(s.sim), job.name)
+    sim = None if s.sim is None else simulation(to_location(s.sim), job.name)
     fixed = effect_sizes(job.source, sim, imu=s.imu, truth=s.truth)
     parameters = tuple(
         Parameter(physics.name, number.name, float(value), float(std), number.unit)
@@ -258,14 +258,6 @@ class UnitReport(Report, frozen=True, tag="imutool.unit/1"):
     bias: list[list[float]]
     parameters: list[Parameter]
     diagnosis: dict[str, Any] | UnsetType = UNSET
-
-
-def _simulation(folder: Location, name: str) -> Location:
-    """Simulation of a log: the same name in another folder, or one file for all."""
-    found = folder if folder.suffix == ".mcap" else folder / name
-    if not found.is_file():
-        raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
-    return found
 
 
 def write_json(report: Report, target: Location) -> None:

@@ -202,7 +202,13 @@ class Statistics:
         for imu in result.imus:
             self.biases["gyro"].append(imu.gyro_bias)
             self.biases["accel"].append(imu.accel_bias)
-        self.warnings.update({warning.partition(": ")[2] or warning for warning in result.warnings})
+        self.warnings.update({_without_topic(warning) for warning in result.warnings})
+
+
+def _without_topic(warning: str) -> str:
+    """Words of a warning about a topic, so that equal ones of many logs count together."""
+    topic, _, words = warning.partition(": ")
+    return words if words and " " not in topic else warning
 
 
 def _batches(results: Iterable[Result]) -> Iterator[list[dict[str, Any]]]:

@@ -21,7 +21,7 @@ from imutool.fleet.journal import Journal
 from imutool.fleet.one_log import page_name, target_name, write_json
 from imutool.fleet.results import FleetSummary, LogProblem
 from imutool.fleet.robots import Comparison, compare
-from imutool.fleet.sources import Found, find, partial_files, remove_files
+from imutool.fleet.sources import Found, find, partial_files, remove_files, with_simulations
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
 from imutool.report import UNSET
 
@@ -136,7 +136,7 @@ def run(
     if not overwrite:
         _refuse_existing(target, page if page is None or not (resume and _is_page(page)) else None)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
-    found = find(source, target, bags=settings.command == "repair")
+    found = with_simulations(find(source, target, bags=settings.command == "repair"), settings.sim)
     progress = Progress(len(found.logs) + len(found.refused), sum(source.size for source in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
 

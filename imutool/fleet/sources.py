@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob as globs
 import logging
 import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import msgspec
 
 from imutool.errors import ConfigError, redact
 from imutool.file_location import Location, identity, io_errors, reason, size_and_etag, to_location
@@ -34,10 +38,11 @@ class Found(NamedTuple):
 
 
 class _File(NamedTuple):
-    """File of a listing, with the details that a store's listing gives."""
+    """File of a listing, with the details that a store's listing gives; or a folder or link that cannot be read, and why."""
 
     where: str
     about: dict[str, Any] | None = None
+    unread: str = ""
 
 
 def find(text: str, out: Location, *, bags: bool = False) -> Found:
@@ -46,21 +51,26 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
     With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
-    keeps its own name. Links are followed. A log without a usable name below OUT is refused, and the others go on.
+    keeps its own name. Links are followed, also to find what lies below `out`. A log without a usable name below OUT is
+    refused, as is a folder that cannot be read, and the others go on.
 
     Raises:
         ConfigError: nothing there, or no log in it.
     """
     endings = (LOG, BAG) if bags else (LOG,)
     root, files = _files(text, (*endings, *RAW))
-    logs, refused, taken, passed_over = [], [], dict[str, str](), Counter[str]()
-    for where, about in files:
-        if f"{where}/".startswith(f"{str(out).rstrip('/')}/"):
+    real = cache(_real)
+    logs, refused, taken, passed_over, outputs = [], [], dict[str, str](), Counter[str](), 0
+    for where, about, unread in files:
+        if real(where.rpartition("/")[0]).startswith(real(str(out))):
+            outputs += where.endswith(endings)
             continue
         if not where.endswith(endings) and (ending := next((raw for raw in RAW if where.endswith(raw)), "")):
             passed_over[ending] += 1
             continue
         try:
+            if unread:
+                raise ConfigError(f"cannot be read ({unread})", fix="See who may read it")
             name = relative(where, root)
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
@@ -70,6 +80,9 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
             logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
             refused.append((_shown(where), str(error)))
+    if not logs and not refused and outputs:
+        what = f"its {outputs} logs lie below OUT ({redact(str(out))}), where outputs are and no sources"
+        raise ConfigError(what, where=text, fix="Choose an OUT beside the logs")
     if not logs and not refused:
         expected = "a log, a folder with logs, or a pattern that fits some"
         raise ConfigError(f"no {' or '.join(endings)} log", where=text, expected=expected, fix=CONVERT if passed_over else "")
@@ -78,6 +91,36 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)
     logs.sort(key=lambda source: source.name)
     return Found(logs, sorted(refused))
+
+
+def simulation(folder: Location, name: str) -> Location:
+    """Simulation of a log: the same name in another folder, or one file for all.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = folder if folder.suffix == ".mcap" else folder / name
+    if not found.is_file():
+        raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
+    return found
+
+
+def with_simulations(found: Found, sim: str | None) -> Found:
+    """Logs with the identity of their simulations.
+
+    A log whose simulation has changed is not done.
+    """
+    if sim is None:
+        return found
+    folder = to_location(sim)
+
+    def compared(source: Source) -> Source:
+        with contextlib.suppress(ConfigError):  # the task of the log says why
+            size, stamp = identity(simulation(folder, source.name))
+            return msgspec.structs.replace(source, simulation=f"{size} {stamp}")
+        return source
+
+    return Found([compared(source) for source in found.logs], found.refused)
 
 
 def relative(file: str, root: str) -> str:
@@ -135,12 +178,23 @@ def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, in
         inode = (status.st_dev, status.st_ino)
         entries = [] if inode in above else sorted(os.scandir(folder), key=lambda entry: entry.name)
     except OSError as error:
-        raise ConfigError(f"cannot be read ({error.strerror})", where=folder) from error
+        yield _File(str(folder), unread=reason(error))
+        return
     for entry in entries:
-        if entry.is_dir():
+        try:
+            is_folder = entry.is_dir()
+        except OSError as error:  # a link to itself, or into a folder that cannot be read
+            yield _File(str(folder / entry.name), unread=reason(error))
+            continue
+        if is_folder:
             yield from _walk(folder / entry.name, endings, above | {inode})
         elif entry.name.endswith(endings):
             yield _File(str(folder / entry.name))
+
+
+def _real(folder: str) -> str:
+    """Folder without links, with a slash at its end."""
+    return f"{(folder if '://' in folder else os.path.realpath(folder)).rstrip('/')}/"
 
 
 def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
@@ -150,10 +204,15 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     root = to_location(fixed)
     assert not isinstance(root, Path), "a URL, not a path"
     try:
-        if match is None:
-            found = root.fs.find(root.path, detail=True)
-        else:
+        if match is not None:
             found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
+        elif fixed.startswith(("http://", "https://")) and fixed.endswith(endings):
+            found = {root.path: {}}  # one file: to list it, the library would fetch the whole log and look for links in it
+        else:
+            found = root.fs.find(root.path, detail=True)
+        for path, about in found.items():
+            if about.get("size") is None and path.endswith(endings):  # a web server lists names alone
+                found[path] = root.fs.info(path)
     except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name

@@ -69,17 +69,19 @@ def with_model_hash(settings: Settings) -> Settings:
 class Source(msgspec.Struct, frozen=True):
     """Source log: its place, its name below OUT, and its identity (size and stamp).
 
-    `stamp` is the store's etag, or the time of the last change in nanoseconds.
+    `stamp` is the store's etag, or the time of the last change in nanoseconds. `simulation` is the identity of the simulation
+    that it is compared with.
     """
 
     place: str
     name: str
     size: int
     stamp: str
+    simulation: str = ""
 
     def key(self, settings: Settings) -> str:
-        """Key of the result; it changes with the content and with the settings."""
-        return _sha256(self.place, str(self.size), self.stamp, settings.digest)
+        """Key of the result; it changes with the content, the simulation and the settings."""
+        return _sha256(self.place, str(self.size), self.stamp, settings.digest, *filter(None, [self.simulation]))
 
 
 class Imu(msgspec.Struct, frozen=True):

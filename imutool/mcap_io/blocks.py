@@ -71,7 +71,7 @@ class MessageBlock:
     def may_hold(self, channels: set[int]) -> bool:
         """False when the block cannot hold a message of these channels."""
         known = (self.indexes if self.trusted else None) or self.counts
-        return known is None or not channels.isdisjoint(known)
+        return known is None or not known.keys().isdisjoint(channels)  # looks up the fewer of the two
 
     def head(self, raw: bytes | memoryview) -> ChunkHead:
         """The head of the chunk, from the first `HEAD_BYTES` of its bytes or more.

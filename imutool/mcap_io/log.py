@@ -58,6 +58,7 @@ class Log:
         self._owns_source, self.path = True, self._source.path
         self.kept: KeptChunks | None = None
         self._begun: tuple[MessageBlock, messages.Messages | None] | None = None
+        self._ids = (0, 0), dict[str, set[int]]()  # channels by topic, of an index and so many channels
         try:
             with self.named():
                 self.index = self._read_index(self._source)
@@ -72,8 +73,7 @@ class Log:
     def _read_topics(self) -> None:
         """Reads the topics from the index; IMUs of other types may need the first message of a topic."""
         self.topics = MappingProxyType(topics_of(self.index))
-        more = reflected_topics(self.index, self.topics, self.first)
-        self.topics = MappingProxyType({**self.topics, **more})
+        self.topics = MappingProxyType({**self.topics, **reflected_topics(self.index, self.topics, self.first)})
 
     def __enter__(self) -> Log:
         return self
@@ -173,8 +173,8 @@ class Log:
 
     def listing(self) -> str:
         """The log's topics and their schemas, for a message."""
-        every = [f"{t.name} ({t.schema_name or 'no schema'})" for t in self.topics.values()]
-        return ", ".join(every) if every else "topics (the log has none)"
+        every = (f"{t.name} ({t.schema_name or 'no schema'})" for t in self.topics.values())
+        return ", ".join(every) or "topics (the log has none)"
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name; in records of the same name, later entries replace earlier ones."""
@@ -208,9 +208,7 @@ class Log:
             raise LogError(f"there is no topic {topic}", where=self.path, expected=self.listing())
         channels = self.channel_ids(topic)
         with self.named(topic):
-            for block in self.index.blocks:
-                if not block.may_hold(channels):
-                    continue
+            for block in (block for block in self.index.blocks if block.may_hold(channels)):
                 indexed = sorted(channels & block.indexes.keys()) if block.trusted and not block.edited else []
                 entries = [self.index.entries(block, c) for c in indexed]
                 if len(entries) == 1 and len(entries[0]) == 1:
@@ -256,7 +254,11 @@ class Log:
     def channel_ids(self, topic: str) -> set[int]:
         """Channels of a topic; for a joined IMU those of its gyroscope."""
         name = (found.gyro_topic if (found := self.topics.get(topic)) else "") or topic
-        return {i for i, channel in self.index.channels.items() if channel.topic == name}
+        if self._ids[0] != (known := (id(self.index), len(self.index.channels))):  # asked for each of many topics
+            self._ids = known, {}
+            for i, channel in self.index.channels.items():
+                self._ids[1].setdefault(channel.topic, set()).add(i)
+        return set(self._ids[1].get(name, ()))
 
     def keep(self, topics: Collection[str]) -> None:
         """Keeps the chunks that are read for some topics from now on: a copy need not read them again."""
@@ -279,8 +281,7 @@ class Log:
     def _rows_of(
         self, blocks: Sequence[MessageBlock], wanted: Mapping[str, set[int]], first: int, last: int
     ) -> Iterator[tuple[str, messages.Rows]]:
-        together = unpack_together(self._source, blocks, self.max_chunk) if len(blocks) > 1 else None
-        if together is not None:
+        if len(blocks) > 1 and (together := unpack_together(self._source, blocks, self.max_chunk)) is not None:
             yield from self._cut(together, wanted, first, last)
             return
         for block in blocks:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -272,13 +273,14 @@ class _Rewrite:
     def _define(self, opcode: int, body: bytes, offset: int) -> None:
         """Adds a definition that only a chunk contains; refuses one under a new channel's id."""
         index, contents = self.index, self.out.contents
-        known_schemas, known_channels = set(index.schemas), set(index.channels)
+        known_schemas, known_channels = len(index.schemas), len(index.channels)
         index.define(opcode, body, offset)
-        new_schemas, new_channels = index.schemas.keys() - known_schemas, index.channels.keys() - known_channels
-        if new_schemas & contents.schemas.keys() or new_channels & contents.channels.keys():
+        new_schemas = {i: index.schemas[i] for i in islice(reversed(index.schemas), len(index.schemas) - known_schemas)}
+        new_channels = {i: index.channels[i] for i in islice(reversed(index.channels), len(index.channels) - known_channels)}
+        if new_schemas.keys() & contents.schemas.keys() or new_channels.keys() & contents.channels.keys():
             raise LogError(f"the chunk at byte {offset} defines an id that the rest of the log does not mention")
-        contents.schemas.update({i: index.schemas[i] for i in new_schemas})
-        contents.channels.update({i: index.channels[i] for i in new_channels})
+        contents.schemas.update(new_schemas)
+        contents.channels.update(new_channels)
 
     def _copy_record(self, span: RecordSpan) -> None:
         """Copies any other record; attachments and metadata are entered in the summary."""

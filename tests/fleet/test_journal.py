@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -45,6 +46,20 @@ def test_what_was_finished_is_known_to_the_next_run(tmp_path: Path) -> None:
         assert not journal.ours("c.mcap")
         journal.finish(result("a", messages=8))
         assert journal.done("a") == result("a", messages=8)
+
+
+def test_a_full_disk_is_told_with_the_journal_and_what_to_do(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    told = re.escape(f"{tmp_path / NAME}: cannot be written (File too large). Make room, and go on with `resume`")
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+        with pytest.raises(ConfigError, match=told):
+            fill(tmp_path, *map(str, range(100)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (tmp_path / NAME).read_bytes().endswith(b"}\n")
+    with Journal(tmp_path, SETTINGS, resume=True) as journal:
+        assert journal.ours("0.mcap")
 
 
 def test_cut_off_anywhere_the_journal_knows_all_whole_lines(tmp_path: Path) -> None:

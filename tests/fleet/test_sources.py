@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,8 @@ from hypothesis import strategies as st
 
 from imutool.errors import ConfigError
 from imutool.file_location import identity, to_location
-from imutool.fleet.sources import LONGEST, find, partial_files, relative, remove_files, within
+from imutool.fleet.sources import LONGEST, find, partial_files, relative, remove_files, with_simulations, within
+from imutool.fleet.task import Settings
 
 NOWHERE = Path("/nowhere")
 
@@ -59,6 +64,37 @@ def test_other_recordings_are_passed_over_and_counted(tmp_path: Path, caplog: py
 def test_what_lies_in_out_is_no_source(tmp_path: Path) -> None:
     tree(tmp_path, "a.mcap", "out/a.mcap", "outer/a.mcap")
     assert names(tmp_path, tmp_path / "out") == ["a.mcap", "outer/a.mcap"]
+
+
+def test_what_lies_in_out_is_no_source_whatever_link_leads_there(tmp_path: Path) -> None:
+    tree(tmp_path / "disk", "a.mcap", "out/a.mcap")
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    assert names(tmp_path / "link", tmp_path / "disk" / "out") == ["a.mcap"]
+    assert names(tmp_path / "disk", tmp_path / "link" / "out") == ["a.mcap"]
+
+
+@pytest.mark.parametrize("out", [".", "logs"])
+def test_logs_that_all_lie_in_out_are_told_as_such(tmp_path: Path, out: str) -> None:
+    tree(tmp_path, "logs/a.mcap", "logs/b.mcap")
+    with pytest.raises(ConfigError, match=r"its 2 logs lie below OUT .*Choose an OUT beside the logs"):
+        find(str(tmp_path / "logs"), tmp_path / out)
+
+
+def test_a_folder_that_cannot_be_read_is_told_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree(tmp_path, "good.mcap", "lost+found/a.mcap")
+    (tmp_path / "circle.mcap").symlink_to("circle.mcap")
+    listed = os.scandir
+
+    def scandir(folder: Path) -> Any:
+        if Path(folder).name == "lost+found":  # chmod does not stop root
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    found = find(str(tmp_path), NOWHERE)
+    assert [log.name for log in found.logs] == ["good.mcap"]
+    assert [Path(where).name for where, _ in found.refused] == ["circle.mcap", "lost+found"]
+    assert "cannot be read (Permission denied)" in found.refused[1][1]
 
 
 def test_links_to_logs_are_followed_but_not_in_circles(tmp_path: Path) -> None:
@@ -132,6 +168,23 @@ def test_a_link_in_out_is_not_followed_elsewhere(tmp_path: Path) -> None:
         within(out, "a/b.mcap")
 
 
+def test_another_simulation_is_another_key(tmp_path: Path) -> None:
+    """The result of a log was skipped once although what it is compared with had changed."""
+    logs, sims = tree(tmp_path / "logs", "a.mcap", "b.mcap"), tree(tmp_path / "sims", "a.mcap")
+    settings = Settings(command="diagnose", sim=str(sims))
+
+    def keys(sim: str | None) -> list[str]:
+        return [log.key(settings) for log in with_simulations(find(str(logs), NOWHERE), sim).logs]
+
+    before = keys(str(sims))
+    assert keys(str(sims)) == before
+    assert keys(None)[1] == before[1], "b has no simulation"
+    (sims / "a.mcap").write_bytes(b"another one")
+    assert keys(str(sims))[0] != before[0]
+    assert keys(str(sims))[1] == before[1]
+    assert keys(str(sims / "a.mcap"))[1] != before[1], "one for all"
+
+
 def test_another_content_is_another_identity(tmp_path: Path) -> None:
     path = tree(tmp_path, "a.mcap") / "a.mcap"
     before = identity(path)
@@ -177,3 +230,29 @@ def test_a_store_is_listed_in_one_request(store: Any) -> None:
     assert [one.name for one in find("s3://fleet/robots/b/log.mcap", NOWHERE).logs] == ["log.mcap"]
     with pytest.raises(ConfigError, match=r"no \.mcap log"):
         find("s3://fleet/none", NOWHERE)
+
+
+class _WebServer(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> None:
+    tree(tmp_path, "robots/a/log.mcap", "robots/b/notes.txt", "robots/b/other.mcap")
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_WebServer, directory=str(tmp_path))) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            root = f"http://127.0.0.1:{server.server_port}/robots"
+            found = find(root, NOWHERE).logs
+            (alone,) = find(f"{root}/b/other.mcap", NOWHERE).logs
+            assert identity(to_location(alone.place)) == (alone.size, alone.stamp)
+        finally:
+            server.shutdown()
+            thread.join()
+    assert [(log.place, log.name, log.size) for log in found] == [
+        (f"{root}/a/log.mcap", "a/log.mcap", len("robots/a/log.mcap")),
+        (f"{root}/b/other.mcap", "b/other.mcap", len("robots/b/other.mcap")),
+    ]
+    assert alone.name == "other.mcap"
+    assert alone.stamp  # of the last change: a log of the same size is another one

@@ -18,6 +18,7 @@ from imutool.errors import LogError
 from imutool.mcap_io.codec.records import HEAD
 
 RUN_AFTER = 8  # equal lengths in a row before a whole run is tested at once
+LOOK_AHEAD = 64  # records of a run that are tested first
 BATCH_BYTES = 1 << 18  # of IMU messages are decoded at once: one chunk holds too few among its images for numpy to be quick
 MESSAGE = np.dtype(
     [
@@ -131,11 +132,20 @@ def scan(data: bytes | memoryview, *, bare: bool = False) -> tuple[Int64[np.ndar
 
 
 def _run(view: UInt8[np.ndarray, " b"], position: int, stride: int) -> int:
-    """How many records in a row start with the same opcode and length as the one at `position`."""
-    count = (len(view) - position) // stride
-    heads = view[position : position + count * stride].reshape(count, stride)[:, : HEAD.size]
-    same = (heads == heads[0]).all(axis=1)
-    return count if same.all() else int(np.argmin(same))
+    """How many records in a row start with the same opcode and length as the one at `position`.
+
+    The look ahead grows with the run: to look at the whole chunk for each short run takes time with the square of its size.
+    """
+    count, known, ahead = (len(view) - position) // stride, 0, LOOK_AHEAD
+    head = view[position : position + HEAD.size]
+    while known < count:
+        rows = min(ahead, count - known)
+        first = position + known * stride
+        same = (view[first : first + rows * stride].reshape(rows, stride)[:, : HEAD.size] == head).all(axis=1)
+        if not same.all():
+            return known + int(np.argmin(same))
+        known, ahead = known + rows, 4 * ahead
+    return count
 
 
 def parse(data: bytes | memoryview, offset: int) -> Messages:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ BATCH_S = 0.1  # shown together
 SWITCH_S = 0.0005  # that the viewer's thread may keep the interpreter: Python's own 5 ms are the whole delay allowed
 SILENT_S = 5.0  # without a sample, before a warning
 MAX_WAITING = 256  # batches: a viewer that does not keep up loses some rather than fill the memory
+MOST_FIRST = 1 << 16  # samples before the start, where the clock jumps again and again
 MAX_DELAYS = 1 << 20  # of which percentiles are taken: 17 minutes at 1 kHz, then a random choice
 
 logger = logging.getLogger("imutool")
@@ -93,6 +95,7 @@ class _Session:
         self._online: OnlineDebiaser | None = None
         self._how, self._std = "", np.zeros(6)
         self._first: list[Sample] = []
+        self._stretches = [0]  # of the first samples: where each begins; the clock jumps between them
         self._batch: list[tuple[Sample, np.ndarray]] = []
         self._delays: list[float] = []
         self._random = np.random.default_rng(0)
@@ -103,14 +106,17 @@ class _Session:
 
     def add(self, found: Sample, batches: _Batches) -> None:
         """Correct a sample, or keep it until the initial bias is known."""
-        self._count(found)
+        jumped = self._count(found)
         if self._online is not None:
             self._correct(found, batches)
             if found.arrival_s >= self._ready_s:
                 self._add_delay(time.perf_counter() - found.arrival_s)
             return
+        if jumped and self._first:
+            self._stretches.append(len(self._first))
         self._first.append(found)
-        if abs(found.stamp_ns - self._first[0].stamp_ns) >= START_S * 1e9:
+        seconds = abs(found.stamp_ns - self._first[self._stretches[-1]].stamp_ns) * 1e-9
+        if seconds >= START_S or len(self._first) >= MOST_FIRST:
             self._start(batches)
 
     def _add_delay(self, delay_s: float) -> None:
@@ -157,7 +163,8 @@ class _Session:
             return None
         return Delay(*(np.percentile(self._delays, [50.0, 99.0, 100.0]) * 1e3).tolist())
 
-    def _count(self, found: Sample) -> None:
+    def _count(self, found: Sample) -> bool:
+        """Count a sample, and say whether the clock has jumped to it."""
         step_ns = found.stamp_ns - self._last_ns
         usual = not self._samples or 0 < step_ns <= GAP_S * 1e9
         jumps = [] if usual else clock_jumps(np.array([self._last_ns, found.stamp_ns]))
@@ -172,14 +179,18 @@ class _Session:
             self._gaps += 1
         self._last_ns = found.stamp_ns if jumps else max(self._last_ns, found.stamp_ns)
         self._samples += 1
+        return bool(jumps)
 
     def _start(self, batches: _Batches) -> None:
-        """Take the initial bias from the first samples, and correct them.
+        """Take the initial bias from the first samples without a jump of the clock, and correct all.
 
         Raises:
             DataError: an untrained model, and no rest.
         """
-        ordered = sorted({sample.stamp_ns: sample for sample in self._first}.values())
+        run = max(
+            (slice(*ends) for ends in pairwise([*self._stretches, len(self._first)])), key=lambda run: run.stop - run.start
+        )
+        ordered = sorted({sample.stamp_ns: sample for sample in self._first[run]}.values())
         t_ns = np.array([sample.stamp_ns for sample in ordered], dtype=np.int64)
         gyro, accel = (np.array([getattr(sample, name) for sample in ordered]) for name in ("gyro", "accel"))
         good = measured(gyro, accel)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import select
 import socket
@@ -20,12 +21,13 @@ from imutool.array_types import Int64
 from imutool.bias.temperature import channel_of
 from imutool.cleaning import raw_batches
 from imutool.errors import ConfigError, LogError, not_installed
-from imutool.file_location import to_location
+from imutool.file_location import STORES, to_location
 from imutool.mcap_io.temperature import temperatures
 from imutool.recording import Scalars
 from imutool.recording.columns import MOST_GAP_S
 from imutool.viewing.stream.samples import Malformed, Sample, decoded
 
+logger = logging.getLogger("imutool")
 EXPECTED = "a log, stdin, udp://HOST:PORT, zenoh://[HOST:PORT]/KEY or rosbridge://HOST:PORT/TOPIC"
 ROSBRIDGE_PORT = 9090
 WAIT_S = 0.5  # for data, between looks at the time
@@ -64,7 +66,7 @@ def _source(name: str, malformed: Malformed, imu: str | None, speed: float, temp
         return _rosbridge(name, malformed)
     if parts.scheme == "zenoh":
         return _zenoh(name, malformed)
-    if "://" in name and parts.scheme not in {"file", "s3", "gs", "az"}:
+    if "://" in name and parts.scheme not in {"file", *STORES}:
         raise ConfigError(f"{name!r}", where="source", expected=EXPECTED)
     return _replay(name, imu, speed, temperature)
 
@@ -111,6 +113,8 @@ def _arriving(stamp_ns: Int64[np.ndarray, " n"], last_ns: int | None, channel: S
 
 def _lines(malformed: Malformed) -> Samples:
     """Samples from standard input, one JSON object a line."""
+    if sys.stdin is None:
+        raise ConfigError("standard input is closed", where="stdin", fix="Pipe the samples into the command")
     descriptor = sys.stdin.fileno()
 
     def samples() -> Generator[Sample | None]:
@@ -167,7 +171,7 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
     """Samples of a topic from a rosbridge server (https://github.com/RobotWebTools/rosbridge_suite)."""
     if find_spec("websockets") is None:
         raise not_installed("websockets", "live", where=name, user="a rosbridge")
-    from websockets.exceptions import ConnectionClosed, InvalidHandshake
+    from websockets.exceptions import ConnectionClosed, ConnectionClosedOK, InvalidHandshake
     from websockets.sync.client import connect
 
     host, port = _address(name, ROSBRIDGE_PORT)
@@ -184,7 +188,7 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
     line.send(msgspec.json.encode({"op": "subscribe", "topic": topic}).decode())
 
     def samples() -> Generator[Sample | None]:
-        with connection, contextlib.suppress(ConnectionClosed):
+        with connection:
             yield None
             while True:
                 try:
@@ -192,6 +196,10 @@ def _rosbridge(name: str, malformed: Malformed) -> Samples:
                 except TimeoutError:
                     yield None
                     continue
+                except ConnectionClosed as error:
+                    if not isinstance(error, ConnectionClosedOK):
+                        logger.warning("%s: the connection is lost (%s); the stream ends here", url, error)
+                    return
                 yield from decoded(text, time.perf_counter(), malformed)
 
     return samples()

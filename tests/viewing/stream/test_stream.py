@@ -11,6 +11,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,8 @@ from imutool.bias_start.bias_at_rest import auto
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.recording import Imu
-from imutool.viewing.stream import sources
-from imutool.viewing.stream.samples import Malformed, Sample, sample
+from imutool.viewing.stream import session, sources
+from imutool.viewing.stream.samples import Malformed, Sample, decoded, sample
 from imutool.viewing.stream.session import run
 from imutool.viewing.stream.sources import open_source
 
@@ -117,6 +119,34 @@ def test_gaps_order_and_missing_values_are_counted_and_do_no_harm(imu: Imu) -> N
     assert np.isfinite(done.gyro_bias).all()
 
 
+@pytest.mark.parametrize("stray_ns", [0, 1 << 62])
+def test_one_stray_stamp_does_not_end_the_wait_for_the_start(imu: Imu, stray_ns: int, caplog: pytest.LogCaptureFixture) -> None:
+    """As of a driver whose first message has no time yet."""
+    samples = list(stream(imu))
+    done = run(iter([samples[0]._replace(stamp_ns=stray_ns), *samples]), api.load_model("static"), Malformed())
+    alone = run(iter(samples), api.load_model("static"), Malformed())
+    assert (done.start, done.samples, done.gaps) == (alone.start, alone.samples + 1, 1)
+    np.testing.assert_allclose(done.gyro_bias, alone.gyro_bias, atol=1e-5)
+    assert "the clock jumps" in caplog.text
+
+
+def test_a_clock_that_jumps_at_each_sample_does_not_delay_the_start_for_ever(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "MOST_FIRST", 100)
+    corrected: list[int] = []
+    odd = (found._replace(stamp_ns=found.stamp_ns + k % 2 * 10**15) for k, found in enumerate(stream(imu)))
+    first = (found for found, _ in zip(odd, range(101), strict=False))
+    linear = api.load_model("fetch-linear")
+    run(first, linear, Malformed(), each=lambda found, rate, force: corrected.append(found.stamp_ns))
+    assert len(corrected) == 101
+
+
+@pytest.mark.parametrize("time", ['"t_s": 1e300', '"t_ns": 9223372036854775807', '"t_ns": 99999999999999999999999'])
+def test_a_time_out_of_range_is_no_sample(time: str) -> None:
+    malformed = Malformed()
+    assert list(decoded(PLAIN.replace('"t_ns": 5', time), 0.0, malformed)) == []
+    assert malformed.count == 1
+
+
 def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) -> None:
     malformed = Malformed()
     malformed.add("nonsense", ValueError("no JSON"))
@@ -134,6 +164,28 @@ def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) 
 def test_a_wrong_source_is_refused_at_once(name: str) -> None:
     with pytest.raises(ConfigError):
         open_source(name, Malformed())
+
+
+def test_closed_standard_input_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)  # as Python does for `<&-`
+    with pytest.raises(ConfigError, match="standard input is closed"):
+        open_source("stdin", Malformed())
+
+
+def test_a_log_of_a_web_server_is_replayed(logs: Path) -> None:
+    handler = partial(SimpleHTTPRequestHandler, directory=str(logs))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            source = open_source(f"http://127.0.0.1:{server.server_port}/flight_1.mcap", Malformed(), speed=100.0)
+            found = next(source)
+            source.close()  # type: ignore[attr-defined]
+        finally:
+            server.shutdown()
+            thread.join()
+    assert found is not None
+    assert found.stamp_ns == api.read(logs / "flight_1.mcap").imu.t_ns[0]
 
 
 def test_a_source_that_nobody_reads_is_closed(logs: Path) -> None:
@@ -163,7 +215,8 @@ def test_datagrams_are_samples(imu: Imu, monkeypatch: pytest.MonkeyPatch) -> Non
     source.close()  # type: ignore[attr-defined]
 
 
-def test_a_rosbridge_is_subscribed_to(imu: Imu) -> None:
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_rosbridge_is_subscribed_to(imu: Imu, caplog: pytest.LogCaptureFixture, lost: bool) -> None:
     from websockets.sync.server import serve
 
     asked: list[Any] = []
@@ -173,6 +226,8 @@ def test_a_rosbridge_is_subscribed_to(imu: Imu) -> None:
         for t_ns in imu.t_ns[:3].tolist():
             stamp = f'"sec": {t_ns // 10**9}, "nanosec": {t_ns % 10**9}'
             line.send('{"op": "publish", "topic": "/imu", "msg": %s}' % (MESSAGE % stamp))
+        if lost:
+            line.close_socket()
         line.close()
 
     with serve(publish, "127.0.0.1", 0) as server:
@@ -182,6 +237,7 @@ def test_a_rosbridge_is_subscribed_to(imu: Imu) -> None:
         found = list(open_source(f"rosbridge://127.0.0.1:{port}/imu/data", Malformed()))
         server.shutdown()
         thread.join()
+    assert ("the connection is lost" in caplog.text) == lost
     assert asked == [{"op": "subscribe", "topic": "/imu/data"}]
     assert [one.stamp_ns for one in found if one is not None] == imu.t_ns[:3].tolist()
 

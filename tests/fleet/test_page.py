@@ -1,0 +1,61 @@
+"""The page about a fleet: its labels can be read, and what it says of logs is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imutool.fleet import page
+from imutool.fleet.results import Statistics
+from imutool.fleet.task import Result
+from imutool.viewing.html import drawing
+
+LETTER = 6.0  # pixels between two numbers: a browser has another font
+
+
+def test_what_is_said_of_logs_counts_without_their_topics_and_stays_whole() -> None:
+    statistics = Statistics()
+    for topic in ("/imu0", "/imu1"):
+        said = (f"{topic}: 4 samples missing", "the record at byte 956 is damaged: it says it has 190982 bytes")
+        statistics.add(Result(key=topic, source=topic, target="", status="ok", warnings=said))
+    assert statistics.warnings == {"4 samples missing": 2, "the record at byte 956 is damaged: it says it has 190982 bytes": 2}
+
+
+def test_the_numbers_below_the_histograms_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn: list[Any] = []
+
+    def svg(draw: Callable[[Any], None], height: float, name: str) -> str:
+        with drawing._inked(drawing.PLACEHOLDER_COLORS, name):
+            figure = Figure(figsize=(drawing.WIDTH_INCH, height))
+            FigureCanvasAgg(figure).draw()
+            draw(figure)
+            figure.canvas.draw()
+        drawn.append(figure)
+        return ""
+
+    monkeypatch.setattr(page, "svg", svg)
+    for rows in (
+        [[0.0097, -0.02006, 0.005], [0.0101, -0.01985, 0.03]],
+        [[-5e-4, -2.1e-4, -0.1], [0.0, 0.0, 0.0]],
+        [[-123.4, 1e-7, -7.0], [-123.1, 2.5e-7, 9.0]],
+    ):
+        page._axes(np.array(rows), "gyro bias (rad/s)")
+    assert len(drawn) == 3
+    for figure in drawn:
+        for axes in figure.axes:
+            low, high = axes.get_xlim()
+            labels = [
+                label
+                for at, label in zip(axes.get_xticks(), axes.get_xticklabels(), strict=True)
+                if low <= at <= high and label.get_text()
+            ]
+            boxes = [label.get_window_extent() for label in labels]
+            assert boxes
+            assert all(left.x1 + LETTER < right.x0 for left, right in pairwise(boxes)), [label.get_text() for label in labels]
