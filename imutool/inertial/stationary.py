@@ -111,7 +111,8 @@ def rest_stretches(imu: Imu, settings: StationarySettings | None = None) -> list
     """
     if len(imu) < 2:
         return []
-    blocks = block_statistics([(imu.t_ns, imu.gyro, imu.accel)], imu.period_s, settings)
+    parts = (slice(first, first + AT_ONCE) for first in range(0, len(imu), AT_ONCE))
+    blocks = block_statistics(((imu.t_ns[s], imu.gyro[s], imu.accel[s]) for s in parts), imu.period_s, settings)
     return [(first * blocks.k, last * blocks.k) for first, last in resting_blocks(blocks, settings)]
 
 

@@ -14,7 +14,7 @@ from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
 from imutool.cleaning.rules.units import Units
-from imutool.cleaning.samples import Motion, Samples
+from imutool.cleaning.samples import BLOCK, Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
@@ -45,7 +45,10 @@ NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or
 def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
     """Totals for the rules about conventions; nothing is converted."""
     motion = Motion()
-    motion.see(Samples(np.arange(len(imu)), imu.t_ns, imu.t_ns, np.concatenate([imu.gyro, imu.accel], axis=1)))
+    for first in range(0, len(imu), BLOCK):
+        s = slice(first, first + BLOCK)
+        t_ns, values = imu.t_ns[s], np.concatenate([imu.gyro[s], imu.accel[s]], axis=1)
+        motion.see(Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values))
     return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
 
 

@@ -192,14 +192,21 @@ def sound_samples(log: Log, topic: str) -> Imu:
 
 def _columns(log: Log, topic: str) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Stamps, rates and accelerations of an IMU as recorded."""
-    batches = list(raw_batches(log, topic))
-    gyro, accel = (np.concatenate([np.empty((0, 3)), *(getattr(batch, name) for batch in batches)]) for name in SENSORS)
-    return _joined(batch.stamp_ns for batch in batches), gyro, accel
+    stamps, rates, forces = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3))]
+    for batch in raw_batches(log, topic):  # copies, as a batch holds whole messages
+        stamps.append(batch.stamp_ns.copy())
+        rates.append(batch.gyro.copy())
+        forces.append(batch.accel.copy())
+    gyro = np.concatenate(rates)
+    rates.clear()
+    return np.concatenate(stamps), gyro, np.concatenate(forces)
 
 
 def _sound(t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]) -> Imu:
     """Finite samples in time order, each stamp once."""
     finite = not_finite.measured(gyro) & not_finite.measured(accel)
+    if finite.all() and (np.diff(t_ns) > 0).all():
+        return Imu(t_ns, gyro, accel)
     ordered, first = np.unique(t_ns[finite], return_index=True)
     return Imu(ordered, gyro[finite][first], accel[finite][first])
 
