@@ -42,7 +42,6 @@ from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import LEAST_PERIOD_S, Imu
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.report import UNSET
-from imutool.units import SENSORS
 
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
