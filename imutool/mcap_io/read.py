@@ -248,7 +248,7 @@ class _Columns:
             if away.any():  # rows that a recording takes as they are keep every bit
                 q_wb_wxyz = np.where(away[:, None], unit_quaternions(q_wb_wxyz), q_wb_wxyz)
             v_w = None
-            for topic in (t for t, of in self.velocity_topics.items() if of == name and t in self.kept):
+            for topic in (t for t, of in self.velocity_topics.items() if of == name and (t in self.kept or not len(stamp_ns))):
                 times, (v_w,) = self.columns(topic, 3)
                 _, both, rows = np.intersect1d(stamp_ns, times, assume_unique=True, return_indices=True)
                 if not len(both) and len(stamp_ns):
