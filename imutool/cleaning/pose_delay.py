@@ -15,7 +15,7 @@ from imutool.recording.columns import median
 
 MOST_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
-SLOW_S = 1.0  # of the turns that find the delay: strides, three a second, fit as well one stride later in steps of 0.1 s
+SLOW_S = 1.0  # length of the turns that find the delay: in steps of 0.1 s a fast walk fits one stride later as well
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
@@ -67,10 +67,10 @@ def _clock_difference(motion: Motion, truth: Truth) -> float | None:
 
 
 def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
-    """Delay of at most `LONGEST_DELAY_S`: first by slow turns, then as precisely as all show it."""
+    """Delay of at most `LONGEST_DELAY_S`: turns over a second find it, and turns between neighbouring poses refine it."""
     period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
-    slow, all_turns = (_Turns.of(motion, truth, n, period_ns) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
-    if min(len(slow.size) + FEWEST, len(all_turns.size)) < DELAY_PARTS * FEWEST:
+    slow, fast = (_Turns.of(motion, truth, n, period_ns) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
+    if min(len(slow.size) + FEWEST, len(fast.size)) < DELAY_PARTS * FEWEST:  # of the slow ones a log holds fewer
         return None
     coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
     whole = slow.correlations(coarse)[:, 0]
@@ -78,7 +78,7 @@ def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
     if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
         return None
     lags = coarse[at] + np.arange(-12, 13) * FINE_S
-    fine = all_turns.correlations(lags)
+    fine = fast.correlations(lags)
     if fine[:, 0].max() < LEAST_CORRELATION:
         return None
     peaks = np.array([_peak(lags, column) for column in fine.T])
@@ -89,7 +89,10 @@ def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
 
 
 class _Turns(NamedTuple):
-    """Turns by the poses, from and to (s of the IMU's clock), and the gyro's means in steps."""
+    """Turns between poses, and the gyro's mean in each step.
+
+    A turn has its size (rad/s), its beginning and its end (s, on the IMU's clock).
+    """
 
     size: Float64[np.ndarray, " n"]
     first_s: Float64[np.ndarray, " n"]
@@ -99,7 +102,7 @@ class _Turns(NamedTuple):
 
     @classmethod
     def of(cls, motion: Motion, truth: Truth, apart: int, period_ns: int) -> _Turns:
-        """Turns between poses so many rows apart that lie within the gyro's samples at every delay."""
+        """Turns between poses that are `apart` rows apart, as far as the gyro covers them at every delay."""
         first, last, rate = turning(truth, apart)
         step, mean = motion.table()
         use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)

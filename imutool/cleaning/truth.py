@@ -86,7 +86,7 @@ def _thinned(stamp_ns: Int64[np.ndarray, " n"], last_ns: int) -> Int64[np.ndarra
 def turning(
     truth: Truth, apart: int = 1
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"], Float64[np.ndarray, "m 3"]]:
-    """Angular rate (rad/s, body) between poses so many rows apart, with start and end (ns)."""
+    """Angular rate (rad/s, body) between poses `apart` rows apart, with start and end (ns)."""
     q_wb = quaternion.unit(truth.q_wb_wxyz)
     first, last = truth.t_ns[:-apart], truth.t_ns[apart:]
     dt = seconds(last, int(truth.t_ns[0])) - seconds(first, int(truth.t_ns[0]))
