@@ -36,7 +36,7 @@ def train(
         Path | None,
         typer.Option(metavar="physics.toml", help="For hybrid: effects to fit; the neural ODE learns the rest."),
     ] = None,
-    device: Annotated[str, typer.Option(help="Device: cpu or cuda, which is faster with conv alone.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device: cpu or cuda. Only conv is faster on cuda.")] = "cpu",
     seed: Annotated[int | None, typer.Option(help="Seed of the random numbers.")] = None,
     imu: Imu = None,
     truth: Truth = None,
