@@ -85,7 +85,7 @@ def _check_inside(target: str, table: Path) -> None:
 def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:
     """Log of a row: the debiased one where the fleet wrote it, else its source."""
     target = folder / row["target"]
-    is_log = target.suffix == ".mcap" and target.is_file()
+    is_log = target.suffix.lower() == ".mcap" and target.is_file()
     diagnosis = target if row["effects"] is not None and target.is_file() else None
     place = str(target) if is_log else row["source"]
     name = str(Path(row["target"]).with_suffix("").as_posix())

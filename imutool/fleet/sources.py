@@ -63,9 +63,9 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
     logs, refused, taken, passed_over, outputs = [], [], dict[str, str](), Counter[str](), 0
     for where, about, unread in files:
         if real(where.rpartition("/")[0]).startswith(real(str(out))):
-            outputs += where.endswith(endings)
+            outputs += _ends(where, endings)
             continue
-        if not where.endswith(endings) and (ending := next((raw for raw in RAW if where.endswith(raw)), "")):
+        if not _ends(where, endings) and (ending := next((raw for raw in RAW if _ends(where, (raw,))), "")):
             passed_over[ending] += 1
             continue
         try:
@@ -99,7 +99,7 @@ def simulation(folder: Location, name: str) -> Location:
     Raises:
         ConfigError: there is none.
     """
-    found = folder if folder.suffix == ".mcap" else folder / name
+    found = folder if _ends(folder.name, (LOG,)) else folder / name
     if not found.is_file():
         raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
     return found
@@ -168,7 +168,7 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
         root /= part
     named = sorted(globs.iglob(str(where), recursive=True))  # noqa: PTH207  Path.glob takes no absolute pattern
     files = (os.path.abspath(name) for name in named)  # noqa: PTH100  Path.resolve would follow links
-    return os.path.abspath(root), (_File(file) for file in files if file.endswith(endings) and Path(file).is_file())  # noqa: PTH100
+    return os.path.abspath(root), (_File(file) for file in files if _ends(file, endings) and Path(file).is_file())  # noqa: PTH100
 
 
 def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, int]]) -> Iterator[_File]:
@@ -188,8 +188,13 @@ def _walk(folder: Path, endings: tuple[str, ...], above: frozenset[tuple[int, in
             continue
         if is_folder:
             yield from _walk(folder / entry.name, endings, above | {inode})
-        elif entry.name.endswith(endings):
+        elif _ends(entry.name, endings):
             yield _File(str(folder / entry.name))
+
+
+def _ends(name: str, endings: tuple[str, ...]) -> bool:
+    """Whether a name has one of these endings, in small or capital letters, as some recorders write them."""
+    return name.lower().endswith(endings)
 
 
 def _real(folder: str) -> str:
@@ -206,19 +211,19 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     try:
         if match is not None:
             found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
-        elif fixed.startswith(("http://", "https://")) and fixed.endswith(endings):
+        elif fixed.startswith(("http://", "https://")) and _ends(fixed, endings):
             found = {root.path: {}}  # one file: to list it, the library would fetch the whole log and look for links in it
         else:
             found = root.fs.find(root.path, detail=True)
         for path, about in found.items():
-            if about.get("size") is None and path.endswith(endings):  # a web server lists names alone
+            if about.get("size") is None and _ends(path, endings):  # a web server lists names alone
                 found[path] = root.fs.info(path)
     except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
     files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
     return whole, (
-        file for file in files if file.where.endswith(endings) and file.about and file.about.get("type", "file") == "file"
+        file for file in files if _ends(file.where, endings) and file.about and file.about.get("type", "file") == "file"
     )
 
 

@@ -6,7 +6,9 @@
 For each log the effects of `hybrid` (without the neural ODE, which would take a minute each) are found on all the others, and
 the log is integrated from every start; AOE in degrees. How long a start from the truth takes, which starts are worth their
 name, and whether an effect earns its place was asked here. With `--minute` it is the other way round: `train`'s closed form
-on the middle minute of each log alone, scored on all others beside raw samples and `static` (mean AOE of these logs).
+on the middle minute of each log alone, scored on all others beside raw samples and `static` (mean AOE of these logs). How much
+of that the minute has to cost: the last columns hold the orientation by which models differ whose parameters are drawn from the
+deviations that the minute leaves, each started in the log as its own model is (root mean square over `DRAWS`).
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from imutool.array_types import Bool
+from imutool.bias import hybrid
 from imutool.bias.model import BiasModel
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import estimate_at_rest, find_initial_bias, smooth_in_memory
@@ -25,12 +29,13 @@ from imutool.errors import ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
-from imutool.recording import Recording, nanoseconds
+from imutool.recording import Poses, Recording, nanoseconds
 from imutool.training.effect_selection import PhysicsFirst
 from imutool.training.fit import Training
 from imutool.training.settings import settings_of
+from imutool.units import SENSORS
 
-MINUTE_S, SCORED = 60.0, ("truth", "auto", "smooth")
+MINUTE_S, SCORED, DRAWS = 60.0, ("truth", "auto", "smooth"), 5
 STARTS = ("prior", "truth:2", "truth:5", "truth:10", "truth:15", "auto", "smooth")
 
 
@@ -65,7 +70,8 @@ def minutes(recordings: list[Recording], starts: list[str], words: list[str]) ->
     """A row for each log that gave its middle minute."""
     raw = [float(metrics.evaluate(*along_truth(r.imu, r.truth, r.name))["aoe_deg"]) for r in recordings]
     static = [at_rest(r) for r in recordings]
-    print(f"| minute of | raw | static | {' | '.join(starts)} | effects |\n|{'---|' * (len(starts) + 4)}")
+    expected = [f"{start}, by deviations" for start in starts]
+    print(f"| minute of | raw | static | {' | '.join([*starts, *expected])} | effects |\n|{'---|' * (2 * len(starts) + 4)}")
     for place, minute_of in enumerate(recordings):
         both = minute_of.overlap().imu
         spare_ns = max(0, int(both.t_ns[-1] - both.t_ns[0]) - nanoseconds(MINUTE_S))
@@ -74,6 +80,7 @@ def minutes(recordings: list[Recording], starts: list[str], words: list[str]) ->
         others = [k for k in range(len(recordings)) if k != place]
         scores = [np.mean([values[k] for k in others]) for values in (raw, static)]
         scores += [np.mean([aoe(model, recordings[k], start) for k in others]) for start in starts]
+        scores += [np.mean([by_deviations(model, recordings[k], start) for k in others]) for start in starts]
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
         print(
             f"| {minute_of.name} | {' | '.join('–' if np.isnan(score) else f'{score:.2f}' for score in scores)} | {found} |",
@@ -106,13 +113,33 @@ def learned(recordings: list[Recording], words: list[str]) -> BiasModel:
 
 def aoe(model: BiasModel, recording: Recording, start: str) -> float:
     """Orientation error of pure integration, in degrees."""
+    return float(metrics.evaluate(*integrated(model, recording, start))["aoe_deg"])
+
+
+def integrated(model: BiasModel, recording: Recording, start: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
+    """Path of pure integration of the debiased samples, the true one, and the mask of valid rows."""
     begun = (
         smooth_in_memory(model, recording.imu, recording.name)
         if start == "smooth"
         else find_initial_bias(start, model, recording)
     )
-    debiased = apply(model, begun, recording.imu).imu
-    return float(metrics.evaluate(*along_truth(debiased, recording.truth, recording.name))["aoe_deg"])
+    return along_truth(apply(model, begun, recording.imu).imu, recording.truth, recording.name)
+
+
+def by_deviations(model: BiasModel, recording: Recording, start: str) -> float:
+    """Orientation by which models differ within the deviations of the effects' parameters, in degrees."""
+    assert isinstance(model, hybrid.Model)
+    rng, (path, _, valid) = np.random.default_rng(0), integrated(model, recording, start)
+    squares = []
+    for _ in range(DRAWS):
+        drawn = {
+            f"theta_{sensor}": rng.multivariate_normal(model.tensors[f"theta_{sensor}"], model.tensors[f"covariance_{sensor}"])
+            for sensor in SENSORS
+        }
+        other = hybrid.Model(model.config, model.rate_hz, model.tensors | drawn)
+        other.card = model.card
+        squares.append(metrics.evaluate(integrated(other, recording, start)[0], path, valid)["aoe_deg"] ** 2)
+    return float(np.sqrt(np.mean(squares)))
 
 
 if __name__ == "__main__":

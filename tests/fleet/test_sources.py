@@ -43,6 +43,12 @@ def test_logs_of_the_same_name_keep_their_folders(tmp_path: Path) -> None:
     assert names(tmp_path / "b" / "**" / "*.mcap") == ["c/log.mcap", "log.mcap"]
 
 
+def test_endings_in_capital_letters_are_endings(tmp_path: Path) -> None:
+    tree(tmp_path, "A.MCAP", "b.mcap", "c/D.Mcap", "e.BAG")
+    assert names(tmp_path) == ["A.MCAP", "b.mcap", "c/D.Mcap"]
+    assert [one.name for one in find(f"{tmp_path}/**/*", NOWHERE, bags=True).logs] == ["A.MCAP", "b.mcap", "c/D.Mcap", "e.BAG"]
+
+
 def test_bags_are_taken_where_asked_for_and_keep_their_names(tmp_path: Path) -> None:
     tree(tmp_path, "a/log.mcap", "a/log.bag", "b.bag")
     assert names(tmp_path) == ["a/log.mcap"]
@@ -53,7 +59,7 @@ def test_bags_are_taken_where_asked_for_and_keep_their_names(tmp_path: Path) -> 
 
 
 def test_other_recordings_are_passed_over_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    tree(tmp_path, "a/log.mcap", "a/log.bag", "b.bag", "t.csv", "u.tar.gz", "readme.txt")
+    tree(tmp_path, "a/log.mcap", "a/log.bag", "b.BAG", "t.csv", "u.tar.gz", "readme.txt")
     assert names(tmp_path) == ["a/log.mcap"]
     assert "passed over (2 .bag, 1 .csv, 1 .tar.gz); imutool convert" in caplog.text
     (tmp_path / "a" / "log.mcap").unlink()
