@@ -179,6 +179,12 @@ def group_of(column: str) -> str:
     return re.sub(r"(^|[/.])[^/.]*$", "", re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", column))
 
 
+def shared_group(time: str, column: str) -> int:
+    """Depth of a time's group, if a column is in it; -1 otherwise."""
+    around, own = ([part for part in re.split(r"[/.]", group_of(each)) if part] for each in (time, column))
+    return len(around) if own[: len(around)] == around else -1
+
+
 def _columns_of(entries: Entries) -> set[str]:
     """Columns that a map names."""
     parts = [[value] if isinstance(value, str) else value for name, value in entries.items() if name in COLUMN_ENTRIES]
