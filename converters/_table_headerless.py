@@ -12,6 +12,8 @@ from collections import Counter
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
 from ._table_names import unit_named
 from ._table_text import Columns
 from ._table_times import rises
@@ -51,7 +53,14 @@ class _Halves(NamedTuple):
 
 def perhaps(columns: Columns) -> list[str]:
     """Lines of a map for more columns without a header, of which the first look like an IMU."""
-    halves = _halves(columns, [name for name in columns.values if re.fullmatch(r"column \d{1,4}", name)])
+    groups: dict[str, list[str]] = {}
+    for name in columns.values:
+        if match := re.fullmatch(r"(.*/)?(column \d{1,4}|time)", name):
+            groups.setdefault(match[1] or "", []).append(name)
+    for names in groups.values():  # a number of a frame, which does not rise in each row, is no time
+        if (first := columns.values[names[0]]).dtype.kind in "iu" and not rises(first) and (np.diff(first) >= 0).all():
+            del names[0]
+    halves = next(filter(None, (_halves(columns, names) for names in groups.values())), None)
     if halves is None:
         return []
     triples = zip(halves.sensors, (halves.columns[:3], halves.columns[3:]), strict=True)
@@ -62,8 +71,14 @@ def _halves(columns: Columns, names: list[str]) -> _Halves | None:
     """The first six columns that are no time; None where not exactly one half shows gravity."""
     time = names[:1] if names and rises(columns.values[names[0]]) else []
     six = names[len(time) : len(time) + 6]
-    shows = [bool(gravity_units(columns, half)[1]) for half in (six[:3], six[3:])] if len(six) == 6 else []
+    shows = [_has_gravity(columns, half) for half in (six[:3], six[3:])] if len(six) == 6 else []
     return _Halves(time, six, ("accel", "gyro") if shows[0] else ("gyro", "accel")) if sum(shows) == 1 else None
+
+
+def _has_gravity(columns: Columns, triple: list[str]) -> bool:
+    """Whether three columns have the size of gravity; zeros beside a one, as of a pose, have not."""
+    whole = all(np.isin(columns.values[name], (-1, 0, 1)).all() for name in triple)
+    return bool(gravity_units(columns, triple)[1]) and not whole
 
 
 def name_headerless(columns: Columns) -> None:

@@ -18,7 +18,7 @@ UNITS = {
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "mg": r"mg",
-    "g": r"g",
+    "g": r"gs?",
     "ns": r"ns|nanoseconds?|nsec",
     "us": r"us|µs|microseconds?|usec",
     "ms": r"ms|milliseconds?|msecs?",
@@ -30,6 +30,7 @@ UNITS = {
     "mm": r"mm|millimet(er|re)s?",
 }
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
+ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth)(_|$)"  # no reading of a sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
@@ -108,7 +109,8 @@ def split_name(column: str) -> tuple[str, str]:
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
         end := re.search(
-            r"(?:_in)?_(m?dps|(deg|rad)(_?(per_?)?s(ec(ond)?)?|ps)|mps2|ms2|m_(per_)?s_?2|mg|g|ns|us|ms|s|sec)$", name
+            r"(?:_in)?_(m?dps|(deg|rad)(_?(per_?)?s(ec(ond)?)?|ps)|mps2|ms2|m_(per_)?s_?2|mg|gs?|ns|us|ms|s|(nano|micro|milli)?sec(ond)?s?)$",
+            name,
         )
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))

@@ -15,6 +15,7 @@ from ._table_headerless import perhaps
 from ._table_map import NO_UNIT, Proposal
 from ._table_names import (
     CORE_MOTION,
+    ESTIMATED,
     ROS_WORDS,
     TIME_WORDS,
     WITHOUT_GRAVITY,
@@ -84,7 +85,8 @@ def _propose_sensor(
     """Columns of the three axes, and their unit."""
     plain = {column: name for column, (name, _) in names.items()}
     spaced = {column: spaced_name(column) for column in names}
-    found = [*triples(sensor, plain, spaced).values()]
+    every = [*triples(sensor, plain, spaced).values()]
+    found = [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
     whole = _with_gravity(found, spaced, columns) if sensor == "accel" else found
     if len(whole) < len(found):
         proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
@@ -109,10 +111,13 @@ def _propose_sensor(
         _propose_unit(proposal, sensor, columns)
     if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
         level, _ = gravity_units(columns, chosen)
-        is_motion = is_motion_alone(columns, chosen)
+        is_motion = is_motion_alone(columns, chosen) and not re.search(r"(^|_)raw(_|$)", spaced[chosen[0]])
         if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or is_motion or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
             proposal.open.append("accel")
-            proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
+            why = ", and its directions cancel out" if is_motion else ""
+            proposal.reasons.append(
+                f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}{why}: gravity was taken out"
+            )
 
 
 def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:

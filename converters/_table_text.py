@@ -128,10 +128,11 @@ def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:
     """Whether a line has `least` numbers."""
-    return not line.startswith(COMMENTS) and sum(map(_is_number, line.split(delimiter))) >= least
+    return not line.startswith(COMMENTS) and sum(map(is_number, line.split(delimiter))) >= least
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a field is a number, perhaps with a decimal comma."""
     text = text.strip().strip('"')
     if "_" in text:  # Python reads 2026_06_15 as a number, nobody else does
         return False

@@ -105,7 +105,7 @@ def counters_of(columns: Columns, length: int) -> list[str]:
 
 
 def counts_others(values: np.ndarray) -> bool:
-    """Whether a counter's steps are no multiples of the usual one: it numbers other packets, too."""
+    """Whether a counter numbers other packets, too: steps are no multiples of the usual."""
     steps = np.diff(_unwrapped(values))
     return float(np.mean(steps % max(float(np.median(steps)), 1.0) != 0.0)) > MOST_ODD
 

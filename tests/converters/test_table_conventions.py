@@ -427,3 +427,17 @@ def test_a_time_and_six_axes_without_a_header_are_an_imu_by_its_gravity(tmp_path
     imu = table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml").imus["/imu0"]
     assert np.array_equal(imu.gyro, GYRO)
     assert np.array_equal(imu.accel, ACCEL)
+
+
+def test_readings_count_before_estimates_and_words_for_units_are_known(tmp_path):
+    """A filter's acceleration has less of the motion, and perhaps the axes of the world."""
+    names = ["timestamp_seconds", *(f"{kind}_acceleration_{a}_gs" for kind in ("raw", "est") for a in "xyz")]
+    names += [f"{kind}_angular_rate_{a}_{unit}_per_s" for kind, unit in (("raw", "deg"), ("est", "rad")) for a in "xyz"]
+    accel = np.random.default_rng(5).normal(0.0, 3.0, (400, 3))
+    gyro = np.random.default_rng(6).normal(0.0, 30.0, (400, 3))
+    t_s = np.arange(400) / 90.0
+    estimated = np.tile([0.0, 0.01, 1.0], (400, 1)) + 0.01 * accel
+    path = write_csv(tmp_path / "rocket.csv", names, [t_s, *accel.T, *estimated.T, *gyro.T, *np.deg2rad(gyro).T])
+    imu = table.read_sequence(table.sequences(path)[0]).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * accel)
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro))
