@@ -21,7 +21,7 @@ from ._table_times import rises
 
 SENSORS = {  # words in the names of files and of sensors
     "gyro": r"gyr|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
-    "accel": r"acce?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
+    "accel": r"acc[el]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
 }
 OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
 UNCORRECTED = r"uncal|uncalib|uncalibrated|raw"  # taken where nothing else is there
@@ -170,7 +170,10 @@ def _words(name: str) -> list[str]:
 
 
 def _axes(names: list[str]) -> dict[str, str]:
-    """Columns of the first three that differ by x, y, z alone."""
+    """Columns of the first three that differ by x, y, z alone, or by their place in an array."""
+    places = {name: "xyz"[int(match[1])] for name in names if (match := re.search(r"\[([0-2])\]$", name))}
+    if len(places) == 3 and len({name[:-3] for name in places}) == 1:
+        return places
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for name in names:
         words = _words(name)

@@ -82,13 +82,13 @@ def units_of_time(first: float, step: float) -> list[str]:
 def rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:
     """Line of a map that counts rows, where several have one stamp."""
     first, last = float(values[0]), float(values[-1])
-    step = (last - first) / max(len(values) - 1, 1)
+    step = (last - first) / max(int(np.argmax(values == values[-1])), 1)  # the last rows have one stamp, too
     units = [unit] if unit in TIME_NS else units_of_time(first, step)
     if not step > 0.0 or len(units) != 1:
         return []
     rate = 1e9 / (step * TIME_NS[units[0]])
     return [
-        f"rate_hz = {rate:.4g}  # in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"
+        f"rate_hz = {rate:.6g}  # in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"
     ]
 
 

@@ -1,4 +1,4 @@
-"""Table with a map of its columns: CSV, TSV, Parquet, .npz, MATLAB .mat or HDF5.
+"""Table with a map of its columns: CSV, TSV, JSON, Parquet, .npz, MATLAB .mat or HDF5.
 
 Columns and units are recognised from their names. What stays open is asked for: the refusal holds a map file to complete.
 """
@@ -34,7 +34,7 @@ from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
-LARGEST_NS = 2**63 - 1
+LARGEST_NS, MOST_LOSSES = 2**63 - 1, 8  # losses in a refusal
 DATA_FILE = "data.hdf5"
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
@@ -112,7 +112,8 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
     for topic, proposal in proposals.items():
         if proposal.open:
             names = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
-            reasons = "; ".join(proposal.reasons + remarks.losses)
+            more = f"; and {len(remarks.losses) - MOST_LOSSES} more losses" if len(remarks.losses) > MOST_LOSSES else ""
+            reasons = "; ".join(proposal.reasons + remarks.losses[:MOST_LOSSES]) + more
             raise ConfigError(
                 f"the meaning of its columns is not certain: {reasons}. Its columns are {names}",
                 where=path,
@@ -142,10 +143,8 @@ def _mapped(columns: Columns, mapping: Path) -> list[TableMap]:
         raise ConfigError(what, where=mapping, expected="gyro = [x, y, z] and accel = [x, y, z]")
     own = ("gyro", "accel") if table.time or table.rate_hz else ("gyro", "accel", "time")
     for topic, entries in named.items():
-        if "time" in own and not entries.get("time"):
-            raise ConfigError(
-                f"names no time, and the columns show none for {topic}", where=mapping, expected="`time`, or `rate_hz`"
-            )
+        if not {*own} <= entries.keys():
+            raise ConfigError(f"names no time, and {topic} shows none", where=mapping, expected="`time`, or `rate_hz`")
     return [
         msgspec.convert(msgspec.structs.asdict(table) | {s: entries[s] for s in own} | {"topic": topic}, TableMap)
         for topic, entries in named.items()
