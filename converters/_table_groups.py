@@ -124,6 +124,19 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     return found
 
 
+def turned(columns: Columns, entries: Entries) -> Entries:
+    """Entries with the orientations that a sensor gives beside its rates, where they name no poses."""
+    if "quaternion_wxyz" in entries:
+        return entries
+    group, length = group_of(entries["gyro"][0]), len(columns.values[str(entries["time"])])
+    beside = [c for c, values in columns.values.items() if group_of(c) == group and len(values) == length]
+    leaves = {split_name(column.removeprefix(group))[0]: column for column in beside}
+    four = _axes(QUATERNION_ARRAY, leaves, "0123")
+    clock = str(entries["time"]), str(entries["time_unit"])
+    found = _axes(QUATERNION, leaves, "wxyz") or (order_by_motion(columns, entries, four, clock) if four else [])
+    return entries | ({"quaternion_wxyz": found, "truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
+
+
 def has_poses(columns: Columns) -> bool:
     """Whether a table has positions and quaternions, in whatever order."""
     leaves = {split_name(column)[0]: column for column in columns.values}

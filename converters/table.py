@@ -23,7 +23,7 @@ from . import Sequence
 from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_folder import POSES_GROUP, TRUTH_GROUP, is_split, load_split
-from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside
+from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
 from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
 from ._table_packed import table_name
 from ._table_propose import propose
@@ -156,8 +156,9 @@ def _proposal(columns: Columns) -> Proposal:
     proposal = known_layout(columns) or propose(columns)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
-    if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, proposal.entries)):
-        proposal.settle_gyro_unit(unit, f"the poses turn as far as a gyro in {unit} says")
+        if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, turned(columns, proposal.entries))):
+            kind = "poses" if "quaternion_wxyz" in proposal.entries else "orientations"
+            proposal.settle_gyro_unit(unit, f"the {kind} turn as far as a gyro in {unit} says")
     return proposal
 
 

@@ -214,3 +214,15 @@ def test_quaternions_that_turn_otherwise_stay_numbers(tmp_path):
     log = read(tmp_path / "trial.mat")
     assert log.poses == {}
     assert "/opt_quat_3" in log.scalars
+
+
+@pytest.mark.parametrize(("unit", "size"), [("rad/s", 1.0), ("deg/s", 180.0 / np.pi)])
+@pytest.mark.parametrize("names", [[f"Quat_{a}" for a in "wxyz"], [f"q{n}" for n in range(4)]])
+def test_the_orientation_beside_the_rates_shows_their_unit(tmp_path, unit, size, names):
+    """Of a body that walks, gravity does not show it."""
+    header = ["time [s]", *(f"Acc_{a} [m/s^2]" for a in "XYZ"), *(f"Gyr_{a}" for a in "XYZ"), *names]
+    walking = np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 3.0, (COUNT, 3))
+    log = read(write_csv(tmp_path / "xsens.csv", header, [T_S, *walking.T, *(size * GYRO).T, *Q_WXYZ.T]))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-12)
+    assert f"the orientations turn as far as a gyro in {unit} says" in log.remarks.notes
+    assert log.poses == {}
