@@ -114,7 +114,7 @@ def _propose_sensor(
         is_motion = is_motion_alone(columns, chosen) and not re.search(r"(^|_)raw(_|$)", spaced[chosen[0]])
         if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or is_motion or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
             proposal.open.append("accel")
-            why = ", and its directions cancel out" if is_motion else ""
+            why = ", and all cancel out" if is_motion else ""
             proposal.reasons.append(
                 f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}{why}: gravity was taken out"
             )
@@ -198,16 +198,15 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     counters = counters_of(columns, length or len(columns.values.get(proposal.entries.get("accel", [""])[0], ())))
     measured = {*counters, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
-    # of each table, without a count of rows; further columns may rise as a temperature does
-    firsts = {_table_of(c): c for c in reversed(names) if c not in counters}
-    rising = [
-        c
-        for c in firsts.values()
-        if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])
-    ]
-    if not found and len(rising) == 1:
-        proposal.reasons.append(f"{rising[0]!r} is the first column and rises: it counts as the time")
-        found = rising
+    if not found:
+        # of each table, without a count of rows; further columns may rise as a temperature does
+        firsts = {_table_of(c): c for c in reversed(names) if c not in counters}.values()
+        fits = [c for c in names if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])]
+        clocks = [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS]
+        rising = [c for c in fits if c in firsts]
+        found = clocks if len(clocks) == 1 else rising if len(rising) == 1 else []
+        why = "alone rises in a unit of time" if len(clocks) == 1 else "is the first column and rises"
+        proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
     if not found:
         for column in still:
             values = columns.values[column]

@@ -135,6 +135,18 @@ def test_row_numbers_beside_a_count_of_samples_are_no_time(tmp_path):
     assert 'rate_hz = "?"' in refused.value.fix
 
 
+def test_a_clock_behind_other_columns_is_the_time(tmp_path):
+    clock = [f"16:24:{4 + n // 250:02d}.{n % 250 * 4:03d}" for n in range(1000)]
+    rows = [
+        f"@ LOG {7} {t} {' '.join(map(repr, row))}"
+        for t, row in zip(clock, np.hstack([GYRO, ACCEL])[:1000].tolist(), strict=True)
+    ]
+    (tmp_path / "raven.txt").write_text("\n".join(rows) + "\n")
+    with pytest.raises(ConfigError, match="'column 4' alone rises in a unit of time: it counts as the time") as refused:
+        read(tmp_path / "raven.txt")
+    assert 'time = "column 4"\ntime_unit = "ns"\n' in refused.value.fix
+
+
 def test_recordings_in_one_structure_keep_their_own_times(tmp_path):
     """Also those with as many samples, and the columns beside an IMU."""
     trial = {"t": T_S, "acc": ACCEL, "gyr": GYRO, "mag": ACCEL}
