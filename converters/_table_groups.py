@@ -125,7 +125,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
 
 
 def turned(columns: Columns, entries: Entries) -> Entries:
-    """Entries with the orientations that a sensor gives beside its rates, where they name no poses."""
+    """Entries with the orientations beside a sensor's rates, where they name no poses."""
     if "quaternion_wxyz" in entries:
         return entries
     group, length = group_of(entries["gyro"][0]), len(columns.values[str(entries["time"])])
