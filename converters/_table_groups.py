@@ -9,7 +9,7 @@ from ._table_map import IMU_TOPIC, Entries, Proposal
 from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name, triples
 from ._table_rotations import order_by_motion
 from ._table_text import Columns
-from ._table_times import rises
+from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
@@ -165,7 +165,7 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     while group and not other:
         for wanted, values in columns.values.items():
             is_time = group_of(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
-            if is_time and len(values) == len(columns.values[column]) and rises(values):
+            if is_time and len(values) == len(columns.values[column]) and goes_on(values):
                 other = other or wanted
         group = group_of(group)
     if other in ("", time):

@@ -31,6 +31,7 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
 ]
 LOOKED_AT = 200  # first lines, which show the words between the numbers
 LEAST_ROWS, LEAST_SHARE = 5, 0.5  # of the lines looked at that have the same words
+LEAST_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
@@ -76,9 +77,20 @@ def _halves(columns: Columns, names: list[str]) -> _Halves | None:
 
 
 def _has_gravity(columns: Columns, triple: list[str]) -> bool:
-    """Whether three columns have the size of gravity; zeros beside a one, as of a pose, have not."""
-    whole = all(np.isin(columns.values[name], (-1, 0, 1)).all() for name in triple)
-    return bool(gravity_units(columns, triple)[1]) and not whole
+    """Whether three columns have the size of gravity, and seldom less, as rates of a fast flight about 1 rad/s have.
+
+    Zeros beside a one, as of a pose, have not.
+    """
+    values = np.stack([columns.values[name].astype(float) for name in triple])
+    level, near = gravity_units(columns, triple)
+    tenth = float(np.nanquantile(np.linalg.norm(values, axis=0), 0.1))
+    return bool(near) and tenth > LEAST_TENTH * level and not np.isin(values, (-1, 0, 1)).all()
+
+
+def _place_of_time(columns: Columns) -> int:
+    """Place of the time in a table without a header: 1 behind a number of the row, else 0."""
+    first, second = ([*columns.values.values()][:2] + [np.zeros(0)] * 2)[:2]
+    return int(first.dtype.kind in "iu" and len(first) > 1 and bool((np.diff(first) == 1).all()) and rises(second))
 
 
 def name_headerless(columns: Columns) -> None:
@@ -89,8 +101,12 @@ def name_headerless(columns: Columns) -> None:
         return
     if width == len(ROS_IMU) and [*columns.values] == [*numbered[:2], *numbered[3:]]:
         new, why = ROS_IMU, "it has the columns of `ros2 topic echo --csv` of sensor_msgs/Imu"
-    elif [*columns.values] == numbered and (halves := _halves(columns, numbered)) and width == len(halves.time) + 6:
-        new = ["time"] * len(halves.time) + [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
+    elif [*columns.values] == numbered and (halves := _halves(columns, numbered[_place_of_time(columns) :])):
+        count = width - len(halves.time) - 6
+        if count != _place_of_time(columns):
+            return
+        new = [*["count"] * count, *["time"] * len(halves.time)]
+        new += [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
         place = width - 5 if halves.sensors[0] == "accel" else width - 2
         why = f"it has no header: columns {place} to {place + 2} show gravity and count as the accel"
     else:

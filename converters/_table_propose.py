@@ -196,7 +196,8 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
         found.sort(key=lambda c: (_table_of(c) != _table_of(gyro), -shared_group(c, gyro)))
         found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
-    counters = counters_of(columns, length or len(columns.values.get(proposal.entries.get("accel", [""])[0], ())))
+    shown = proposal.entries.get("accel", [*names])[:1]
+    counters = counters_of(columns, length or len(columns.values[shown[0]]) if shown else 0)
     measured = {*counters, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
     if not found:
         # of each table, without a count of rows; further columns may rise as a temperature does

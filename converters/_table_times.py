@@ -76,7 +76,9 @@ def units_of_time(first: float, step: float) -> list[str]:
     """
     rates = {unit: 1e9 / (step * size) for unit, size in USUAL_TIME_NS.items() if step > 0.0}
     epochs = [u for u, hz in rates.items() if SLOWEST_HZ[0] <= hz <= PLAUSIBLE_HZ[1] and 1e18 < first * TIME_NS[u] < 4e18]
-    return epochs or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz < PLAUSIBLE_HZ[1]]
+    whole_s = epochs == ["s"] and float(first).is_integer() and float(step).is_integer()  # or ms since a boot weeks ago
+    fast = [unit for unit, hz in rates.items() if PLAUSIBLE_HZ[0] <= hz < PLAUSIBLE_HZ[1]] if whole_s else []
+    return epochs + fast or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz < PLAUSIBLE_HZ[1]]
 
 
 def rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:

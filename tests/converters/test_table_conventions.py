@@ -441,3 +441,20 @@ def test_readings_count_before_estimates_and_words_for_units_are_known(tmp_path)
     imu = table.read_sequence(table.sequences(path)[0]).imus["/imu0"]
     np.testing.assert_allclose(imu.accel, 9.80665 * accel)
     np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro))
+
+
+@pytest.mark.parametrize("with_number", [False, True])
+def test_rates_of_about_one_are_no_gravity_and_a_row_number_is_no_time(tmp_path, with_number):
+    rng, count = np.random.default_rng(4), 2000
+    t_s, gyro = 4908.0 + np.arange(count) / 500.0, rng.normal(0.0, 0.65, (count, 3))
+    number = [np.arange(count)] if with_number else []
+    rest = rng.normal([0.0, 0.0, 9.81], 0.3, (count, 3))
+    for name, accel, found in (("calm", rest, True), ("race", 1.3 * rest, False)):
+        columns = [*number, t_s, *gyro.T, *accel.T]
+        path = write_csv(tmp_path / f"{name}.txt", [f"{value!r}" for value in range(len(columns))], columns, " ")
+        path.write_text(path.read_text().partition("\n")[2])
+        with pytest.raises(ConfigError) as refused:
+            table.read_sequence(table.sequences(path)[0])
+        assert ('gyro = ["gyro_x", "gyro_y", "gyro_z"]' in refused.value.fix) is found
+        assert f'time = "{"time" if found else "column 2" if with_number else "column 1"}"' in refused.value.fix
+        assert 'time_unit = "s"\n' in refused.value.fix
