@@ -35,7 +35,7 @@ CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
-    r"|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
+    r"|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
     "accel": r"accel(eration|erometer)?|acc[el]?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
     r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }

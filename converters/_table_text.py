@@ -212,6 +212,8 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
     rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
     rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) < MOSTLY * width]  # CAL, CAL, ...
+    if len(rows) > 2 and _are_units(rows[-2]) and len({*rows[-1]} - {""}) < len(rows[-1]) / 2:
+        rows.pop()  # below the units RaceChrono writes the device of each column
     units: list[str] = []
     axes = bool(rows) and {"x", "y", "z"} <= {text.lower() for text in rows[-1]}
     if (len(rows) > 1 and not axes) and (
@@ -228,6 +230,12 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
         names, units = (names, units) if _repeats(joint) else (joint, units or below)
     names = _distinct(names)
     return names, dict(zip(names, units, strict=True)) if units else {}
+
+
+def _are_units(texts: list[str]) -> bool:
+    """Whether a row states units: what repeats in it is short, and some are known."""
+    known = sum(bool(unit_named(text)) for text in texts)
+    return known > len(texts) / 5 and all(UNIT_TEXT.fullmatch(text) for text in texts)
 
 
 def _below_groups(groups: list[str], names: list[str], between: str) -> tuple[list[str], list[str]]:

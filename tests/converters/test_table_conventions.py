@@ -446,7 +446,7 @@ def test_readings_count_before_estimates_and_words_for_units_are_known(tmp_path)
 @pytest.mark.parametrize("with_number", [False, True])
 def test_rates_of_about_one_are_no_gravity_and_a_row_number_is_no_time(tmp_path, with_number):
     rng, count = np.random.default_rng(4), 2000
-    t_s, gyro = 4908.0 + np.arange(count) / 500.0, rng.normal(0.0, 0.65, (count, 3))
+    t_s, gyro = 4908.0 + np.arange(count) / 500.0, rng.normal([0.5, 0.0, 0.0], 0.6, (count, 3))
     number = [np.arange(count)] if with_number else []
     rest = rng.normal([0.0, 0.0, 9.81], 0.3, (count, 3))
     for name, accel, found in (("calm", rest, True), ("race", 1.3 * rest, False)):
@@ -458,3 +458,21 @@ def test_rates_of_about_one_are_no_gravity_and_a_row_number_is_no_time(tmp_path,
         assert ('gyro = ["gyro_x", "gyro_y", "gyro_z"]' in refused.value.fix) is found
         assert f'time = "{"time" if found else "column 2" if with_number else "column 1"}"' in refused.value.fix
         assert 'time_unit = "s"\n' in refused.value.fix
+
+
+def test_a_row_of_devices_below_the_units_hides_no_names(tmp_path):
+    """RaceChrono's CSV, of a phone in a car: the names, the units, and who measured."""
+    names = ["timestamp", "lap_number", "speed", *(f"{a}_acc" for a in "xyz"), *(f"{a}_rate_of_rotation" for a in "xyz")]
+    units = ["unix time", "", "m/s", "G", "G", "G", "deg/s", "deg/s", "deg/s"]
+    devices = ["", "", "100: gps", *["200: acc"] * 3, *["300: gyro"] * 3]
+    rng = np.random.default_rng(8)
+    gyro, accel = rng.normal(0.0, 9.0, (200, 3)), rng.normal([0.0, 0.0, 1.0], 0.1, (200, 3))
+    rows = [
+        f"{1767150797 + n / 50:.2f},3,8.0,{','.join(map(repr, row))}" for n, row in enumerate(np.hstack([accel, gyro]).tolist())
+    ]
+    head = ["This file is created using RaceChrono Pro", "Format,3", "", *(",".join(row) for row in (names, units, devices))]
+    (tmp_path / "lap.csv").write_text("\n".join([*head, *rows]) + "\n")
+    imu = table.read_sequence(table.sequences(tmp_path / "lap.csv")[0]).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro))
+    np.testing.assert_allclose(imu.accel, 9.80665 * accel)
+    assert imu.t_ns[0] == 1_767_150_797 * 10**9
