@@ -16,6 +16,7 @@ import numpy as np
 
 from imutool.errors import DataError
 
+from ._table_headerless import name_headerless
 from ._table_packed import read_bytes
 from ._table_sensors import name_columns, read_rows, sensors_among
 from ._table_text import Columns, read_csv
@@ -47,6 +48,7 @@ def load_json(path: Path, columns: Columns) -> None:
             columns.add(name, np.array([np.nan if value is None else value for value in node]))
         else:
             columns.numbers[name] = float(node)
+    name_headerless(columns)
     sensors = sensors_among(tables) if len(tables) > 1 else {}
     for name, rows in tables.items():
         part, text = Columns(), _text(rows)

@@ -99,6 +99,14 @@ def test_batches_of_samples_are_rows_and_their_rate_is_proposed(tmp_path):
     assert np.diff(imu.t_ns)[0] == pytest.approx(75e6 / 8, rel=1e-5)
 
 
+def test_lists_a_line_are_a_table_without_a_header(tmp_path):
+    """As Python prints them."""
+    text = "".join(f"{[t / 1000, *g, *(np.array(a) + 0.01 * n % 2)]}\n" for n, (t, g, a) in enumerate(SAMPLES))
+    imu = read(tmp_path / "log.txt", text.replace("np.float64(", "").replace(")", "")).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO)
+    assert np.array_equal(imu.t_ns, 10_000_000 * np.arange(COUNT))
+
+
 def test_other_json_is_refused_in_one_sentence(tmp_path):
     (tmp_path / "cut.json").write_text(json.dumps(FLAT)[:-40])
     with pytest.raises(DataError, match="begins as JSON and cannot be read"):
