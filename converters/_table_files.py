@@ -1,4 +1,4 @@
-"""Table files: CSV, TSV, Parquet, .npz, MATLAB .mat and HDF5, by their first bytes."""
+"""Table files: CSV, TSV, JSON, Parquet, .npz, MATLAB .mat and HDF5, by their first bytes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from imutool.errors import DataError, required
 
 from ._archive import refusing
 from ._table_headerless import as_table, name_headerless
+from ._table_json import is_json, load_json
 from ._table_mocap import is_mocap, read_mocap
 from ._table_packed import opener, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
@@ -32,16 +33,17 @@ def kind_of(head: bytes, path: Path) -> str:
         return "mat"
     if head.startswith(HDF5) or head[512:].startswith(HDF5):
         return "hdf5"
-    if head.startswith(PARQUET):
-        return "parquet"
+    if head.startswith((PARQUET, OLD_EXCEL)):
+        return "parquet" if head.startswith(PARQUET) else "sheet"
     if head.startswith(ZIP):
         names = _members(path)
         if any(name.endswith(".npy") for name in names) or names & {*SHEETS}:
             return "sheet" if names & {*SHEETS} else "npz"
-    if head.startswith(OLD_EXCEL):
-        return "sheet"
     text = text_head(path) if opener(head) else head
-    is_table = is_text_table(text) or (b"\0" not in text and (as_table(text_of(text))[0] or is_mocap(text_of(text))))
+    words = "" if b"\0" in text else text_of(text)
+    if is_json(words) and not as_table(words)[0]:
+        return "json"
+    is_table = is_text_table(text) or (words and (as_table(words)[0] or is_mocap(words)))
     return "csv" if is_table else ""
 
 
@@ -213,6 +215,7 @@ def _module(name: str, path: Path) -> Any:
 
 LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "csv": _load_csv,
+    "json": load_json,
     "parquet": _load_parquet,
     "npz": _load_npz,
     "mat": _load_mat,

@@ -9,7 +9,7 @@ from ._table_map import IMU_TOPIC, Entries, Proposal
 from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name, triples
 from ._table_rotations import order_by_motion
 from ._table_text import Columns
-from ._table_times import rises
+from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
@@ -124,6 +124,19 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     return found
 
 
+def turned(columns: Columns, entries: Entries) -> Entries:
+    """Entries with the orientations beside a sensor's rates, where they name no poses."""
+    if "quaternion_wxyz" in entries:
+        return entries
+    group, length = group_of(entries["gyro"][0]), len(columns.values[str(entries["time"])])
+    beside = [c for c, values in columns.values.items() if group_of(c) == group and len(values) == length]
+    leaves = {split_name(column.removeprefix(group))[0]: column for column in beside}
+    four = _axes(QUATERNION_ARRAY, leaves, "0123")
+    clock = str(entries["time"]), str(entries["time_unit"])
+    found = _axes(QUATERNION, leaves, "wxyz") or (order_by_motion(columns, entries, four, clock) if four else [])
+    return entries | ({"quaternion_wxyz": found, "truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
+
+
 def has_poses(columns: Columns) -> bool:
     """Whether a table has positions and quaternions, in whatever order."""
     leaves = {split_name(column)[0]: column for column in columns.values}
@@ -152,7 +165,7 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     while group and not other:
         for wanted, values in columns.values.items():
             is_time = group_of(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
-            if is_time and len(values) == len(columns.values[column]) and rises(values):
+            if is_time and len(values) == len(columns.values[column]) and goes_on(values):
                 other = other or wanted
         group = group_of(group)
     if other in ("", time):
@@ -177,6 +190,12 @@ def is_true(column: str) -> bool:
 def group_of(column: str) -> str:
     """Group of a column: `mocap` of `mocap/v [m/s]`, and of a structure's `mocap.position[0]`."""
     return re.sub(r"(^|[/.])[^/.]*$", "", re.sub(r"\s*[\[(][^\])]*[\])]\s*$", "", column))
+
+
+def shared_group(time: str, column: str) -> int:
+    """Depth of a time's group, if a column is in it; -1 otherwise."""
+    around, own = ([part for part in re.split(r"[/.]", group_of(each)) if part] for each in (time, column))
+    return len(around) if own[: len(around)] == around else -1
 
 
 def _columns_of(entries: Entries) -> set[str]:

@@ -12,6 +12,8 @@ from collections import Counter
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
 from ._table_names import unit_named
 from ._table_text import Columns
 from ._table_times import rises
@@ -29,6 +31,7 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
 ]
 LOOKED_AT = 200  # first lines, which show the words between the numbers
 LEAST_ROWS, LEAST_SHARE = 5, 0.5  # of the lines looked at that have the same words
+LEAST_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
 NUMBER = re.compile(
@@ -51,7 +54,14 @@ class _Halves(NamedTuple):
 
 def perhaps(columns: Columns) -> list[str]:
     """Lines of a map for more columns without a header, of which the first look like an IMU."""
-    halves = _halves(columns, [name for name in columns.values if re.fullmatch(r"column \d{1,4}", name)])
+    groups: dict[str, list[str]] = {}
+    for name in columns.values:
+        if match := re.fullmatch(r"(.*/)?(column \d{1,4}|time)", name):
+            groups.setdefault(match[1] or "", []).append(name)
+    for names in groups.values():  # a number of a frame, which does not rise in each row, is no time
+        if (first := columns.values[names[0]]).dtype.kind in "iu" and not rises(first) and (np.diff(first) >= 0).all():
+            del names[0]
+    halves = next(filter(None, (_halves(columns, names) for names in groups.values())), None)
     if halves is None:
         return []
     triples = zip(halves.sensors, (halves.columns[:3], halves.columns[3:]), strict=True)
@@ -62,8 +72,25 @@ def _halves(columns: Columns, names: list[str]) -> _Halves | None:
     """The first six columns that are no time; None where not exactly one half shows gravity."""
     time = names[:1] if names and rises(columns.values[names[0]]) else []
     six = names[len(time) : len(time) + 6]
-    shows = [bool(gravity_units(columns, half)[1]) for half in (six[:3], six[3:])] if len(six) == 6 else []
+    shows = [_has_gravity(columns, half) for half in (six[:3], six[3:])] if len(six) == 6 else []
     return _Halves(time, six, ("accel", "gyro") if shows[0] else ("gyro", "accel")) if sum(shows) == 1 else None
+
+
+def _has_gravity(columns: Columns, triple: list[str]) -> bool:
+    """Whether three columns have the size of gravity, and seldom less, as rates of a fast flight about 1 rad/s have.
+
+    Zeros beside a one, as of a pose, have not.
+    """
+    values = np.stack([columns.values[name].astype(float) for name in triple])
+    level, near = gravity_units(columns, triple)
+    tenth = float(np.nanquantile(np.linalg.norm(values, axis=0), 0.1))
+    return bool(near) and tenth > LEAST_TENTH * level and not np.isin(values, (-1, 0, 1)).all()
+
+
+def _place_of_time(columns: Columns) -> int:
+    """Place of the time in a table without a header: 1 behind a number of the row, else 0."""
+    first, second = ([*columns.values.values()][:2] + [np.zeros(0)] * 2)[:2]
+    return int(first.dtype.kind in "iu" and len(first) > 1 and bool((np.diff(first) == 1).all()) and rises(second))
 
 
 def name_headerless(columns: Columns) -> None:
@@ -74,8 +101,12 @@ def name_headerless(columns: Columns) -> None:
         return
     if width == len(ROS_IMU) and [*columns.values] == [*numbered[:2], *numbered[3:]]:
         new, why = ROS_IMU, "it has the columns of `ros2 topic echo --csv` of sensor_msgs/Imu"
-    elif [*columns.values] == numbered and (halves := _halves(columns, numbered)) and width == len(halves.time) + 6:
-        new = ["time"] * len(halves.time) + [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
+    elif [*columns.values] == numbered and (halves := _halves(columns, numbered[_place_of_time(columns) :])):
+        count = width - len(halves.time) - 6
+        if count != _place_of_time(columns):
+            return
+        new = [*["count"] * count, *["time"] * len(halves.time)]
+        new += [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
         place = width - 5 if halves.sensors[0] == "accel" else width - 2
         why = f"it has no header: columns {place} to {place + 2} show gravity and count as the accel"
     else:

@@ -66,11 +66,12 @@ def read_map(path: Path) -> TableMap:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
     except (ValueError, RecursionError, msgspec.ValidationError) as error:
         raise ConfigError(f"is no map of a table ({error})", where=path) from error
-    if not (0.0 < table.rate_hz < np.inf) if not table.time else table.rate_hz:
+    own_times = not (table.gyro or table.time or table.rate_hz) and table.time_unit  # of several IMUs
+    if not own_times and (not (0.0 < table.rate_hz < np.inf) if not table.time else table.rate_hz):
         raise ConfigError(
             "has to name a time or a positive rate_hz", where=path, expected="`time` and `time_unit`, or `rate_hz`"
         )
-    needless = {"truth_time_unit", *([] if table.time else ["time_unit"])}
+    needless = {"truth_time_unit", *([] if table.time or own_times else ["time_unit"])}
     for name, units in UNITS_OF.items():
         if (unit := getattr(table, name)) not in units and (unit or name not in needless):
             raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
@@ -101,18 +102,18 @@ class Proposal(msgspec.Struct):
         self.reasons[:] = [each for each in self.reasons if each != NO_UNIT.format("gyro")] + [reason]
         self.entries["gyro_unit"] = unit
 
-    def toml(self, several: Sequence[str] = ()) -> str:
-        """The proposal as a map file, with a question behind what is open."""
+    def toml(self, several: Sequence[str] = (), *, own_times: bool = False) -> str:
+        """The proposal as a map file, with a question behind what is open; `several` are the topics of more than one IMU."""
         lines = [f"rate_hz = {self.rate_hz}"] if self.rate_hz else []
         lines += ['rate_hz = "?"  # please state: the samples a second, as a number'] if "rate_hz" in self.open else []
-        times = [] if lines else ["time", "time_unit"]
+        times = [] if lines else ["time_unit"] if own_times else ["time", "time_unit"]
         asked_for = (*times, "gyro_unit", "accel_unit") if several else (*times, "gyro", "gyro_unit", "accel", "accel_unit")
         left_out = {*asked_for, "time", "time_unit", *(("gyro", "accel") if several else ())}
         for name in (*asked_for, *(name for name in self.entries if name not in left_out)):
             value = self.entries.get(name, ["?", "?", "?"] if name in ("gyro", "accel") else "?")
             text = json.dumps(value, ensure_ascii=False)
             choices = " or ".join(UNITS_OF.get(name, ["the columns"]))
-            proposed = "these columns" if isinstance(value, list) else choices
+            proposed = "these columns" if isinstance(value, list) else "this column" if name == "counter" else choices
             asked = f"please confirm: {proposed}?" if name in self.entries else f"please state: {choices}"
             lines.append(f"{name} = {text}" + (f"  # {asked}" if name in self.open else ""))
         if several:

@@ -7,7 +7,7 @@ import re
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
 ROS_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_"  # of ROS' and PX4's messages, in SI units
 TIME_WORDS = (
-    rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
+    rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|cts|stamp|seconds|seconds_?elapsed|sec|epoch|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
@@ -18,7 +18,7 @@ UNITS = {
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "mg": r"mg",
-    "g": r"g",
+    "g": r"gs?",
     "ns": r"ns|nanoseconds?|nsec",
     "us": r"us|µs|microseconds?|usec",
     "ms": r"ms|milliseconds?|msecs?",
@@ -30,11 +30,12 @@ UNITS = {
     "mm": r"mm|millimet(er|re)s?",
 }
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
+ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth)(_|$)"  # no reading of a sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
-    r"|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
+    r"|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
     "accel": r"accel(eration|erometer)?|acc[el]?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
     r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
@@ -108,7 +109,8 @@ def split_name(column: str) -> tuple[str, str]:
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
         end := re.search(
-            r"(?:_in)?_(m?dps|(deg|rad)(_?(per_?)?s(ec(ond)?)?|ps)|mps2|ms2|m_(per_)?s_?2|mg|g|ns|us|ms|s|sec)$", name
+            r"(?:_in)?_(m?dps|(deg|rad)(_?(per_?)?s(ec(ond)?)?|ps)|mps2|ms2|m_(per_)?s_?2|mg|gs?|ns|us|ms|s|(nano|micro|milli)?sec(ond)?s?)$",
+            name,
         )
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))

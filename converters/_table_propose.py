@@ -10,11 +10,12 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.recording.joined_imu import in_order, unit_by_gravity
 
-from ._table_groups import is_true
+from ._table_groups import is_true, shared_group
 from ._table_headerless import perhaps
 from ._table_map import NO_UNIT, Proposal
 from ._table_names import (
     CORE_MOTION,
+    ESTIMATED,
     ROS_WORDS,
     TIME_WORDS,
     WITHOUT_GRAVITY,
@@ -25,13 +26,25 @@ from ._table_names import (
     unit_named,
 )
 from ._table_text import Columns
-from ._table_times import PLAUSIBLE_HZ, count_times, counter_of, goes_on, rises, stated_rate
+from ._table_times import (
+    MOST_SKIPPED,
+    PLAUSIBLE_HZ,
+    count_times,
+    counters_of,
+    counts_others,
+    goes_on,
+    rate_of_rows,
+    rises,
+    said_steps,
+    share_skipped,
+    stated_rate,
+    units_of_time,
+)
 from ._table_units import (
     ACCEL_SI,
     COUNTS_A_DPS,
     GYRO_SI,
     TIME_NS,
-    USUAL_TIME_NS,
     gravity_units,
     is_motion_alone,
     raw_counts,
@@ -39,9 +52,9 @@ from ._table_units import (
 )
 
 LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
-SLOWEST_HZ = 0.01, 0.9  # of samples with a time since 1970, and of others
 MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
+NO_IMU = ", and a recording of an IMU needs one"
 MOST_SHOWN = 12  # triples of columns in a message
 OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
 
@@ -72,14 +85,15 @@ def _propose_sensor(
     """Columns of the three axes, and their unit."""
     plain = {column: name for column, (name, _) in names.items()}
     spaced = {column: spaced_name(column) for column in names}
-    found = [*triples(sensor, plain, spaced).values()]
+    every = [*triples(sensor, plain, spaced).values()]
+    found = [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
     whole = _with_gravity(found, spaced, columns) if sensor == "accel" else found
     if len(whole) < len(found):
         proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
         shown = "".join(f"{': ' if n == 0 else ', '}{triple['x']}/y/z" for n, triple in enumerate(whole[:MOST_SHOWN]))
-        proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}{shown}")
+        proposal.reasons.append(f"{len(whole)} triples of columns look like the {sensor}{shown or NO_IMU}")
     if not whole:
         return
     chosen = [whole[0][axis] for axis in "xyz"]
@@ -97,10 +111,13 @@ def _propose_sensor(
         _propose_unit(proposal, sensor, columns)
     if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
         level, _ = gravity_units(columns, chosen)
-        is_motion = is_motion_alone(columns, chosen)
+        is_motion = is_motion_alone(columns, chosen) and not re.search(r"(^|_)raw(_|$)", spaced[chosen[0]])
         if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or is_motion or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
             proposal.open.append("accel")
-            proposal.reasons.append(f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}: gravity was taken out")
+            why = ", and all cancel out" if is_motion else ""
+            proposal.reasons.append(
+                f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}{why}: gravity was taken out"
+            )
 
 
 def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:
@@ -175,36 +192,36 @@ def _propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
     if "gyro" in proposal.entries:
-        group = _table_of(proposal.entries["gyro"][0])
-        found.sort(key=lambda c: _table_of(c) != group)
+        gyro = proposal.entries["gyro"][0]
+        found.sort(key=lambda c: (_table_of(c) != _table_of(gyro), -shared_group(c, gyro)))
         found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
-    counter = counter_of(columns, length or 0)
-    measured = {counter, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
-    # of each table, without a count of rows; further columns may rise as a temperature does
-    firsts = {_table_of(c): c for c in reversed(names) if c != counter}
-    rising = [
-        c
-        for c in firsts.values()
-        if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])
-    ]
-    if not found and len(rising) == 1:
-        proposal.reasons.append(f"{rising[0]!r} is the first column and rises: it counts as the time")
-        found = rising
+    shown = proposal.entries.get("accel", [*names])[:1]
+    counters = counters_of(columns, length or len(columns.values[shown[0]]) if shown else 0)
+    measured = {*counters, *proposal.entries.get("gyro", ()), *proposal.entries.get("accel", ())}
+    if not found:
+        # of each table, without a count of rows; further columns may rise as a temperature does
+        firsts = {_table_of(c): c for c in reversed(names) if c not in counters}.values()
+        fits = [c for c in names if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])]
+        clocks = [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS]
+        rising = [c for c in fits if c in firsts]
+        found = clocks if len(clocks) == 1 else rising if len(rising) == 1 else []
+        why = "alone rises in a unit of time" if len(clocks) == 1 else "is the first column and rises"
+        proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
     if not found:
         for column in still:
             values = columns.values[column]
             counts = f"{len(np.unique(values))} different values in {len(values)} rows"
             proposal.reasons.append(f"{column!r} is named as a time and does not rise: {counts}")
-            proposal.hints += _rate_of_rows(column, values, columns.units.get(column, "") or names[column][1])
-        _propose_rate(proposal, columns, counter, length)
+            proposal.hints += rate_of_rows(column, values, columns.units.get(column, "") or names[column][1])
+        _propose_rate(proposal, columns, next(iter(counters), ""), length)
         return
     column = proposal.entries["time"] = found[0]
     if re.match(OWN_TIME["gyro"], spelled[column][1]):
         own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
         proposal.entries |= {"accel_time": own[0]} if own else {}
     _propose_time_unit(proposal, column, names, columns)
-    if column == counter and "time_unit" in proposal.open:
+    if column in counters and "time_unit" in proposal.open:
         proposal.hints.append(
             f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
         )
@@ -227,7 +244,7 @@ def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[s
         proposal.entries["time_unit"] = counts
         proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")
         return
-    certain = _units_of_time(float(values[0]), step)
+    certain = units_of_time(float(values[0]), step)
     if len(certain) == 1 and (other := _another_pace(columns, column, certain[0], names)):
         proposal.open.append("time_unit")
         proposal.reasons.append(f"{column!r} would count {certain[0]}, but {other}")
@@ -252,34 +269,21 @@ def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tup
     return ""
 
 
-def _units_of_time(first: float, step: float) -> list[str]:
-    """Units in which a time since 1970 begins in this century, or else in which its step is one of an IMU.
-
-    A board that prints may be as slow as once a second, so a step of 1 may be a second or a millisecond.
-    """
-    rates = {unit: 1e9 / (step * size) for unit, size in USUAL_TIME_NS.items() if step > 0.0}
-    epochs = [u for u, hz in rates.items() if SLOWEST_HZ[0] <= hz <= PLAUSIBLE_HZ[1] and 1e18 < first * TIME_NS[u] < 4e18]
-    return epochs or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz < PLAUSIBLE_HZ[1]]
-
-
-def _rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:
-    """Line of a map that counts rows, where several have one stamp."""
-    first, last = float(values[0]), float(values[-1])
-    step = (last - first) / max(len(values) - 1, 1)
-    units = [unit] if unit in TIME_NS else _units_of_time(first, step)
-    if not step > 0.0 or len(units) != 1:
-        return []
-    rate = 1e9 / (step * TIME_NS[units[0]])
-    return [
-        f"rate_hz = {rate:.4g}  # in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"
-    ]
-
-
 def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:
     """Sampling rate of samples that are counted, in place of a time."""
     counted = f"{counter!r} counts the samples" if counter else "no column holds the time: rows are counted"
     rate = stated_rate(columns, proposal.entries.get("gyro", [""])[0])
-    proposal.entries |= {"counter": counter} if counter else {}
+    used = counter
+    if counter and counts_others(columns.values[counter]):
+        used = ""
+        counted = f"{counter!r} counts more than the samples ({said_steps(columns.values[counter])}): rows are counted"
+    elif counter and share_skipped(columns.values[counter]) > MOST_SKIPPED:
+        proposal.open.append("counter")
+        proposal.reasons.append(
+            f"{said_steps(columns.values[counter])} in {counter!r}: are samples missing, or does it count packets of other"
+            " sensors, too? For the second, leave it out of the map"
+        )
+    proposal.entries |= {"counter": used} if used else {}
     if rate is None:
         proposal.open += ["rate_hz"] if counter else ["time", "time_unit"]
         what = counted if counter else "no column that rises looks like a time"
@@ -288,4 +292,4 @@ def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: in
     proposal.rate_hz = rate[1]
     proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
     if length:
-        proposal.entries |= {"time": count_times(columns, rate[1], length, counter), "time_unit": "s"}
+        proposal.entries |= {"time": count_times(columns, rate[1], length, used), "time_unit": "s"}

@@ -9,17 +9,19 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from ._table_headerless import name_headerless
 from ._table_names import UNITS, split_name
-from ._table_text import COMMENTS, Columns, read_csv
+from ._table_text import COMMENTS, Columns, is_number, read_csv
 from ._table_times import rises
 
 SENSORS = {  # words in the names of files and of sensors
     "gyro": r"gyr|gyros?|gyroscopes?|gyroskop|giroscopio|giroscopo",
-    "accel": r"acce?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
+    "accel": r"acc[el]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
 }
 OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
 UNCORRECTED = r"uncal|uncalib|uncalibrated|raw"  # taken where nothing else is there
@@ -31,6 +33,10 @@ MOST_NAMES, LEAST_ROWS = 60, 20
 LOOKED_AT = 200_000  # first characters of a text, which show whether its rows name sensors
 NEAR_ONE = 0.01
 PLACES = 3  # first fields of a row, of which one may name its sensor
+KIND = r"[@$%/]?[A-Za-z][\w/.:-]*|/[\w/.:-]+"  # a word that names the kind of a row, or the device that it is of
+FLAGS = r"(?i)true|false|yes|no|on|off|ok|none|nan|[a-z]"  # words that a device writes of its state
+DEVICE = r"(?i)(sensor|device|imu|node|unit)([ _]?(id|no|nr|num(ber)?|index|name))?|id|mac|address"  # in a header
+BY_TURNS, LEAST_SHARE = 0.2, 0.1  # of rows that are of another device than the one before; of the rows, of each device
 
 
 def sensors_among(names: Iterable[str]) -> dict[str, str]:
@@ -47,7 +53,7 @@ def sensors_among(names: Iterable[str]) -> dict[str, str]:
 
 def read_rows(text: str, columns: Columns, path: Path) -> bool:
     """Add the columns of each sensor of a text whose rows name theirs; False for any other text."""
-    found = _sensor_rows(text[:LOOKED_AT])
+    found = _sensor_rows(text[:LOOKED_AT]) or _rows_of_kinds(text[:LOOKED_AT])
     if found is None:
         return False
     mark, place, sensors = found
@@ -68,6 +74,8 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
         group = sensors.get(name, name)
         if name in sensors:
             part.remarks.notes.append(f"its rows are the {group}")
+        if not sensors:
+            name_headerless(part)
         if part.values:
             android = ANDROIDS.get(group, "") if re.fullmatch(ANDROID, name) else ""
             name_columns(part, sensors.get(name, ""), split_name(name)[1] or android)
@@ -75,15 +83,46 @@ def read_rows(text: str, columns: Columns, path: Path) -> bool:
     return True
 
 
-def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
-    """Delimiter, place of the sensor's name in a row, and names of gyro and accel; None for any other text."""
+def _split_rows(start: str) -> tuple[str, list[list[str]]]:
+    """Delimiter of the first whole lines of a text, and their fields."""
     lines = [line for line in start.splitlines()[:-1] if line.strip() and not line.startswith(COMMENTS)]
     marks = Counter(mark for line in lines for mark in ";\t, " if line.count(mark) >= PLACES)  # of equals the first
-    if not marks:
-        return None
-    mark = marks.most_common(1)[0][0]
-    rows = [line.split(mark) for line in lines]
+    mark = marks.most_common(1)[0][0] if marks else ""
+    return mark, [line.split(mark) for line in lines] if mark else []
+
+
+def _rows_of_kinds(start: str) -> tuple[str, int, dict[str, str]] | None:
+    """Delimiter and place of a word by which rows are of several kinds; None for any other text.
+
+    Rows of kinds have different numbers of fields (`IMU 0.1 ...`, `LANDMARK 0.1 3 ...`), or come by turns, as those of
+    several devices do. Labels of what a person does come in long runs.
+    """
+    mark, rows = _split_rows(start)
+    header = rows.pop(0) if rows and not any(map(is_number, rows[0])) else []
     for place in range(PLACES):
+        kinds = [row[place].strip().strip('"') for row in rows if len(row) > place]
+        counts = Counter(kinds)
+        by_name = place < len(header) and re.fullmatch(DEVICE, header[place].strip())
+        if not 2 <= len(counts) <= MOST_NAMES or len(kinds) < LEAST_ROWS * len(counts):
+            continue
+        are_words = all(re.fullmatch(KIND, kind) for kind in counts)
+        widths: dict[str, set[int]] = {}
+        for row, kind in zip(rows, kinds, strict=False):
+            widths.setdefault(kind, set()).add(len(row))
+        apart = len(set.union(*widths.values())) > 1 and (are_words or all(len(each) == 1 for each in widths.values()))
+        turns = sum(one != other for one, other in pairwise(kinds)) / len(kinds)
+        by_turns = turns > BY_TURNS and min(counts.values()) > LEAST_SHARE * len(kinds) / len(counts)
+        if not header and apart:
+            return mark, place, {}
+        if by_turns and (by_name or (are_words and not any(re.fullmatch(FLAGS, kind) for kind in counts))):
+            return mark, place, {}
+    return None
+
+
+def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
+    """Delimiter, place of the sensor's name in a row, and names of gyro and accel; None for any other text."""
+    mark, rows = _split_rows(start)
+    for place in range(PLACES if rows else 0):
         counts = Counter(row[place].strip() for row in rows if len(row) > place)
         sensors = sensors_among(name for name, count in counts.items() if count >= LEAST_ROWS)
         if len(counts) <= MOST_NAMES and {*sensors.values()} == {*SENSORS}:
@@ -131,7 +170,10 @@ def _words(name: str) -> list[str]:
 
 
 def _axes(names: list[str]) -> dict[str, str]:
-    """Columns of the first three that differ by x, y, z alone."""
+    """Columns of the first three that differ by x, y, z alone, or by their place in an array."""
+    places = {name: "xyz"[int(match[1])] for name in names if (match := re.search(r"\[([0-2])\]$", name))}
+    if len(places) == 3 and len({name[:-3] for name in places}) == 1:
+        return places
     found: dict[tuple[str, ...], dict[str, str]] = {}
     for name in names:
         words = _words(name)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ MAX_LINE = 65_536
 LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 LEAST_NUMBERS = 4  # in a row: a time and a vector
 MOSTLY = 0.8  # share of columns above which a text says nothing of a column
+LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table
 COMMENTS = "#", "%", "//"
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
@@ -126,10 +128,11 @@ def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:
     """Whether a line has `least` numbers."""
-    return not line.startswith(COMMENTS) and sum(map(_is_number, line.split(delimiter))) >= least
+    return not line.startswith(COMMENTS) and sum(map(is_number, line.split(delimiter))) >= least
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a field is a number, perhaps with a decimal comma."""
     text = text.strip().strip('"')
     if "_" in text:  # Python reads 2026_06_15 as a number, nobody else does
         return False
@@ -159,18 +162,19 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     ends = {len(row) for row in _fields(lines[:first], delimiter) if row and row[-1].strip()}
     while rows and len(rows[0]) > 1 and len(rows[0]) not in ends and all(row[-1] == "" for row in rows):
         rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
-    width = max(map(len, rows), default=0)
+    width = _width(rows, _fields(lines[:first], delimiter))
     names, units = _header(lines[:first], delimiter, width)
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
     commas: list[str] = []
     empty: list[str] = []
-    for name, fields in zip(names, zip(*whole, strict=True), strict=True):
+    for place, (named, fields) in enumerate(zip(names, zip(*whole, strict=True), strict=True), 1):
         texts = [text.strip().strip('"') for text in fields]
         if not any(texts):
-            empty.append(name)
+            empty.append(named)
             continue
+        name = named or f"column {place}"
         if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
             texts[:] = [text.replace(",", ".") for text in texts]
             commas.append(name)
@@ -183,10 +187,20 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
             columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
         else:
             columns.remarks.losses.append(f"{name} is left out: its fields, as {texts[0][:40]!r}, are no numbers")
-    if named := ", ".join(filter(None, empty)):
-        columns.remarks.notes.append(f"columns without a value are left out: {named}")
+    if left := ", ".join(filter(None, empty)):
+        columns.remarks.notes.append(f"columns without a value are left out: {left}")
     if commas:
         columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
+
+
+def _width(rows: list[list[str]], above: list[list[str]]) -> int:
+    """Number of fields of most rows, of those that the header has names for if there are any; of equals the larger.
+
+    A row may be longer than its table: two that a board wrote at once, or a note.
+    """
+    counts = Counter(map(len, rows))
+    named = {len(row) for row in above} & {width for width, count in counts.items() if count > LEAST_NAMED * len(rows)}
+    return max(named or counts, key=lambda width: (counts[width], width), default=0)
 
 
 def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[str], dict[str, str]]:
@@ -198,6 +212,8 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
     rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
     rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) < MOSTLY * width]  # CAL, CAL, ...
+    if len(rows) > 2 and _are_units(rows[-2]) and len({*rows[-1]} - {""}) < len(rows[-1]) / 2:
+        rows.pop()  # below the units RaceChrono writes the device of each column
     units: list[str] = []
     axes = bool(rows) and {"x", "y", "z"} <= {text.lower() for text in rows[-1]}
     if (len(rows) > 1 and not axes) and (
@@ -214,6 +230,12 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
         names, units = (names, units) if _repeats(joint) else (joint, units or below)
     names = _distinct(names)
     return names, dict(zip(names, units, strict=True)) if units else {}
+
+
+def _are_units(texts: list[str]) -> bool:
+    """Whether a row states units: what repeats in it is short, and some are known."""
+    known = sum(bool(unit_named(text)) for text in texts)
+    return known > len(texts) / 5 and all(UNIT_TEXT.fullmatch(text) for text in texts)
 
 
 def _below_groups(groups: list[str], names: list[str], between: str) -> tuple[list[str], list[str]]:

@@ -12,15 +12,20 @@ from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
 from ._table_text import Columns
+from ._table_units import TIME_NS, USUAL_TIME_NS
 
 NS = 10**9
 COUNTED = "#counted "  # begins the name of a column of times that are counted
 PLAUSIBLE_HZ = 5.0, 10_000.0
+SLOWEST_HZ = 0.01, 0.9  # of samples with a time since 1970, and of others
 OF = r"imu|gyr(o(scope)?)?|acce?(l(erometer)?)?|sensors?|data|log(ging)?|record(ing)?|acquisition|sampl(e|ing)|update|output"
 RATE = rf"(({OF})_?)*(fs|f_?samp|srate|odr|hz|rate|freq|frequency)(_({OF}))*"  # no baud rate, no rate of frames
 PERIOD = rf"(({OF})_?)*(dt|delta_?t|period|interval)|sampl(e|ing)_?time"
 PERIOD_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+COUNTER = r"packet|count|index|seq|frame|sample(?![ _]?time)"  # in the name of a column that counts
 MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
+MOST_SKIPPED = 0.1  # share of a counter's steps that lost samples make longer; more may be packets of other sensors
+MOST_ODD = 0.01  # share of its steps that are no multiple of the usual one
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
 
 
@@ -64,29 +69,82 @@ def stated_rate(columns: Columns, gyro: str) -> tuple[str, float] | None:
     return next(iter(found.items()))
 
 
-def counter_of(columns: Columns, length: int) -> str:
-    """Column of this length that counts samples, missing ones too; empty without one."""
+def units_of_time(first: float, step: float) -> list[str]:
+    """Units in which a time begins in this century, or else steps as an IMU does.
+
+    A board that prints may be as slow as once a second, so a step of 1 may be a second or a millisecond.
+    """
+    rates = {unit: 1e9 / (step * size) for unit, size in USUAL_TIME_NS.items() if step > 0.0}
+    epochs = [u for u, hz in rates.items() if SLOWEST_HZ[0] <= hz <= PLAUSIBLE_HZ[1] and 1e18 < first * TIME_NS[u] < 4e18]
+    whole_s = epochs == ["s"] and float(first).is_integer() and float(step).is_integer()  # or ms since a boot weeks ago
+    fast = [unit for unit, hz in rates.items() if PLAUSIBLE_HZ[0] <= hz < PLAUSIBLE_HZ[1]] if whole_s else []
+    return epochs + fast or [unit for unit, hz in rates.items() if SLOWEST_HZ[1] <= hz < PLAUSIBLE_HZ[1]]
+
+
+def rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:
+    """Line of a map that counts rows, where several have one stamp."""
+    first, last = float(values[0]), float(values[-1])
+    step = (last - first) / max(int(np.argmax(values == values[-1])), 1)  # the last rows have one stamp, too
+    units = [unit] if unit in TIME_NS else units_of_time(first, step)
+    if not step > 0.0 or len(units) != 1:
+        return []
+    rate = 1e9 / (step * TIME_NS[units[0]])
+    return [
+        f"rate_hz = {rate:.6g}  # in place of time and time_unit, if the rows are evenly spaced over the span of {column!r}"
+    ]
+
+
+def counters_of(columns: Columns, length: int) -> list[str]:
+    """Columns of this length that count, row numbers without a name last."""
+    found = []
     for column, values in columns.values.items():
         if values.dtype.kind in "iu" and len(values) == length > 1:
             steps = np.diff(_unwrapped(values))
-            if 1.0 <= np.median(steps) <= MOST_STEP and np.mean(steps == np.median(steps)) > 0.5:
-                return column
-    return ""
+            regular = np.mean(steps == np.median(steps)) > 0.5 or re.search(COUNTER, column, re.IGNORECASE)
+            if 1.0 <= np.median(steps) <= MOST_STEP and regular:
+                found.append(column)
+    return sorted(found, key=lambda column: re.fullmatch(r"column \d+", column) is not None)
+
+
+def counts_others(values: np.ndarray) -> bool:
+    """Whether a counter numbers other packets, too: steps are no multiples of the usual."""
+    steps = np.diff(_unwrapped(values))
+    return float(np.mean(steps % max(float(np.median(steps)), 1.0) != 0.0)) > MOST_ODD
+
+
+def said_steps(values: np.ndarray) -> str:
+    """Shares of the most frequent steps of a counter, in words."""
+    steps, counts = np.unique(np.diff(_unwrapped(values)), return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:3]
+    return ", ".join(f"{100.0 * counts[n] / counts.sum():.0f} % of its steps are {steps[n]:g}" for n in most)
+
+
+def share_skipped(values: np.ndarray) -> float:
+    """Share of the steps of a counter that are longer than the usual one."""
+    steps = np.diff(_unwrapped(values))
+    return float(np.mean(steps > np.median(steps)))
 
 
 def count_times(columns: Columns, rate_hz: float, length: int, counter: str) -> str:
     """Add a column of seconds since the first sample, by a counter or by rows; its name.
 
     Raises:
-        ConfigError: the counter has another length than the samples, or does not count.
+        ConfigError: the counter has another length than the samples, does not count, or counts other packets, too.
     """
     if not counter:
         counts = np.arange(length, dtype=np.float64)
-    elif len(values := columns.values.get(counter, np.zeros(0))) == length:
+    elif len(values := columns.values.get(counter, np.zeros(0))) != length:
+        raise ConfigError(f"{counter!r} has {len(values)} rows and the gyro {length}", where="counter", expected="as many")
+    elif counts_others(values):
+        raise ConfigError(
+            f"{counter!r} counts more than the samples: {said_steps(values)}",
+            where="counter",
+            expected="steps that are multiples of one step",
+            fix="Leave the counter out: the rows are counted then",
+        )
+    else:
         counts = _unwrapped(values)
         counts /= max(float(np.median(np.diff(counts))), 1.0)  # a packet's number also counts those of other sensors
-    else:
-        raise ConfigError(f"{counter!r} has {len(values)} rows and the gyro {length}", where="counter", expected="as many")
     name = f"{COUNTED}{counter or length}"
     columns.values[name], columns.units[name] = counts / rate_hz, "s"
     return name

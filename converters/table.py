@@ -1,4 +1,4 @@
-"""Table with a map of its columns: CSV, TSV, Parquet, .npz, MATLAB .mat or HDF5.
+"""Table with a map of its columns: CSV, TSV, JSON, Parquet, .npz, MATLAB .mat or HDF5.
 
 Columns and units are recognised from their names. What stays open is asked for: the refusal holds a map file to complete.
 """
@@ -23,7 +23,7 @@ from . import Sequence
 from ._source import find_folders, head, name
 from ._table_files import kind_of, load
 from ._table_folder import POSES_GROUP, TRUTH_GROUP, is_split, load_split
-from ._table_groups import group_entries, imus_apart, known_layout, time_beside
+from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
 from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
 from ._table_packed import table_name
 from ._table_propose import propose
@@ -34,7 +34,7 @@ from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
-LARGEST_NS = 2**63 - 1
+LARGEST_NS, MOST_LOSSES = 2**63 - 1, 8  # losses in a refusal
 DATA_FILE = "data.hdf5"
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
@@ -76,7 +76,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
         remarks.losses.append(f"{what}; a map names its columns (truth_time, position, quaternion_wxyz or rotation_matrix)")
     if poses and not table.truth_file:
         used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
-    scalars, constants = _further(columns, table, used, place)
+    scalars, constants = _further(columns, tables, used, place)
     log = MessageLog(
         sequence.name,
         path.name,
@@ -107,15 +107,17 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
     """
     apart = {} if known_layout(columns) else imus_apart(columns)
     proposals = {topic: _proposal(part) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
+    own_times = len({str(proposal.entries.get("time", "")) for proposal in proposals.values()}) > 1
     maps = []
     for topic, proposal in proposals.items():
         if proposal.open:
             names = ", ".join([column for column in columns.values if not column.startswith(COUNTED)][:40])
-            reasons = "; ".join(proposal.reasons + remarks.losses)
+            more = f"; and {len(remarks.losses) - MOST_LOSSES} more losses" if len(remarks.losses) > MOST_LOSSES else ""
+            reasons = "; ".join(proposal.reasons + remarks.losses[:MOST_LOSSES]) + more
             raise ConfigError(
                 f"the meaning of its columns is not certain: {reasons}. Its columns are {names}",
                 where=path,
-                fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart])}",
+                fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart], own_times=own_times)}",
             )
         named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
         counted = {key for key, value in named.items() if value.startswith(COUNTED)}
@@ -127,10 +129,10 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
 
 
 def _mapped(columns: Columns, mapping: Path) -> list[TableMap]:
-    """Map of a file, or one for each IMU where it names no gyro and accel.
+    """Map of a file, or one for each IMU where it names no gyro and accel; without a time each IMU has its own.
 
     Raises:
-        ConfigError: the file is no map, or it names no columns and they show no IMUs apart.
+        ConfigError: the file is no map, or it names no columns and they show no IMUs or times.
     """
     table = read_map(mapping)
     if table.gyro:
@@ -139,8 +141,12 @@ def _mapped(columns: Columns, mapping: Path) -> list[TableMap]:
     if not named:
         what = "names no gyro and accel, and the columns' names do not show several IMUs"
         raise ConfigError(what, where=mapping, expected="gyro = [x, y, z] and accel = [x, y, z]")
+    own = ("gyro", "accel") if table.time or table.rate_hz else ("gyro", "accel", "time")
+    for topic, entries in named.items():
+        if not {*own} <= entries.keys():
+            raise ConfigError(f"names no time, and {topic} shows none", where=mapping, expected="`time`, or `rate_hz`")
     return [
-        msgspec.convert(msgspec.structs.asdict(table) | {s: entries[s] for s in ("gyro", "accel")} | {"topic": topic}, TableMap)
+        msgspec.convert(msgspec.structs.asdict(table) | {s: entries[s] for s in own} | {"topic": topic}, TableMap)
         for topic, entries in named.items()
     ]
 
@@ -150,8 +156,9 @@ def _proposal(columns: Columns) -> Proposal:
     proposal = known_layout(columns) or propose(columns)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
-    if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, proposal.entries)):
-        proposal.settle_gyro_unit(unit, f"the poses turn as far as a gyro in {unit} says")
+        if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, turned(columns, proposal.entries))):
+            kind = "poses" if "quaternion_wxyz" in proposal.entries else "orientations"
+            proposal.settle_gyro_unit(unit, f"the {kind} turn as far as a gyro in {unit} says")
     return proposal
 
 
@@ -256,12 +263,15 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
 
 
-def _further(columns: Columns, table: TableMap, used: set[str], where: Path) -> tuple[dict[str, Scalars], dict[str, str]]:
-    """Further columns as topics, on the clock of their group or on the IMU's, and short ones without time as texts."""
-    t_ns = _times(columns, table.time, table.time_unit, where)
+def _further(
+    columns: Columns, tables: list[TableMap], used: set[str], where: Path
+) -> tuple[dict[str, Scalars], dict[str, str]]:
+    """Further columns as topics, on the clock of their group or on an IMU's, and short ones without time as texts."""
+    times = [(each, _times(columns, each.time, each.time_unit, where)) for each in tables]
     clocks: dict[str, Int64[np.ndarray, " n"]] = {}
     constants, left = {}, []
     for column in [c for c in columns.values if c not in used]:
+        table, t_ns = max(times, key=lambda each: shared_group(each[0].time, column))
         beside = time_beside(columns, column, table.time, table.time_unit)
         if beside is not None:
             if beside[0] != column:

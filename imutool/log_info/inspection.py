@@ -43,6 +43,7 @@ from imutool.recording import LEAST_PERIOD_S, Imu
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.report import UNSET
 
+UNUSUAL = 0.5  # share by which a period may differ from the median, to count for the rate
 CALM_SHARE = 0.25  # of the resting windows, the calmest, that give the noise: motors may idle in the others
 NOISE_WINDOW_S = 1.0
 JOIN_VECTORS = "; imutool debias and others read a gyro's and an accelerometer's vectors as one: --imu gyro=TOPIC,accel=TOPIC"
@@ -128,8 +129,9 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     periods = np.diff(ordered)
     known = len(periods) > 0
     median = float(np.median(periods)) if known else 0.0
+    usual = periods[np.abs(periods - median) <= UNUSUAL * median]  # the median itself is coarse where times are whole ms
     return Clock(
-        rate_hz=1e9 / median if median > 0 else None,
+        rate_hz=1e9 / float(usual.mean()) if median > 0 else None,
         jitter_s=float(np.std(periods)) * 1e-9 if known else None,
         largest_gap_s=float(periods.max()) * 1e-9 if known else None,
         first_ns=int(ordered[0]) if len(ordered) else None,

@@ -67,7 +67,7 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
     rms = float(np.sqrt(((gyro - omega @ turn.T) ** 2).sum(axis=1).mean()))
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
-    body = _turned(turn, gyro, rms, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
+    body = _turned(turn, gyro, omega, rms, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
     return Agreement(rms, explained, body)
 
 
@@ -125,11 +125,18 @@ def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
 
 
 def _turned(
-    turn: Float64[np.ndarray, "3 3"], gyro: Float64[np.ndarray, "n 3"], rms_rad_s: float, length_s: float
+    turn: Float64[np.ndarray, "3 3"],
+    gyro: Float64[np.ndarray, "n 3"],
+    omega: Float64[np.ndarray, "n 3"],
+    rms_rad_s: float,
+    length_s: float,
 ) -> Turned | None:
-    """Rotation with its deviations, if these are small: an error about each axis moves the rates about the other two."""
-    squares = gyro.T @ gyro * (length_s / ERRORS_LAST_S / len(gyro))
-    seen = np.trace(squares) * np.eye(3) - squares
+    """Rotation with its deviations, if these are small: an error about each axis moves the rates about the other two.
+
+    Only rates that both share count: the poses of a robot on a floor turn about one axis, and say nothing of a turn about it.
+    """
+    shared = gyro.T @ (omega @ turn.T) * (length_s / ERRORS_LAST_S / len(gyro))  # symmetric, as R is the best
+    seen = np.trace(shared) * np.eye(3) - (shared + shared.T) / 2.0
     if np.linalg.eigvalsh(seen)[0] <= 0.0:
         return None
     std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))

@@ -54,6 +54,13 @@ def test_stamps_one_by_one_are_no_batches(jitter_ns: int) -> None:
     assert read_stamps(stamps).faults == []
 
 
+def test_a_logger_that_slows_down_does_not_write_in_batches() -> None:
+    """A rocket's computer logs at 100 Hz until the apogee and at 10 Hz on its parachute."""
+    true = START_NS + np.cumsum(np.where(np.arange(1700) < 1200, 10_000_000, 100_000_000))
+    assert read_stamps(true).faults == []
+    assert np.abs(restamped(true) - true).max() < 1000
+
+
 def test_a_clock_set_back_is_no_wrap_and_a_pause_ends_the_line() -> None:
     true = sampled()
     assert not read_stamps(np.where(np.arange(12_000) < 6000, true, true - 3_000_000_000)).wraps

@@ -485,9 +485,11 @@ def test_messages_written_as_a_table_keep_the_names_of_their_fields(convert, tmp
     same(tmp_path / "out.mcap")
 
 
-def test_rows_of_another_width_are_losses(convert, tmp_path):
+@pytest.mark.parametrize("row", ["1,2,3", "1,2,3,4,5,6,7,8,9"])
+def test_rows_of_another_width_are_losses(convert, tmp_path, row):
+    """A longer one, as of two lines that a board wrote at once, says nothing of the others."""
     path = write_csv(tmp_path / "log.csv", CERTAIN, arrays())
-    path.write_text(path.read_text() + "1,2,3\n")
+    path.write_text(path.read_text() + f"{row}\n")
     done = convert(path, tmp_path / "out.mcap")
     assert done.returncode == 3
     assert "1 rows do not have 7 fields and are left out" in done.stderr

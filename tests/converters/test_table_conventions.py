@@ -427,3 +427,52 @@ def test_a_time_and_six_axes_without_a_header_are_an_imu_by_its_gravity(tmp_path
     imu = table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml").imus["/imu0"]
     assert np.array_equal(imu.gyro, GYRO)
     assert np.array_equal(imu.accel, ACCEL)
+
+
+def test_readings_count_before_estimates_and_words_for_units_are_known(tmp_path):
+    """A filter's acceleration has less of the motion, and perhaps the axes of the world."""
+    names = ["timestamp_seconds", *(f"{kind}_acceleration_{a}_gs" for kind in ("raw", "est") for a in "xyz")]
+    names += [f"{kind}_angular_rate_{a}_{unit}_per_s" for kind, unit in (("raw", "deg"), ("est", "rad")) for a in "xyz"]
+    accel = np.random.default_rng(5).normal(0.0, 3.0, (400, 3))
+    gyro = np.random.default_rng(6).normal(0.0, 30.0, (400, 3))
+    t_s = np.arange(400) / 90.0
+    estimated = np.tile([0.0, 0.01, 1.0], (400, 1)) + 0.01 * accel
+    path = write_csv(tmp_path / "rocket.csv", names, [t_s, *accel.T, *estimated.T, *gyro.T, *np.deg2rad(gyro).T])
+    imu = table.read_sequence(table.sequences(path)[0]).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * accel)
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro))
+
+
+@pytest.mark.parametrize("with_number", [False, True])
+def test_rates_of_about_one_are_no_gravity_and_a_row_number_is_no_time(tmp_path, with_number):
+    rng, count = np.random.default_rng(4), 2000
+    t_s, gyro = 4908.0 + np.arange(count) / 500.0, rng.normal([0.5, 0.0, 0.0], 0.6, (count, 3))
+    number = [np.arange(count)] if with_number else []
+    rest = rng.normal([0.0, 0.0, 9.81], 0.3, (count, 3))
+    for name, accel, found in (("calm", rest, True), ("race", 1.3 * rest, False)):
+        columns = [*number, t_s, *gyro.T, *accel.T]
+        path = write_csv(tmp_path / f"{name}.txt", [f"{value!r}" for value in range(len(columns))], columns, " ")
+        path.write_text(path.read_text().partition("\n")[2])
+        with pytest.raises(ConfigError) as refused:
+            table.read_sequence(table.sequences(path)[0])
+        assert ('gyro = ["gyro_x", "gyro_y", "gyro_z"]' in refused.value.fix) is found
+        assert f'time = "{"time" if found else "column 2" if with_number else "column 1"}"' in refused.value.fix
+        assert 'time_unit = "s"\n' in refused.value.fix
+
+
+def test_a_row_of_devices_below_the_units_hides_no_names(tmp_path):
+    """RaceChrono's CSV, of a phone in a car: the names, the units, and who measured."""
+    names = ["timestamp", "lap_number", "speed", *(f"{a}_acc" for a in "xyz"), *(f"{a}_rate_of_rotation" for a in "xyz")]
+    units = ["unix time", "", "m/s", "G", "G", "G", "deg/s", "deg/s", "deg/s"]
+    devices = ["", "", "100: gps", *["200: acc"] * 3, *["300: gyro"] * 3]
+    rng = np.random.default_rng(8)
+    gyro, accel = rng.normal(0.0, 9.0, (200, 3)), rng.normal([0.0, 0.0, 1.0], 0.1, (200, 3))
+    rows = [
+        f"{1767150797 + n / 50:.2f},3,8.0,{','.join(map(repr, row))}" for n, row in enumerate(np.hstack([accel, gyro]).tolist())
+    ]
+    head = ["This file is created using RaceChrono Pro", "Format,3", "", *(",".join(row) for row in (names, units, devices))]
+    (tmp_path / "lap.csv").write_text("\n".join([*head, *rows]) + "\n")
+    imu = table.read_sequence(table.sequences(tmp_path / "lap.csv")[0]).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro))
+    np.testing.assert_allclose(imu.accel, 9.80665 * accel)
+    assert imu.t_ns[0] == 1_767_150_797 * 10**9

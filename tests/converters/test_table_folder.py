@@ -173,3 +173,15 @@ def test_a_rounded_time_is_a_time_and_an_open_unit_beside_a_counter_no_error(tmp
     )
     with pytest.raises(ConfigError, match="rate_hz"):
         table.read_sequence(table.sequences(tmp_path / "log.csv")[0])
+
+
+def test_poses_whose_clock_was_set_back_keep_their_own_times(tmp_path):
+    """As many poses as samples do not make the IMU's times theirs."""
+    names = ["t_ns", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    t_ns = np.arange(COUNT) * 10_000_000
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1))
+    (tmp_path / "imu.csv").write_text(",".join(names) + "\n" + rows(t_ns, GYRO, ACCEL))
+    later = t_ns + np.where(np.arange(COUNT) < 0.7 * COUNT, 4_000_000_000, 1_000_000)
+    (tmp_path / "headpose.csv").write_text("t_ns,px,py,pz,qx,qy,qz,qw\n" + rows(later, np.zeros((COUNT, 3)), turns))
+    (poses,) = table.read_sequence(table.sequences(tmp_path)[0]).poses.values()
+    assert poses.t_ns[0] == 4_000_000_000

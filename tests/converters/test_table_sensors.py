@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from imutool.converters import table
+from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
 COUNT = 60
@@ -72,3 +73,38 @@ def test_a_table_with_words_in_it_is_read_as_one(tmp_path):
         for n, (gyro, accel) in enumerate(zip(GYRO, ACCEL, strict=True))
     ]
     assert np.array_equal(read(tmp_path / "log.csv", lines).imus["/imu0"].gyro, GYRO)
+
+
+def test_rows_of_several_devices_are_several_imus(tmp_path):
+    """As one IMU, samples of two bodies would take turns."""
+    lines = ["time [ms],device,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"]
+    for number, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        lines += [row(",", 10 * number + late, device, *gyro, *accel) for device, late in (("left_foot", 0), ("right_foot", 3))]
+    imus = read(tmp_path / "two.csv", lines).imus
+    assert {topic: len(imu) for topic, imu in imus.items()} == {"/left_foot/imu": COUNT, "/right_foot/imu": COUNT}
+    assert imus["/right_foot/imu"].t_ns[0] == 3_000_000
+    numbered = [line.replace("left_foot", "1").replace("right_foot", "2") for line in lines]
+    assert [len(imu) for imu in read(tmp_path / "two.csv", numbered).imus.values()] == [COUNT, COUNT]
+
+
+def test_rows_of_several_kinds_do_not_hide_one_another(tmp_path):
+    """Those of the IMU have fewer fields than those of what the robot sees."""
+    lines = []
+    for number, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        lines += [row(" ", "IMU", f"{0.01 * number:.6f}", *gyro, *accel), row(" ", "LANDMARK", 0.01 * number, *range(12))]
+    (tmp_path / "log.txt").write_text("\n".join(lines) + "\n")
+    with pytest.raises(ConfigError, match="no unit of the gyro") as refused:
+        table.read_sequence(table.sequences(tmp_path / "log.txt")[0])
+    (tmp_path / "map.toml").write_text(refused.value.fix.split("\n\n", 1)[1].replace('gyro_unit = "?"', 'gyro_unit = "rad/s"'))
+    (sequence,) = table.sequences(tmp_path / "log.txt")
+    imu = table.read_sequence(sequence, mapping=tmp_path / "map.toml").imus["/imu0"]
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
+
+
+@pytest.mark.parametrize("flags", ["VX", ("true", "false"), ("walk", "run")])
+def test_states_and_labels_of_one_device_make_no_kinds_of_rows(tmp_path, flags):
+    lines = ["time [ms],state,gx [deg/s],gy [deg/s],gz [deg/s],ax [g],ay [g],az [g]"]
+    for number, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        state = flags[number // 20 % 2 if "run" in flags else number % 2]
+        lines.append(row(",", 10 * number, state, *gyro, *accel))
+    assert [len(imu) for imu in read(tmp_path / "one.csv", lines).imus.values()] == [COUNT]

@@ -103,6 +103,75 @@ def test_a_counter_is_no_time_and_the_map_that_is_proposed_asks_for_the_rate(tmp
     assert np.array_equal(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
 
 
+def test_a_counter_of_all_packets_is_no_clock_of_the_samples(tmp_path):
+    """An x-IMU numbers the packets of all sensors: by its numbers 60 s of samples would be 50 s."""
+    names = ["Packet number", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
+    counts = np.cumsum(np.where(np.arange(COUNT) % 3, 2, 1))
+    path = write_csv(tmp_path / "count.csv", names, [counts, *ACCEL.T, *GYRO.T])
+    with pytest.raises(ConfigError, match="'Packet number' counts more than the samples") as refused:
+        read(path)
+    proposed = refused.value.fix.split("\n\n", 1)[1].replace('rate_hz = "?"', "rate_hz = 250")
+    (tmp_path / "map.toml").write_text(proposed)
+    assert np.array_equal(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
+    (tmp_path / "map.toml").write_text(f'counter = "Packet number"\n{proposed}')
+    with pytest.raises(ConfigError, match="counts more than the samples"):
+        read(path, tmp_path / "map.toml")
+
+
+def test_a_counter_that_often_skips_is_asked_about(tmp_path):
+    names = ["PacketCounter", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
+    counts = np.cumsum(np.where(np.arange(COUNT) % 4, 1, 2))
+    path = write_csv(tmp_path / "log.txt", names, [counts, *ACCEL.T, *GYRO.T], above="// Update Rate: 250.0Hz\n")
+    with pytest.raises(ConfigError, match="25 % of its steps are 2 in 'PacketCounter': are samples missing") as refused:
+        read(path)
+    assert 'counter = "PacketCounter"  # please confirm: this column?' in refused.value.fix
+
+
+def test_row_numbers_beside_a_count_of_samples_are_no_time(tmp_path):
+    names = ["", "index", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
+    path = write_csv(tmp_path / "pandas.csv", names, [np.arange(COUNT), 23_000 + np.arange(COUNT), *ACCEL.T, *GYRO.T])
+    with pytest.raises(ConfigError, match="'index' counts the samples") as refused:
+        read(path)
+    assert 'rate_hz = "?"' in refused.value.fix
+
+
+def test_a_clock_behind_other_columns_is_the_time(tmp_path):
+    clock = [f"16:24:{4 + n // 250:02d}.{n % 250 * 4:03d}" for n in range(1000)]
+    rows = [
+        f"@ LOG {7} {t} {' '.join(map(repr, row))}"
+        for t, row in zip(clock, np.hstack([GYRO, ACCEL])[:1000].tolist(), strict=True)
+    ]
+    (tmp_path / "raven.txt").write_text("\n".join(rows) + "\n")
+    with pytest.raises(ConfigError, match="'column 4' alone rises in a unit of time: it counts as the time") as refused:
+        read(tmp_path / "raven.txt")
+    assert 'time = "column 4"\ntime_unit = "ns"\n' in refused.value.fix
+
+
+def test_recordings_in_one_structure_keep_their_own_times(tmp_path):
+    """Also those with as many samples, and the columns beside an IMU."""
+    trial = {"t": T_S, "acc": ACCEL, "gyr": GYRO, "mag": ACCEL}
+    for later, rows in ((500.0, COUNT), (90.0, COUNT - 700)):
+        second = {name: values[:rows] + (later if name == "t" else 0.0) for name, values in trial.items()}
+        scipy.io.savemat(tmp_path / "two.mat", {"data": {"first": trial, "second": second}})
+        log = read(tmp_path / "two.mat")
+        for name, start in (("first", 0.0), ("second", later)):
+            assert log.imus[f"/data_{name}/imu"].t_ns[0] == log.scalars[f"/data_{name}_mag_0"].t_ns[0] == start * 1e9
+        assert len(log.imus["/data_second/imu"]) == rows
+
+
+def test_one_map_holds_for_recordings_with_their_own_times(tmp_path):
+    rest = {"acc": np.tile([0.0, 0.0, 9.81], (COUNT, 1)) + RNG.normal(0.0, 0.02, (COUNT, 3)), "gyr": GYRO * 1e-3}
+    two = {"first": {"t": T_S, **rest}, "second": {"t": T_S[:-9] + 40.0, **{k: v[:-9] for k, v in rest.items()}}}
+    scipy.io.savemat(tmp_path / "two.mat", {"data": two})
+    with pytest.raises(ConfigError, match="no unit of the gyro") as refused:
+        read(tmp_path / "two.mat")
+    proposed = refused.value.fix.split("\n\n", 1)[1]
+    (tmp_path / "map.toml").write_text(proposed.replace('gyro_unit = "?"', 'gyro_unit = "deg/s"'))
+    imus = read(tmp_path / "two.mat", tmp_path / "map.toml").imus
+    assert imus["/data_second/imu"].t_ns[0] == 40 * 10**9
+    assert [len(imu) for imu in imus.values()] == [COUNT, COUNT - 9]
+
+
 def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
     names = [*(f"acc_{a}" for a in "xyz"), *(f"gyr_{a} [rad/s]" for a in "xyz")]
     path = write_csv(tmp_path / "bare.csv", names, [*ACCEL.T, *GYRO.T])
@@ -157,3 +226,15 @@ def test_quaternions_that_turn_otherwise_stay_numbers(tmp_path):
     log = read(tmp_path / "trial.mat")
     assert log.poses == {}
     assert "/opt_quat_3" in log.scalars
+
+
+@pytest.mark.parametrize(("unit", "size"), [("rad/s", 1.0), ("deg/s", 180.0 / np.pi)])
+@pytest.mark.parametrize("names", [[f"Quat_{a}" for a in "wxyz"], [f"q{n}" for n in range(4)]])
+def test_the_orientation_beside_the_rates_shows_their_unit(tmp_path, unit, size, names):
+    """Of a body that walks, gravity does not show it."""
+    header = ["time [s]", *(f"Acc_{a} [m/s^2]" for a in "XYZ"), *(f"Gyr_{a}" for a in "XYZ"), *names]
+    walking = np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 3.0, (COUNT, 3))
+    log = read(write_csv(tmp_path / "xsens.csv", header, [T_S, *walking.T, *(size * GYRO).T, *Q_WXYZ.T]))
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-12)
+    assert f"the orientations turn as far as a gyro in {unit} says" in log.remarks.notes
+    assert log.poses == {}

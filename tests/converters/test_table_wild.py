@@ -70,6 +70,13 @@ def test_a_time_since_1970_may_be_slow(tmp_path, start, step_s, unit):
     assert np.allclose(np.diff(log.imus["/imu0"].t_ns) * 1e-9, step_s, atol=1e-4)
 
 
+def test_whole_seconds_since_1970_that_may_be_milliseconds_since_a_boot_are_asked(tmp_path):
+    """A phone that runs for two weeks counts as many ms as seconds have passed until 2010."""
+    t = 1_279_035_037 + 2 * np.arange(COUNT)
+    with pytest.raises(ConfigError, match="states no unit, and a step of 2 fits s and ms"):
+        read(write_csv(tmp_path / "imu.csv", ["timestamp", *NAMES[1:]], [t, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T]))
+
+
 def test_a_last_column_that_has_a_name_and_no_values_keeps_the_header(tmp_path):
     gyro = (COUNTS * 0.07).round(2)
     rows = [",".join(map(repr, row)) + ",,,," for row in np.hstack([T_S[:, None], ACCEL_G, gyro]).tolist()]
@@ -88,7 +95,7 @@ def test_several_rows_with_one_stamp_propose_their_rate(tmp_path):
     t = 1.7e9 + np.arange(COUNT) // 10 * 0.1
     with pytest.raises(ConfigError) as caught:
         read(write_csv(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
-    assert "# rate_hz = 103.1  # in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
+    assert "# rate_hz = 100  # in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
 
 
 def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):

@@ -299,7 +299,7 @@ def test_real_recordings_are_described_without_false_alarms(data, tmp_path):
     (truth,) = report["truth"]
     assert truth["gaps"] == 17  # drop-outs of the motion capture
     assert truth["longest_gap_s"] == pytest.approx(2.491667)
-    assert report["imu"][0]["rate_hz"] == pytest.approx(199.362, abs=1e-3)
+    assert report["imu"][0]["rate_hz"] == pytest.approx(199.372, abs=1e-3)
     assert report["imu"][0]["missing"] == 0
 
 

@@ -51,6 +51,19 @@ def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias()
     assert motion_warnings("/mocap", found.explained, found.rms_rad_s) == []
 
 
+def test_poses_that_turn_about_one_axis_show_no_mount() -> None:
+    """A robot on a floor: its gyro sees it pitch and roll, its wheels do not, and nothing shows a turn about the vertical."""
+    t, t_imu = np.arange(0.0, 300.0, 0.1), np.arange(0.0, 300.0, 0.02)
+    rate = np.stack([0.4 * np.sin(3.1 * t_imu), 0.4 * np.sin(4.3 * t_imu), 1.2 * np.cos(t_imu)], axis=1)
+    q_wxyz = Rotation.from_rotvec(1.2 * np.sin(t)[:, None] * [0.0, 0.0, 1.0]).as_quat(scalar_first=True)
+    truth = Truth("/odom", np.rint(t * 1e9).astype(np.int64), np.zeros((len(t), 3)), q_wxyz)
+    accel = np.tile([0.0, 0.0, 9.81], (len(t_imu), 1))
+    found = agreement(truth, Imu(np.rint(t_imu * 1e9).astype(np.int64), MOUNT.apply(rate), accel))
+    assert found is not None
+    assert found.explained > 0.8
+    assert found.turned is None
+
+
 def test_a_gap_of_the_imu_counts_for_nothing():
     whole = imu()
     rows = np.r_[0:2000, 3001:4100, 4120:6000]  # 5 s and 0.1 s are missing; no gap begins at a pose

@@ -1,0 +1,184 @@
+"""JSON documents: arrays of samples, of batches of samples, or of numbers.
+
+`[{"t": 1, "acc": {"x": 0.1, ...}}, ...]`; `{"t": [1, 2], "ax": [0.1, 0.2]}`; `{"IMU6": [{"Timestamp": 1, "ArrayAcc": [...]}]}`.
+Each array of objects becomes a table; an object with an array of samples in it becomes as many rows.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from imutool.errors import DataError
+
+from ._table_headerless import name_headerless
+from ._table_packed import read_bytes
+from ._table_sensors import name_columns, read_rows, sensors_among
+from ._table_text import Columns, read_csv
+
+START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,))')
+LEAST_ROWS = 5  # objects of an array that is a table
+MOST_NUMBERS = 9  # in an array that belongs to one sample, as a matrix does
+LEAST_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
+Row = dict[str, Any]
+
+
+def is_json(start: str) -> bool:
+    """Whether a text begins as a JSON document does."""
+    return START.match(start) is not None
+
+
+def load_json(path: Path, columns: Columns) -> None:
+    """Add the columns of a JSON document, or of one JSON value a line.
+
+    Raises:
+        DataError: no JSON.
+    """
+    tables: dict[str, list[Row]] = {}
+    for name, node in _nodes(_decoded(path), ""):
+        if isinstance(node, list) and isinstance(node[0], dict):
+            for kind, rows in _kinds(node).items():
+                tables["/".join(filter(None, (name, kind)))] = rows
+        elif isinstance(node, list):
+            columns.add(name, np.array([np.nan if value is None else value for value in node]))
+        else:
+            columns.numbers[name] = float(node)
+    name_headerless(columns)
+    sensors = sensors_among(tables) if len(tables) > 1 else {}
+    for name, rows in tables.items():
+        part, text = Columns(), _text(rows)
+        if not read_rows(text, part, path):
+            read_csv(text, part, path, least=1)
+        if len(tables) == 1:
+            columns.values, columns.texts, columns.units = (
+                part.values | columns.values,
+                part.texts,
+                part.units | columns.units,
+            )
+            columns.remarks.notes.extend(part.remarks.notes)
+            columns.remarks.losses.extend(part.remarks.losses)
+        else:
+            group = sensors.get(name, name)
+            name_columns(part, sensors.get(name, ""))
+            columns.take(group, part, name)
+
+
+def _decoded(path: Path) -> Any:
+    raw = read_bytes(path)
+    try:
+        return msgspec.json.decode(raw)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        lines = [line.strip().rstrip(b",") for line in raw.splitlines() if line.strip()]
+        try:
+            return [msgspec.json.decode(line) for line in lines]
+        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            what = f"begins as JSON and cannot be read ({error})"
+            raise DataError(what, where=path, expected="one JSON document, or one JSON value a line") from error
+
+
+def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Arrays and single numbers of a document, with dotted names."""
+    if isinstance(node, dict):
+        for key, child in node.items():
+            inner = f"{name}.{key}" if name else str(key)
+            if (names := _names_beside(node, child)) and _is_matrix(child):
+                yield from ((f"{name}.{each}" if name else each, [row[n] for row in child]) for n, each in enumerate(names))
+            else:
+                yield from _nodes(child, inner)
+    elif isinstance(node, bool) or node is None or isinstance(node, str):
+        return
+    elif isinstance(node, int | float):
+        yield name or "value", node
+    elif len(node) >= LEAST_ROWS and all(isinstance(row, dict) for row in node):
+        yield name, node
+    elif _is_matrix(node):
+        yield from ((f"{name}[{n}]" if name else f"column {n + 1}", [row[n] for row in node]) for n in range(len(node[0])))
+    elif len(node) >= LEAST_ROWS and all(isinstance(value, int | float | None) for value in node):
+        yield name or "values", node
+    else:
+        for number, child in enumerate(node):
+            yield from _nodes(child, f"{name}.{number}" if name else str(number))
+
+
+def _is_matrix(node: Any) -> bool:
+    return (
+        isinstance(node, list)
+        and len(node) >= LEAST_ROWS
+        and all(isinstance(row, list) and len(row) == len(node[0]) > 1 for row in node)
+        and all(isinstance(value, int | float | None) for row in node for value in row)
+    )
+
+
+def _names_beside(parent: Row, node: Any) -> list[str]:
+    """Names of the columns of a matrix: a list beside it of as many words, or of as many objects with a name and units."""
+    if not _is_matrix(node):
+        return []
+    for other in parent.values():
+        if isinstance(other, list) and len(other) == len(node[0]):
+            if all(isinstance(each, str) for each in other):
+                return other
+            if all(isinstance(each, dict) and isinstance(each.get("name"), str) for each in other):
+                units = [each.get("units", each.get("unit", "")) for each in other]
+                return [f"{each['name']} [{unit}]" if unit else each["name"] for each, unit in zip(other, units, strict=True)]
+    return []
+
+
+def _kinds(records: list[Row]) -> dict[str, list[Row]]:
+    """Rows of the records, apart where these have different fields, by the fields that the others lack."""
+    every = [row for record in records for row in _rows(record)]
+    kinds: dict[tuple[str, ...], list[Row]] = {}
+    for row in every:
+        kinds.setdefault(tuple(sorted(row)), []).append(row)
+    large = {fields: rows for fields, rows in kinds.items() if len(rows) > LEAST_SHARE * len(every)}
+    common = set.intersection(*map(set, large)) if large else set()
+    own = [{*fields} - common for fields in large]
+    if len(large) < 2 or any(one <= other for one in own for other in own if one is not other):
+        return {"": every}
+    return {re.split(r"[.\[]", min(fields))[0]: rows for fields, rows in zip(own, large.values(), strict=True)}
+
+
+def _rows(record: Row) -> list[Row]:
+    """A record as rows of flat names: one, or one for each sample of the arrays in it."""
+    flat: Row = {}
+    batches: dict[str, list[Any]] = {}
+    _flatten(record, "", flat, batches)
+    length = max(map(len, batches.values()), default=0)
+    rows = []
+    for number in range(length):
+        row = dict(flat)
+        for name, batch in batches.items():
+            if number < len(batch):
+                _flatten({name: batch[number]}, "", row, {})
+        rows.append(row)
+    return rows or [flat]
+
+
+def _flatten(node: Row, name: str, flat: Row, batches: dict[str, list[Any]]) -> None:
+    for key, value in node.items():
+        inner = f"{name}.{key}" if name else key
+        if isinstance(value, dict):
+            _flatten(value, inner, flat, batches)
+        elif not isinstance(value, list):
+            flat[inner] = value
+        elif len(value) <= MOST_NUMBERS and all(isinstance(each, int | float | None) for each in value):
+            flat |= {f"{inner}[{n}]": each for n, each in enumerate(value)}
+        else:
+            batches[inner] = value
+
+
+def _text(rows: list[Row]) -> str:
+    """Rows as a table of text, with every field that one of them has."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    lines = ["\t".join(map(_field, names)), *("\t".join(_field(row.get(name)) for name in names) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _field(value: Any) -> str:
+    if value is None:
+        return ""
+    return re.sub(r"\s+", " ", value) if isinstance(value, str) else str(int(value) if isinstance(value, bool) else value)

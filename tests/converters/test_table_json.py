@@ -1,0 +1,116 @@
+"""JSON documents, as sensors' programs and web pages write them: made-up values."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imutool.converters import table
+from imutool.errors import ConfigError, DataError
+from imutool.recording.message_log import MessageLog
+
+COUNT = 80
+GYRO = np.random.default_rng(17).normal(0.0, 0.1, (COUNT, 3))
+ACCEL = np.tile([0.1, 0.2, 9.8], (COUNT, 1))
+SAMPLES = list(zip(range(0, 10 * COUNT, 10), GYRO.tolist(), ACCEL.tolist(), strict=True))
+
+
+def axes(values: list[float]) -> dict[str, float]:
+    return dict(zip("xyz", values, strict=True))
+
+
+def numbered(sensor: str, unit: str, values: list[float]) -> dict[str, float]:
+    return {f"{sensor}_{axis} [{unit}]": value for axis, value in zip("xyz", values, strict=True)}
+
+
+FLAT = [{"t_ms": t, **numbered("gyro", "rad/s", g), **numbered("acc", "m/s^2", a)} for t, g, a in SAMPLES]
+DOCUMENTS: dict[str, Any] = {
+    "samples": FLAT,
+    "below": {"meta": {"name": "walk"}, "data": {"samples": FLAT}},
+    "arrays": {name: [row[name] for row in FLAT] for name in FLAT[0]},
+    "columns": {"columns": list(FLAT[0]), "data": [list(row.values()) for row in FLAT]},
+    "payload": {
+        "payload": {
+            "interval_ms": 10,
+            "sensors": [{"name": f"{s}{a}", "units": u} for s, u in (("gyr", "rad/s"), ("acc", "m/s2")) for a in "XYZ"],
+            "values": [g + a for _, g, a in SAMPLES],
+        }
+    },
+    "nested": [{"time [ms]": t, "gyro": g, "accel": axes(a)} for t, g, a in SAMPLES],
+    "sensors": [
+        row
+        for t, g, a in SAMPLES
+        for row in ({"sensor": "Gyroscope", "time [ms]": t, **axes(g)}, {"sensor": "Accelerometer", "time [ms]": t, **axes(a)})
+    ],
+    "streams": {
+        "1": {
+            name: {"samples": [{"value": sample[place], "cts": sample[0]} for sample in SAMPLES]}
+            for name, place in (("ACCL", 2), ("GYRO", 1))
+        }
+    },
+}
+
+
+def read(path: Path, text: str, unit: str = "rad/s") -> MessageLog:
+    """Log of a document; what it asks about is the unit of the gyro, or the time, which are given."""
+    path.write_text(text)
+    (sequence,) = table.sequences(path)
+    try:
+        return table.read_sequence(sequence)
+    except ConfigError as refused:
+        mapping = path.with_suffix(".toml")
+        answered = refused.fix.split("\n\n", 1)[1].replace('gyro_unit = "?"', f'gyro_unit = "{unit}"')
+        mapping.write_text(answered)
+        return table.read_sequence(sequence, mapping=mapping)
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+@pytest.mark.parametrize("indent", [None, 2])
+def test_a_json_document_of_samples_is_a_table(tmp_path, name, indent):
+    imu = read(tmp_path / "log.json", json.dumps(DOCUMENTS[name], indent=indent)).imus["/imu0"]
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
+    assert np.array_equal(imu.t_ns - imu.t_ns[0], 10_000_000 * np.arange(COUNT))
+
+
+def test_batches_of_samples_are_rows_and_their_rate_is_proposed(tmp_path):
+    """A Movesense has a time for each batch alone."""
+    sensors = {"ArrayAcc": ACCEL, "ArrayGyro": np.rad2deg(GYRO)}
+    batches = [
+        {
+            "Timestamp": 500 + 75 * n,
+            **{key: [axes(v) for v in each[8 * n : 8 * n + 8].tolist()] for key, each in sensors.items()},
+        }
+        for n in range(COUNT // 8)
+    ]
+    (tmp_path / "log.json").write_text(json.dumps({"Meas": {"IMU6": batches}}))
+    (sequence,) = table.sequences(tmp_path / "log.json")
+    with pytest.raises(ConfigError, match="'Timestamp' is named as a time and does not rise") as refused:
+        table.read_sequence(sequence)
+    lines = refused.value.fix.split("\n\n", 1)[1].splitlines()
+    rate = next(line.removeprefix("# ") for line in lines if line.startswith("# rate_hz = 106.667  # in place of"))
+    answered = [line.replace('"?"', '"deg/s"', 1) for line in lines if not line.startswith("time")]
+    (tmp_path / "map.toml").write_text("\n".join([rate, *answered]))
+    imu = table.read_sequence(sequence, mapping=tmp_path / "map.toml").imus["/imu0"]
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([GYRO, ACCEL]))
+    assert np.diff(imu.t_ns)[0] == pytest.approx(75e6 / 8, rel=1e-5)
+
+
+def test_lists_a_line_are_a_table_without_a_header(tmp_path):
+    """As Python prints them."""
+    text = "".join(f"{[t / 1000, *g, *(np.array(a) + 0.01 * n % 2)]}\n" for n, (t, g, a) in enumerate(SAMPLES))
+    imu = read(tmp_path / "log.txt", text.replace("np.float64(", "").replace(")", "")).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO)
+    assert np.array_equal(imu.t_ns, 10_000_000 * np.arange(COUNT))
+
+
+def test_other_json_is_refused_in_one_sentence(tmp_path):
+    (tmp_path / "cut.json").write_text(json.dumps(FLAT)[:-40])
+    with pytest.raises(DataError, match="begins as JSON and cannot be read"):
+        table.read_sequence(table.sequences(tmp_path / "cut.json")[0])
+    (tmp_path / "package.json").write_text(json.dumps({"name": "page", "version": "1.0.0", "files": ["a", "b"]}))
+    with pytest.raises(DataError, match="holds no columns of numbers"):
+        table.read_sequence(table.sequences(tmp_path / "package.json")[0])
