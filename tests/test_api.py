@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import doctest
 import inspect
 import json
@@ -229,6 +230,10 @@ STATIC = imutool.load_model("static")
         (lambda: imutool.load_model(STATIC), "name: of type Model; expected text or a path"),
         (lambda: imutool.bias_at_rest("static", STILL.imu), "model, imu: of type str, Imu"),
         (lambda: imutool.OnlineDebiaser("static"), "model: of type str; expected a loaded model"),
+        (
+            lambda: imutool.OnlineDebiaser(STATIC, np.zeros(6)),
+            "start: of type ndarray; expected a bias of `imutool.bias_at_rest`",
+        ),
         (lambda: imutool.train([], "m.safetensors"), "logs: no log is given"),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings=["steps=3"]),
@@ -254,7 +259,7 @@ STATIC = imutool.load_model("static")
             "settings: steps: is out of range; expected an integer >=",
         ),
     ],
-    ids=range(22),
+    ids=range(23),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):
@@ -271,10 +276,39 @@ def test_six_numbers_are_a_start_as_their_text_is() -> None:
 
 def test_a_live_sample_of_another_kind_is_refused() -> None:
     call = inspect.unwrap(imutool.OnlineDebiaser.__call__)  # as users call it: without the check of annotations
-    for stamp, gyro, accel in ((0.5, np.zeros(3), np.ones(3)), (5, np.zeros((2, 3)), np.ones((2, 3))), (5, np.zeros(6), [0.0])):
-        with pytest.raises(imutool.DataError, match="expected one sample of 3 values each, at integer nanoseconds"):
+    still, none, texts = np.ones(3), None, ["0", "0", "1"]
+    wrong: list[tuple[Any, Any, Any]] = [(0.5, still, still), (5, np.zeros((2, 3)), np.ones((2, 3))), (5, np.zeros(6), [0.0])]
+    for stamp, gyro, accel in [*wrong, (5, none, none), (5, still, none), (5, still, texts), (5, still + 1j, still)]:
+        with pytest.raises(imutool.DataError, match="expected one sample of 3 numbers each, at integer nanoseconds"):
             call(imutool.OnlineDebiaser(STATIC), stamp, gyro, accel)
     assert call(imutool.OnlineDebiaser(STATIC), np.int64(5), [0.0, 0.0, 0.1], (0.0, 0.0, 9.8))[0][2] == 0.1
+
+
+@pytest.mark.parametrize("set_back_ns", [0, 20_000_000_000])
+def test_a_live_sensor_may_count_its_time_from_anywhere(logs: Path, set_back_ns: int) -> None:
+    """Stamps below zero, and a clock since power-on that is set back beyond its start, begin nothing anew."""
+    imu, model = imutool.read(logs / "flight_2.mcap").imu.rows(slice(0, 1200)), imutool.load_model(logs / "linear.safetensors")
+    t_ns = imu.t_ns - imu.t_ns[0] - set_back_ns * (np.arange(len(imu)) >= 600)
+    rows = []
+    for start_ns in (10**15, 5_000_000_000, -60_000_000_000):
+        online = imutool.OnlineDebiaser(model)
+        rows.append([online(*sample)[2] for sample in zip((start_ns + t_ns).tolist(), imu.gyro, imu.accel, strict=True)])
+    np.testing.assert_array_equal(rows[1], rows[0])
+    np.testing.assert_array_equal(rows[2], rows[0])
+
+
+def test_a_copy_of_a_live_debiaser_goes_its_own_way(logs: Path) -> None:
+    imu, model = imutool.read(logs / "flight_2.mcap").imu, imutool.load_model(logs / "linear.safetensors")
+    samples = list(zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True))[:800]
+    alone, copied = imutool.OnlineDebiaser(model), imutool.OnlineDebiaser(model)
+    for online in (alone, copied):
+        for sample in samples[:400]:
+            online(*sample)
+    branch = copy.deepcopy(copied)
+    for stamp_ns, gyro, accel in samples[400:]:
+        branch(stamp_ns, gyro + 0.3, accel)
+    for sample in samples[400:]:
+        np.testing.assert_array_equal(copied(*sample)[2], alone(*sample)[2])
 
 
 def test_times_outside_a_log_are_refused_with_those_it_has(tmp_path: Path) -> None:
