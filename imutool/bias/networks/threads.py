@@ -27,9 +27,10 @@ if hasattr(os, "register_at_fork"):
 
 @contextmanager
 def settings_of_a_new_process() -> Iterator[None]:
-    """Work with PyTorch's settings in a new process, and give the caller's settings and random numbers back.
+    """Use PyTorch's settings of a new process, and give the caller's back.
 
-    A training of one seed would otherwise depend on what a script set before, and set what the script draws after.
+    So with its random numbers. A training of one seed would otherwise depend on what a script set before, and set what the
+    script draws after.
     """
     with _training:
         dtype, device = torch.get_default_dtype(), torch.get_default_device()
