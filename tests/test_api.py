@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,14 @@ def test_the_lines_of_help_run(tmp_path: Path) -> None:
     assert "<svg" in (tmp_path / "debiased.html").read_text(encoding="utf-8")
 
 
+def test_the_reference_names_what_is_there() -> None:
+    text = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    for place, members in re.findall(r"^::: (\S+)\n    options:\n      members: \[(.*)\]", text, re.MULTILINE):
+        module, _, name = place.rpartition(".")
+        missing = [member for member in members.split(", ") if not hasattr(getattr(import_module(module), name), member)]
+        assert not missing, f"{place} has no {', '.join(missing)}"
+
+
 # ── arrays ──
 
 
@@ -212,6 +221,7 @@ def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: 
 
 STILL = imutool.example_recording(1, duration_s=5.0)
 STATIC = imutool.load_model("static")
+ZEROS = np.zeros((2, len(STILL.imu), 3))
 
 
 @pytest.mark.parametrize(
@@ -234,6 +244,10 @@ STATIC = imutool.load_model("static")
             lambda: imutool.OnlineDebiaser(STATIC, np.zeros(6)),
             "start: of type ndarray; expected a bias of `imutool.bias_at_rest`",
         ),
+        (lambda: imutool.notebook_page("a.mcap"), "runs: of type str; expected runs of `imutool.load_run`"),
+        (lambda: imutool.notebook_viewer(None), "runs: of type NoneType; expected runs of `imutool.load_run`"),
+        (lambda: imutool.Log(None), "of type NoneType; expected a path or a URL"),
+        (lambda: imutool.debias(replace(STILL, imu=imutool.Imu(STILL.imu.t_ns, *ZEROS)), STATIC), "no sample is a measurement"),
         (lambda: imutool.train([], "m.safetensors"), "logs: no log is given"),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings=["steps=3"]),
@@ -259,11 +273,17 @@ STATIC = imutool.load_model("static")
             "settings: steps: is out of range; expected an integer >=",
         ),
     ],
-    ids=range(23),
+    ids=range(27),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):
         call()
+
+
+def test_a_log_without_samples_is_not_diagnosed(tmp_path: Path) -> None:
+    imutool.write(tmp_path / "log.mcap", replace(STILL, imu=STILL.imu.rows(slice(0, 0))))
+    with pytest.raises(imutool.ImutoolError, match="expected"):
+        imutool.diagnose(tmp_path / "log.mcap")
 
 
 def test_six_numbers_are_a_start_as_their_text_is() -> None:
@@ -272,6 +292,17 @@ def test_six_numbers_are_a_start_as_their_text_is() -> None:
     for given in (numbers, np.array(numbers), text):
         debiased = imutool.debias(STILL, STATIC, init=given)
         assert np.array_equal(debiased.start.rest, numbers)
+
+
+def test_a_start_of_ones_own_has_six_numbers_each() -> None:
+    """As users make it: without the check of annotations."""
+    start = object.__new__(imutool.InitialBias)
+    start.__dict__.update(rest=[0] * 6, std=np.ones(6, np.float32), noise=(0.0,) * 6)
+    start.__post_init__()
+    assert {value.dtype for value in (start.rest, start.std, start.noise)} == {np.dtype(np.float64)}
+    start.__dict__.update(std=[1.0] * 3)
+    with pytest.raises(imutool.DataError, match=r"InitialBias.std is float64\[3\]; expected float64\[6\]"):
+        start.__post_init__()
 
 
 def test_a_live_sample_of_another_kind_is_refused() -> None:
