@@ -41,7 +41,7 @@ class Log:
 
     Memory is bounded by the largest chunk; a chunk of more than `max_chunk` bytes is refused. The path may also be an open
     `Source`. Times in a method's arguments select by log time, both ends included. The first damage is an error;
-    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log.
+    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log. Threads open a log each.
 
     Raises:
         ConfigError: the file cannot be opened.
