@@ -356,6 +356,13 @@ def test_one_name_is_a_list_of_one(tmp_path: Path) -> None:
     assert [trace.name for trace in imutool.load_run(tmp_path / "log.mcap", models="static").traces] == ["raw", "static"]
 
 
+def test_a_view_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
+    shown = "with imutool.watch('x', save='x.rrd'): pass"
+    code = f"import os, imutool\nbefore = dict(os.environ)\n{shown}\nprint(before == dict(os.environ))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("True\n", "")
+
+
 def test_a_misspelt_option_of_view_is_named_before_any_work() -> None:
     with pytest.raises(TypeError, match=r"view\(\) got an unexpected keyword argument 'model'. Did you mean 'models'"):
         imutool.view("absent.mcap", model="static")
