@@ -7,6 +7,7 @@ import copy
 import doctest
 import inspect
 import json
+import pickle
 import pydoc
 import re
 import shutil
@@ -354,6 +355,13 @@ def test_one_name_is_a_list_of_one(tmp_path: Path) -> None:
     (survey,) = imutool.clean(tmp_path / "log.mcap", imus="/imu0", rules="gaps").surveys
     assert survey.topic == "/imu0"
     assert [trace.name for trace in imutool.load_run(tmp_path / "log.mcap", models="static").traces] == ["raw", "static"]
+
+
+def test_a_loaded_run_crosses_to_another_process(logs: Path) -> None:
+    run = imutool.load_run(logs / "flight_1.mcap", models="static", aid="stops")
+    for again in (pickle.loads(pickle.dumps(run)), copy.deepcopy(run)):
+        assert again.table() == run.table()
+        assert [trace.run.is_aided for trace in again.traces] == [trace.run.is_aided for trace in run.traces]
 
 
 def test_a_view_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
