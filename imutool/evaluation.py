@@ -28,6 +28,7 @@ from imutool.inertial.aids import Aids, find_aids, parse_aids
 from imutool.inertial.strapdown import StartPose, along_truth, drift
 from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.storage.target import writing
 from imutool.recording import Imu, Poses, Recording, seconds
 
 logger = logging.getLogger(__name__)
@@ -225,7 +226,8 @@ def _refuse_twins(models: Sequence[str | Path]) -> None:
 
 def _write(folder: Path, log: str, model: str, estimate: Poses, true: Poses, valid: Any, *, overwrite: bool) -> None:
     """TUM-format files: LOG_truth.tum and LOG_MODEL.tum on the same stamps, those that are scored."""
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     log = re.sub(r"[^\w.+-]", "_", log).lstrip(".") or "_"  # a log's name is its writer's, and must not lead elsewhere
     if model == RAW:
         metrics.write_tum(true.rows(valid), folder / f"{log}_truth.tum", overwrite)

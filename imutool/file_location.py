@@ -166,6 +166,8 @@ def open_location(where: Location) -> OpenFile:
         The classes that `io_errors` names.
     """
     if isinstance(where, Path):
+        if "\0" in str(where):
+            raise OSError(errno.EINVAL, "no name of a file holds a zero byte", str(where))
         if where.exists() and not where.is_file() and not where.is_dir():
             raise OSError(errno.EINVAL, "it is a pipe, a socket or a device, not a file", str(where))  # opening it might wait
         file = where.open("rb", buffering=0)
@@ -174,8 +176,9 @@ def open_location(where: Location) -> OpenFile:
     remote = where.fs.open(where.path, "rb", block_size=BLOCK_BYTES, cache_type=CACHE, cache_options=dict(CACHE_OPTIONS))
     if remote.size is None:
         raise OSError("the server does not say how long it is, so no part of it can be asked for")
-    details = getattr(remote, "details", None)  # as opening it has learnt them, without another request
-    return OpenFile(remote, remote.size, size_and_etag(details if isinstance(details, dict) else where.fs.info(where.path)))
+    details = getattr(remote, "details", None)  # as opening it has learnt them, without another request: of http only the size
+    found = size_and_etag(details) if isinstance(details, dict) else (0, "")
+    return OpenFile(remote, remote.size, found if found[1] else size_and_etag(where.fs.info(where.path)))
 
 
 def compression(start: bytes) -> str:

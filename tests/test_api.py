@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import copy
 import doctest
 import inspect
 import json
+import pickle
 import pydoc
 import re
 import shutil
@@ -13,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +152,14 @@ def test_the_lines_of_help_run(tmp_path: Path) -> None:
     assert "<svg" in (tmp_path / "debiased.html").read_text(encoding="utf-8")
 
 
+def test_the_reference_names_what_is_there() -> None:
+    text = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    for place, members in re.findall(r"^::: (\S+)\n    options:\n      members: \[(.*)\]", text, re.MULTILINE):
+        module, _, name = place.rpartition(".")
+        missing = [member for member in members.split(", ") if not hasattr(getattr(import_module(module), name), member)]
+        assert not missing, f"{place} has no {', '.join(missing)}"
+
+
 # ── arrays ──
 
 
@@ -211,6 +222,7 @@ def test_what_cannot_be_is_said(call: Callable[[str], object], said: str, logs: 
 
 STILL = imutool.example_recording(1, duration_s=5.0)
 STATIC = imutool.load_model("static")
+ZEROS = np.zeros((2, len(STILL.imu), 3))
 
 
 @pytest.mark.parametrize(
@@ -229,6 +241,14 @@ STATIC = imutool.load_model("static")
         (lambda: imutool.load_model(STATIC), "name: of type Model; expected text or a path"),
         (lambda: imutool.bias_at_rest("static", STILL.imu), "model, imu: of type str, Imu"),
         (lambda: imutool.OnlineDebiaser("static"), "model: of type str; expected a loaded model"),
+        (
+            lambda: imutool.OnlineDebiaser(STATIC, np.zeros(6)),
+            "start: of type ndarray; expected a bias of `imutool.bias_at_rest`",
+        ),
+        (lambda: imutool.notebook_page("a.mcap"), "runs: of type str; expected runs of `imutool.load_run`"),
+        (lambda: imutool.notebook_viewer(None), "runs: of type NoneType; expected runs of `imutool.load_run`"),
+        (lambda: imutool.Log(None), "of type NoneType; expected a path or a URL"),
+        (lambda: imutool.debias(replace(STILL, imu=imutool.Imu(STILL.imu.t_ns, *ZEROS)), STATIC), "no sample is a measurement"),
         (lambda: imutool.train([], "m.safetensors"), "logs: no log is given"),
         (
             lambda: imutool.train("a.mcap", "m.safetensors", settings=["steps=3"]),
@@ -254,11 +274,17 @@ STATIC = imutool.load_model("static")
             "settings: steps: is out of range; expected an integer >=",
         ),
     ],
-    ids=range(22),
+    ids=range(27),
 )
 def test_a_value_of_another_kind_is_said(call: Callable[[], object], said: str) -> None:
     with pytest.raises(imutool.ImutoolError, match=said):
         call()
+
+
+def test_a_log_without_samples_is_not_diagnosed(tmp_path: Path) -> None:
+    imutool.write(tmp_path / "log.mcap", replace(STILL, imu=STILL.imu.rows(slice(0, 0))))
+    with pytest.raises(imutool.ImutoolError, match="expected"):
+        imutool.diagnose(tmp_path / "log.mcap")
 
 
 def test_six_numbers_are_a_start_as_their_text_is() -> None:
@@ -269,12 +295,52 @@ def test_six_numbers_are_a_start_as_their_text_is() -> None:
         assert np.array_equal(debiased.start.rest, numbers)
 
 
+def test_a_start_of_ones_own_has_six_numbers_each() -> None:
+    """As users make it: without the check of annotations."""
+    start = object.__new__(imutool.InitialBias)
+    start.__dict__.update(rest=[0] * 6, std=np.ones(6, np.float32), noise=(0.0,) * 6)
+    start.__post_init__()
+    assert {value.dtype for value in (start.rest, start.std, start.noise)} == {np.dtype(np.float64)}
+    start.__dict__.update(std=[1.0] * 3)
+    with pytest.raises(imutool.DataError, match=r"InitialBias.std is float64\[3\]; expected float64\[6\]"):
+        start.__post_init__()
+
+
 def test_a_live_sample_of_another_kind_is_refused() -> None:
     call = inspect.unwrap(imutool.OnlineDebiaser.__call__)  # as users call it: without the check of annotations
-    for stamp, gyro, accel in ((0.5, np.zeros(3), np.ones(3)), (5, np.zeros((2, 3)), np.ones((2, 3))), (5, np.zeros(6), [0.0])):
-        with pytest.raises(imutool.DataError, match="expected one sample of 3 values each, at integer nanoseconds"):
+    still, none, texts = np.ones(3), None, ["0", "0", "1"]
+    wrong: list[tuple[Any, Any, Any]] = [(0.5, still, still), (5, np.zeros((2, 3)), np.ones((2, 3))), (5, np.zeros(6), [0.0])]
+    for stamp, gyro, accel in [*wrong, (5, none, none), (5, still, none), (5, still, texts), (5, still + 1j, still)]:
+        with pytest.raises(imutool.DataError, match="expected one sample of 3 numbers each, at integer nanoseconds"):
             call(imutool.OnlineDebiaser(STATIC), stamp, gyro, accel)
     assert call(imutool.OnlineDebiaser(STATIC), np.int64(5), [0.0, 0.0, 0.1], (0.0, 0.0, 9.8))[0][2] == 0.1
+
+
+@pytest.mark.parametrize("set_back_ns", [0, 20_000_000_000])
+def test_a_live_sensor_may_count_its_time_from_anywhere(logs: Path, set_back_ns: int) -> None:
+    """Stamps below zero, and a clock since power-on that is set back beyond its start, begin nothing anew."""
+    imu, model = imutool.read(logs / "flight_2.mcap").imu.rows(slice(0, 1200)), imutool.load_model(logs / "linear.safetensors")
+    t_ns = imu.t_ns - imu.t_ns[0] - set_back_ns * (np.arange(len(imu)) >= 600)
+    rows = []
+    for start_ns in (10**15, 5_000_000_000, -60_000_000_000):
+        online = imutool.OnlineDebiaser(model)
+        rows.append([online(*sample)[2] for sample in zip((start_ns + t_ns).tolist(), imu.gyro, imu.accel, strict=True)])
+    np.testing.assert_array_equal(rows[1], rows[0])
+    np.testing.assert_array_equal(rows[2], rows[0])
+
+
+def test_a_copy_of_a_live_debiaser_goes_its_own_way(logs: Path) -> None:
+    imu, model = imutool.read(logs / "flight_2.mcap").imu, imutool.load_model(logs / "linear.safetensors")
+    samples = list(zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True))[:800]
+    alone, copied = imutool.OnlineDebiaser(model), imutool.OnlineDebiaser(model)
+    for online in (alone, copied):
+        for sample in samples[:400]:
+            online(*sample)
+    branch = copy.deepcopy(copied)
+    for stamp_ns, gyro, accel in samples[400:]:
+        branch(stamp_ns, gyro + 0.3, accel)
+    for sample in samples[400:]:
+        np.testing.assert_array_equal(copied(*sample)[2], alone(*sample)[2])
 
 
 def test_times_outside_a_log_are_refused_with_those_it_has(tmp_path: Path) -> None:
@@ -289,6 +355,20 @@ def test_one_name_is_a_list_of_one(tmp_path: Path) -> None:
     (survey,) = imutool.clean(tmp_path / "log.mcap", imus="/imu0", rules="gaps").surveys
     assert survey.topic == "/imu0"
     assert [trace.name for trace in imutool.load_run(tmp_path / "log.mcap", models="static").traces] == ["raw", "static"]
+
+
+def test_a_loaded_run_crosses_to_another_process(logs: Path) -> None:
+    run = imutool.load_run(logs / "flight_1.mcap", models="static", aid="stops")
+    for again in (pickle.loads(pickle.dumps(run)), copy.deepcopy(run)):
+        assert again.table() == run.table()
+        assert [trace.run.is_aided for trace in again.traces] == [trace.run.is_aided for trace in run.traces]
+
+
+def test_a_view_leaves_the_environment_as_it_was(tmp_path: Path) -> None:
+    shown = "with imutool.watch('x', save='x.rrd'): pass"
+    code = f"import os, imutool\nbefore = dict(os.environ)\n{shown}\nprint(before == dict(os.environ))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("True\n", "")
 
 
 def test_a_misspelt_option_of_view_is_named_before_any_work() -> None:

@@ -330,6 +330,11 @@ def test_the_truth_that_is_named_gives_start_and_score(recording: Recording, tmp
         evaluate(path, truth="/nowhere")
 
 
+def test_a_folder_for_trajectories_that_cannot_be_made_is_said(log: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tum: cannot be written \(Not a directory\)"):
+        evaluate(log, trajectories=log / "tum")
+
+
 def test_trajectories_are_not_written_over_unless_told(log: Path, tmp_path: Path) -> None:
     evaluate(log, trajectories=tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

@@ -9,6 +9,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -251,6 +253,27 @@ def test_any_store_of_fsspec_serves(logs: Path, tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError):
         filled("memory://out/other.mcap", then=lambda _: 1 // 0)
     assert sorted(fs.store) == ["/in/log.mcap", "/out/log.mcap"]
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None: ...
+
+
+def test_a_web_server_s_log_is_debiased_as_the_file_is(logs: Path, tmp_path: Path) -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(logs))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        log = to_location(f"http://127.0.0.1:{server.server_port}/flight_1.mcap")
+        report = debias(log, tmp_path / "out.mcap", model=logs / "linear.safetensors")
+        server.shutdown()
+    assert (
+        report.rewrite.added
+        == debias(logs / "flight_1.mcap", tmp_path / "b.mcap", model=logs / "linear.safetensors").rewrite.added
+    )
+
+
+def test_a_name_with_a_zero_byte_is_said() -> None:
+    with pytest.raises(ConfigError, match=r"cannot be opened .no name of a file holds a zero byte"):
+        Source(to_location("a\0b.mcap"))
 
 
 def test_a_temporary_object_that_cannot_be_removed_spoils_nothing(store: Any, caplog: pytest.LogCaptureFixture) -> None:

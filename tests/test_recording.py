@@ -6,12 +6,14 @@ import pickle
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import MISSING, FrozenInstanceError, fields, replace
+from datetime import UTC, datetime
 from fractions import Fraction
 from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -124,6 +126,12 @@ def unchecked(kind: type, *columns: Any) -> Any:
         (Imu, (T, [[0.0], [0.0, 1.0]], V), "Imu.gyro is of type list"),
         (Imu, (T, np.ma.masked_greater(V, 9.0), V), "Imu.gyro is .* with masked values"),
         (Imu, (np.array(["2026", "NaT", "2027", "2028"], "datetime64[s]"), V, V), r"Imu.t_ns is datetime64\[s\]"),
+        (Imu, (T.astype(np.uint64) + np.uint64(2**63), V, V), r"Imu.t_ns is uint64\[4\]; expected int64"),
+        (Imu, (np.array(["3026", "3027", "3028", "3029"], "datetime64[s]"), V, V), r"Imu.t_ns is datetime64\[s\]"),
+        (Imu, (T, np.full((4, 3), 2**53 + 1), V), r"Imu.gyro is int64\[4, 3\]; expected float64"),
+        (Imu, ([datetime.fromtimestamp(k, UTC) for k in range(4)], V, V), r"of type list; .* the time zone off"),
+        (Imu, (T, torch.zeros(4, 3, requires_grad=True), V), r"Imu.gyro is of type Tensor; .* Use tensor.detach"),
+        (Recording, ("r", make_imu(), {1: Poses(T, V, Q)}), "Recording.truths holds a name of type int; expected str"),
         (Poses, (T, V, Q[:, :3]), r"expected float64\[4, 4\]"),
         (Poses, (T, V, Q, V[:, :2]), "Poses.v_w"),
         (Scalars, (T, V[:3], ""), r"Scalars.values is float64\[3, 3\]"),
@@ -157,8 +165,10 @@ def test_wrong_shapes_and_types_are_refused_without_the_type_checker_too(
         (T.astype(">i8"), V.astype(">f8")),
         (T.astype("datetime64[ns]"), V.astype(np.int16)),
         (T, np.ma.masked_greater(V, 99.0)),
+        (T.astype(object), V.astype(object)),
+        (T, torch.from_numpy(V.copy())),
     ],
-    ids=["lists", "smaller", "byte order", "dates", "nothing masked"],
+    ids=["lists", "smaller", "byte order", "dates", "nothing masked", "objects", "tensor"],
 )
 def test_what_converts_without_loss_is_taken(t_ns: Any, gyro: Any) -> None:
     assert unchecked(Imu, t_ns, gyro, V) == Imu(T, V, V)
@@ -294,6 +304,13 @@ def test_between_is_both_ends_included(first: int, last: int, before: int, after
     np.testing.assert_array_equal(imu.between(start, end).t_ns, imu.t_ns[(imu.t_ns >= start) & (imu.t_ns <= end)])
 
 
+def test_seconds_are_no_times_of_a_cut() -> None:
+    """Of an epoch in float nanoseconds the ends would be 128 ns off, and of seconds nothing would be left."""
+    for start in (0.5, float(EPOCH_NS), None):
+        with pytest.raises(DataError, match=r"start_ns is .*; expected integer nanoseconds"):
+            make_imu().between(start, EPOCH_NS)  # type: ignore[arg-type]
+
+
 def test_rows_by_slice_and_by_mask() -> None:
     poses = make_poses()
     mask = np.arange(20) % 3 == 0
@@ -423,9 +440,16 @@ def test_a_gap_is_80_ms_or_four_periods(missing: int, gap: bool) -> None:
     assert not holed.at(np.array([EPOCH_NS + 5_000_000]), max_gap_s=0.005)[1][0]
 
 
-def test_one_pose_is_no_path() -> None:
-    with pytest.raises(DataError, match="Poses has 1 rows; expected at least 2"):
-        make_poses(1).at(np.array([EPOCH_NS]))
+@pytest.mark.parametrize("max_gap_s", [None, 1.0])
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_pose_is_no_path(count: int, max_gap_s: float | None) -> None:
+    with pytest.raises(DataError, match=f"Poses has {count} rows; expected at least 2"):
+        make_poses(2).rows(slice(0, count)).at(np.array([EPOCH_NS]), max_gap_s)
+
+
+def test_no_gap_is_longer_than_infinity() -> None:
+    poses = make_poses(100)
+    assert poses.rows((np.arange(100) < 30) | (np.arange(100) >= 50)).at(poses.t_ns, float("inf"))[1].all()
 
 
 def test_quaternions_are_made_unit_where_they_are_not_and_refused_where_they_are_none() -> None:

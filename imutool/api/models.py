@@ -23,8 +23,9 @@ from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
+from imutool.bias_start.stretches import measured_imu
 from imutool.debiasing import DebiasReport
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError
 from imutool.file_location import Location, LogPath, location, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
@@ -236,8 +237,7 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
     if not isinstance(model, Model | None):
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     recording.imu.check_rate(recording.name)
-    if len(recording.imu) < 2:
-        raise DataError(f"the IMU has {len(recording.imu)} samples", where=recording.name, expected="at least 2")
+    measured_imu(recording.imu, recording.name)  # warns of what is no measurement, and refuses a recording of nothing else
     name, chosen, start = _model_and_start(recording, model, init, smooth)
     about = recording.metadata.get("imutool", {})
     fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).report(name, recording.name, force=force)

@@ -171,13 +171,13 @@ def notebook_viewer(runs: RunData | Sequence[RunData]) -> Any:
         runs: Runs from `load_run`.
 
     Raises:
-        ConfigError: The extra `notebook` is not installed.
+        ConfigError: The extra `notebook` is not installed, or `runs` are no runs.
 
     Examples:
         >>> import imutool
         >>> imutool.notebook_viewer(imutool.load_run("flight_2.mcap"))  # doctest: +SKIP
     """
-    return notebook.show(several(runs))
+    return notebook.show(_loaded(runs))
 
 
 def notebook_page(runs: RunData | Sequence[RunData]) -> notebook.Page:
@@ -187,7 +187,7 @@ def notebook_page(runs: RunData | Sequence[RunData]) -> notebook.Page:
         runs: Runs from `load_run`.
 
     Raises:
-        ConfigError: matplotlib is not installed.
+        ConfigError: matplotlib is not installed, or `runs` are no runs.
 
     Examples:
         >>> import imutool
@@ -195,7 +195,15 @@ def notebook_page(runs: RunData | Sequence[RunData]) -> notebook.Page:
         >>> "<svg" in page.content
         True
     """
-    return notebook.page(several(runs))
+    return notebook.page(_loaded(runs))
+
+
+def _loaded(runs: object) -> list[RunData]:
+    """Runs of a notebook cell; ConfigError of others, such as a path."""
+    given = several(runs)
+    if wrong := [type(run).__name__ for run in given if not isinstance(run, RunData)]:
+        raise ConfigError(f"of type {wrong[0]}", where="runs", expected="runs of `imutool.load_run`")
+    return given
 
 
 class LiveView:

@@ -6,7 +6,8 @@ Causal: after the initial bias, the bias at a sample depends on that sample and 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from functools import partial
+from operator import index
 from typing import NamedTuple
 
 import numpy as np
@@ -83,12 +84,15 @@ class OnlineDebiaser:
     """
 
     def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
-        given: object = model
-        if not isinstance(given, BiasModel):
-            what = f"of type {type(given).__name__}"
+        given: tuple[object, object] = model, start
+        if not isinstance(given[0], BiasModel):
+            what = f"of type {type(given[0]).__name__}"
             raise ConfigError(what, where="model", expected="a loaded model", fix="Load it with `imutool.load_model`")
-        self._model, self._start = model, start
-        self._start_ns, self._before_ns, self._bias = -1, -1, np.zeros(6)
+        if not isinstance(given[1], InitialBias | None):
+            what = f"of type {type(given[1]).__name__}"
+            raise ConfigError(what, where="start", expected="a bias of `imutool.bias_at_rest`, or None")
+        self._model, self._start, self._begun = model, start, False
+        self._start_ns, self._before_ns, self._bias = 0, 0, np.zeros(6)
         self._drift = OnlineDrift(model) if model.temperature_parameters() else None
 
     def __call__(
@@ -105,10 +109,13 @@ class OnlineDebiaser:
         Raises:
             DataError: not one sample of three and three values, or a stamp that is not an integer.
         """
-        u = np.concatenate((gyro, accel))
-        if u.shape != (6,) or not isinstance(stamp_ns, int | np.integer):
+        try:
+            u, stamp_ns = np.concatenate((gyro, accel), dtype=np.float64, casting="safe"), index(stamp_ns)
+        except (TypeError, ValueError):
+            u = np.zeros(0)
+        if u.shape != (6,):
             what = f"gyro and accel of shape {list(np.shape(gyro))}, {list(np.shape(accel))} at {stamp_ns!r}"
-            raise DataError(what, where="OnlineDebiaser", expected="one sample of 3 values each, at integer nanoseconds")
+            raise DataError(what, where="OnlineDebiaser", expected="one sample of 3 numbers each, at integer nanoseconds")
         size = np.abs(u)
         if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
             if self._drift is None:
@@ -124,16 +131,16 @@ class OnlineDebiaser:
 
     def _warn_without(self, stamp_ns: int, temperature: float | None) -> None:
         """Warn of a first sample without temperature; the rest bias then varies as much as the drift did in training."""
-        if self._start_ns < 0 and temperature is None:
+        if not self._begun and temperature is None:
             self._model = bound(self._model, {}, "", stamp_ns, stamp_ns)
             logger.warning("live stream: %s", "; ".join(self._model.remarks))
 
     def _seconds(self, stamp_ns: int) -> float:
         """Seconds since the first sample; a jump of the clock counts as at most `stretches.MOST_GAP_S`."""
-        if self._start_ns < 0:
-            self._start_ns = self._before_ns = stamp_ns
+        if not self._begun:
+            self._begun, self._start_ns, self._before_ns = True, stamp_ns, stamp_ns
             stream = (self._start or tracked_from_prior(self._model, stamp_ns)).stream(self._model)
-            self._correct = stream.one if isinstance(stream, SampleStream) else _by_blocks(stream)
+            self._correct = stream.one if isinstance(stream, SampleStream) else partial(_one_as_block, stream)
         step_ns = stamp_ns - self._before_ns
         if -GAP_NS < step_ns < 0:  # out of order: no time passes
             self._start_ns += step_ns
@@ -143,11 +150,7 @@ class OnlineDebiaser:
         return (stamp_ns - self._start_ns) * 1e-9
 
 
-def _by_blocks(stream: Stream) -> Callable[[float, Vector6], Vector6]:
-    """Corrects one sample as a block, for a stream without a path for single samples."""
-
-    def correct(t_s: float, u: Vector6) -> Vector6:
-        bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
-        return bias
-
-    return correct
+def _one_as_block(stream: Stream, t_s: float, u: Vector6) -> Vector6:
+    """Bias at one sample, of a stream without a path for single samples."""
+    bias: Vector6 = stream(np.array([t_s]), u[None, :3], u[None, 3:])[0]
+    return bias

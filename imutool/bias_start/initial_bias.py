@@ -44,6 +44,7 @@ from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import FilterSettings
 from imutool.recording import Imu, seconds
+from imutool.recording.columns import converted
 
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
@@ -77,6 +78,13 @@ class InitialBias:
     follows: BiasPrior | None = None
     hold_s: float = 0.0
     least_std: Vector6 | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("rest", "std", "noise"):
+            value = converted(getattr(self, name), f"InitialBias.{name}")
+            if value.shape != (6,):
+                raise DataError(f"InitialBias.{name} is {value.dtype}{list(value.shape)}", expected="float64[6]")
+            object.__setattr__(self, name, value)
 
     def stream(self, model: BiasModel) -> Stream:
         """Bias stream of a model from this start."""

@@ -17,7 +17,7 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
 from imutool.cleaning.rules.stuck import repeated
-from imutool.errors import ConfigError, LogError
+from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
@@ -73,8 +73,11 @@ def measured_imu(imu: Imu, where: str, *, free_fall: bool = False) -> Imu:
     Without specific force they are one in `free_fall` alone: a simulated sensor has no noise.
 
     Raises:
+        DataError: fewer than two samples.
         ConfigError: fewer than two are left.
     """
+    if len(imu) < 2:
+        raise DataError(f"the IMU has {len(imu)} samples", where=where, expected="at least 2")
     reasons = {why: mask for why, mask in unmeasured(imu.gyro, imu.accel).items() if not (free_fall and why == ZERO_FORCE)}
     left_out = {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
     if not left_out:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from imutool.array_types import Float64
 from imutool.errors import ConfigError
 from imutool.exporting import ExportReport
-from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.sensor import physics_file
@@ -101,7 +101,8 @@ def write(source: Path, out: Path, form: str, noise: str | Path | None, overwrit
         texts[name] = text_of(twin)
     else:
         twin.used.update(entry.name for entry in twin.physics.effect)
-    out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
         with Target(out / file, overwrite=overwrite) as target:
             target.write(text.encode())

@@ -27,7 +27,8 @@ from imutool.config import Settings
 from imutool.recording import Imu, nanoseconds
 from imutool.recording.columns import median, quantile, true_ranges
 
-WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes it scatters by 0.14
+WHITE_MARGIN = 1.3  # ratio of block means to white noise; with 10 blocks of 3 axes, equally noisy, it scatters by 0.14
+LEAST_VARIANCE = 1e-300  # of a window that is stuck
 TREND_DEVIATIONS = 4.0  # of the difference of two means; real stops reach 2.1, a slow turn that changes 11
 FLOOR_MARGIN = 2.5  # ratio to the calmest windows of the log
 FLOOR_RANK = 10  # rank of the window that sets the floor: a single stuck window must not
@@ -120,21 +121,23 @@ def resting_blocks(blocks: Blocks, settings: StationarySettings | None = None) -
     """Rest stretches of at least `min_s` as ordered, disjoint ranges `[first, end)` of blocks.
 
     Window statistics: block means m_j and variances s_j^2 over k samples each; rest when
-    std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all four figures are within their caps.
+    std(m) <= max(1.3 sqrt(mean(s^2) / k), 2.5 floor) for the gyro, and all four figures are within their caps. The margin of
+    1.3 is that of equally noisy axes (`_white_margin`).
     """
     settings = settings or StationarySettings()
     k, period_s, count = blocks.k, blocks.period_s, len(blocks.late)
     width = max(4, round(settings.window_s / (k * period_s)))
     if count < width:
         return []
-    gyro_scatter, gyro_noise, gyro_mean = _window_statistics(blocks.mean[:, :3], blocks.var[:, :3], width)
-    accel_scatter, accel_noise, _ = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
+    gyro_scatter, gyro_variances, gyro_mean = _window_statistics(blocks.mean[:, :3], blocks.var[:, :3], width)
+    accel_scatter, accel_variances, _ = _window_statistics(blocks.mean[:, 3:], blocks.var[:, 3:], width)
+    gyro_noise, accel_noise = (np.sqrt(variances.sum(axis=1)) for variances in (gyro_variances, accel_variances))
     half = width // 2
     halves = np.lib.stride_tricks.sliding_window_view(blocks.mean[:, :3], half, axis=0).mean(axis=-1)
     trend = np.linalg.norm(halves[width - half :] - halves[: len(gyro_scatter)], axis=1)
     calmest = np.sort(gyro_scatter)
     floor = calmest[min(FLOOR_RANK, len(calmest) // 10)]
-    allowed = np.maximum(WHITE_MARGIN * gyro_noise / np.sqrt(k), FLOOR_MARGIN * floor)
+    allowed = np.maximum(_white_margin(gyro_variances) * gyro_noise / np.sqrt(k), FLOOR_MARGIN * floor)
     rests = (
         (gyro_scatter <= np.minimum(allowed, settings.gyro_scatter_rad_s))
         & (trend <= settings.gyro_trend_rad_s + TREND_DEVIATIONS * gyro_noise * np.sqrt(2.0 / (half * k)))
@@ -198,7 +201,8 @@ class OnlineRestDetector:
         del self._calmest[FLOOR_RANK + 1 :]
         self._windows += 1
         floor = self._calmest[min(FLOOR_RANK, self._windows // 10, len(self._calmest) - 1)]
-        allowed = min(max(WHITE_MARGIN * noise[0] / math.sqrt(k), FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
+        white = float(_white_margin(var[:, :3].sum(axis=0))) * noise[0] / math.sqrt(k)
+        allowed = min(max(white, FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
         calm = scatter[0] <= allowed and scatter[1] <= s.accel_scatter_m_s2
         quiet = noise[0] <= s.gyro_noise_rad_s and noise[1] <= s.accel_noise_m_s2
         half = len(mean) // 2
@@ -256,16 +260,25 @@ def is_white(
     return bool(alike and (parts[0] < factor**2 * np.maximum(noise**2, least)).all() and line.min() > chance)
 
 
+def _white_margin(variances: Float64[np.ndarray, "*w 3"]) -> Float64[np.ndarray, "*w"]:
+    """Margin of the ratio of block means to white noise.
+
+    It scatters as fewer axes do where one is much noisier than the others: by sqrt(3 sum(s^4)) / sum(s^2) times as much.
+    """
+    total = np.maximum(variances.sum(axis=-1), LEAST_VARIANCE)
+    return np.asarray(1.0 + (WHITE_MARGIN - 1.0) * np.sqrt(3.0 * (variances**2).sum(axis=-1)) / total)
+
+
 def _window_statistics(
     mean: Float64[np.ndarray, "m 3"], var: Float64[np.ndarray, "m 3"], width: int
-) -> tuple[Float64[np.ndarray, " w"], Float64[np.ndarray, " w"], Float64[np.ndarray, "w 3"]]:
-    """Scatter of the block means, noise within blocks, and mean of each window of consecutive blocks."""
-    scatter, noise, means = [], [], []
+) -> tuple[Float64[np.ndarray, " w"], Float64[np.ndarray, "w 3"], Float64[np.ndarray, "w 3"]]:
+    """Scatter of the block means, variances within blocks, and mean of each window of consecutive blocks."""
+    scatter, variances, means = [], [], []
     for first in range(0, len(mean) - width + 1, AT_ONCE):  # numpy needs ten times the memory of its windows
         part = slice(first, first + AT_ONCE + width - 1)
         m = np.lib.stride_tricks.sliding_window_view(mean[part], width, axis=0)
-        v = np.lib.stride_tricks.sliding_window_view(var[part].sum(axis=1), width, axis=0)
+        v = np.lib.stride_tricks.sliding_window_view(var[part], width, axis=0)
         scatter.append(np.sqrt(m.var(axis=-1, ddof=1).sum(axis=1)))
-        noise.append(np.sqrt(v.mean(axis=-1)))
+        variances.append(v.mean(axis=-1))
         means.append(m.mean(axis=-1))
-    return np.concatenate(scatter), np.concatenate(noise), np.concatenate(means)
+    return np.concatenate(scatter), np.concatenate(variances), np.concatenate(means)

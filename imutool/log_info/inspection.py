@@ -255,17 +255,18 @@ def _rest(imu: Imu) -> _Rest:
 def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
     """Standard deviation and density by axis in the calmest quarter of the resting seconds.
 
-    density = std * sqrt(period), the white noise that a sensor's data sheet or an ASL `sensor.yaml` states.
+    density = std * sqrt(period), the white noise that a sensor's data sheet or an ASL `sensor.yaml` states. Every other sample
+    chooses the quarter and the rest gives the noise: seconds chosen by their own noise have up to 13 % less than the sensor.
     """
     if not samples:
         return None
-    length = max(2, round(NOISE_WINDOW_S / imu.period_s))
+    length = max(4, round(NOISE_WINDOW_S / imu.period_s))
     std = []
     for values in (imu.gyro, imu.accel):
         parts = [values[s][: (s.stop - s.start) // length * length].reshape(-1, length, 3) for s in samples]
-        variances = np.concatenate(parts).var(axis=1, ddof=1)
-        calm = variances[np.argsort(variances.sum(axis=1))[: max(1, round(CALM_SHARE * len(variances)))]]
-        std.append(np.sqrt(calm.mean(axis=0)))
+        chosen_by, measured = (np.concatenate(parts)[:, first::2].var(axis=1, ddof=1) for first in (0, 1))
+        calm = np.argsort(chosen_by.sum(axis=1))[: max(1, round(CALM_SHARE * len(measured)))]
+        std.append(np.sqrt(measured[calm].mean(axis=0)))
     gyro, accel = std
     root_s = np.sqrt(imu.period_s)
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())

@@ -13,7 +13,7 @@ from mcap.records import Metadata
 
 from imutool.array_types import Int64
 from imutool.errors import DataError, LogError
-from imutool.file_location import Location, to_location
+from imutool.file_location import Location, location
 from imutool.mcap_io.blocks import MessageBlock, RecordSpan
 from imutool.mcap_io.codec import messages, records, schemas
 from imutool.mcap_io.codec.decode import ImuBatch, PoseBatch
@@ -41,7 +41,7 @@ class Log:
 
     Memory is bounded by the largest chunk; a chunk of more than `max_chunk` bytes is refused. The path may also be an open
     `Source`. Times in a method's arguments select by log time, both ends included. The first damage is an error;
-    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log.
+    `recovery.recovered_log.RecoveredLog` reads the intact part of a damaged log. Threads open a log each.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -53,8 +53,7 @@ class Log:
     def __init__(self, path: str | Location | Source, *, max_chunk: int | None = None) -> None:
         keep_buffers()
         self.max_chunk = records.MAX_CHUNK if max_chunk is None else max_chunk
-        place = to_location(path) if isinstance(path, str) else path
-        self._source = place if isinstance(place, Source) else Source(place)
+        self._source = path if isinstance(path, Source) else Source(location(path))
         self._owns_source, self.path = True, self._source.path
         self.kept: KeptChunks | None = None
         self._begun: tuple[MessageBlock, messages.Messages | None] | None = None

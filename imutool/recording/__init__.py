@@ -100,6 +100,8 @@ class Poses(Columns):
         Raises:
             DataError: fewer than two poses.
         """
+        if len(self) < 2:
+            raise DataError(f"Poses has {len(self)} rows", expected="at least 2")
         t_ns = np.atleast_1d(converted(t_ns, "t_ns", times=True))
         gap_s = max(GAP_FACTOR * self.period_s, MIN_GAP_S) if max_gap_s is None else max_gap_s
         clipped = np.clip(t_ns, self.t_ns[0], self.t_ns[-1])
@@ -107,7 +109,7 @@ class Poses(Columns):
         exact = self.t_ns[after] == clipped
         exact_first = self.t_ns[after - 1] == clipped
         span_ns = self.t_ns[after] - self.t_ns[after - 1]
-        valid = (clipped == t_ns) & ((span_ns <= nanoseconds(gap_s)) | exact | exact_first)
+        valid = (clipped == t_ns) & ((span_ns <= np.round(1e9 * gap_s)) | exact | exact_first)
 
         start = int(self.t_ns[0])
         knots, wanted = seconds(self.t_ns, start), seconds(clipped, start)

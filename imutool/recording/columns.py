@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
+from numbers import Real
+from operator import index
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -19,6 +21,7 @@ from imutool.errors import DataError
 MOST_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps is a jump of their clock
 SET_BACK_NS = 1_000_000_000  # by which stamps go back at a jump; less is a sample that came late
 MOST_TOLD = 5  # jumps
+MOST_EXACT = {"f": 2**53, "i": 2**63 - 1}  # integers that float64 and int64 hold exactly
 
 
 class Columns:
@@ -93,8 +96,13 @@ class Columns:
         return replace(self, **cut)  # type: ignore[type-var]
 
     def between(self, start_ns: int, end_ns: int) -> Any:
-        """Rows with `start_ns <= t_ns <= end_ns`."""
-        first, last = np.searchsorted(self.t_ns, start_ns), np.searchsorted(self.t_ns, end_ns, side="right")
+        """Rows with `start_ns <= t_ns <= end_ns`.
+
+        Raises:
+            DataError: times that are not integers, such as seconds.
+        """
+        start, end = whole_ns(start_ns, "start_ns"), whole_ns(end_ns, "end_ns")
+        first, last = np.searchsorted(self.t_ns, start), np.searchsorted(self.t_ns, end, side="right")
         return self.rows(slice(int(first), int(last)))
 
     @property
@@ -126,27 +134,52 @@ def _same(a: object, b: object) -> bool:
 def converted(value: Any, where: str, *, times: bool = False) -> Shaped[np.ndarray, "..."]:
     """Array of float64, or of int64 nanoseconds for `times`, if the value converts without loss.
 
-    A list, a table's column, float32, another byte order, smaller integers, and `datetime64` for times.
+    A list, a table's column, numbers as objects, float32, another byte order, smaller integers, and `datetime64` for times.
 
     Raises:
-        DataError: it does not: seconds as float, masked values, text, or nothing.
+        DataError: it does not: seconds as float, masked values, text, larger integers, or nothing.
     """
-    wanted = np.dtype(np.int64 if times else np.float64)
+    wanted, fix = np.dtype(np.int64 if times else np.float64), ""
     try:
         array = np.asarray(value)
-    except (TypeError, ValueError):  # rows of different lengths
+    except ValueError:  # rows of different lengths
         array = np.asarray(None)
+    except (TypeError, RuntimeError) as error:  # a tensor on a GPU, or with a gradient
+        array, fix = np.asarray(None), str(error).rstrip(".")
+    if array.dtype == object and all(isinstance(item, Real) for item in array.flat):
+        array = np.asarray(array.tolist())
     mask = getattr(value, "mask", None)
     masked = isinstance(mask, np.ndarray | np.bool_) and bool(mask.any())
-    if times and array.dtype.kind == "M" and not np.isnat(array).any():
-        array = array.astype("datetime64[ns]").astype(np.int64)
-    if not masked and (np.can_cast(array.dtype, wanted, "safe") or (times and array.dtype.kind == "u")):
-        return array.astype(wanted, copy=False)
+    if not masked and (found := _exactly(array, wanted)) is not None:
+        return found
     kind = f"{array.dtype}{list(array.shape)}" if isinstance(value, np.ndarray) else f"of type {type(value).__name__}"
-    fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)" if times and array.dtype.kind == "f" else ""
+    if times and array.dtype.kind == "f":
+        fix = "Convert seconds with np.round(1e9 * seconds).astype(np.int64)"
+    elif times and array.dtype == object and getattr(array.flat[0], "tzinfo", None) is not None:
+        fix = "Take the time zone off with `tz_convert(None)`"
     raise DataError(
         f"{where} is {kind}{' with masked values' * masked}", expected=f"{wanted}[n{'' if times else ', ...'}]", fix=fix
     )
+
+
+def _exactly(array: Shaped[np.ndarray, "..."], wanted: np.dtype[Any]) -> Shaped[np.ndarray, "..."] | None:
+    """The array in another type; None where this loses something."""
+    kind, times = array.dtype.kind, wanted.kind == "i"
+    if times and kind == "M":
+        ns = array.astype("datetime64[ns]")
+        return ns.astype(wanted) if not np.isnat(array).any() and np.array_equal(ns.astype(array.dtype), array) else None
+    if array.size and kind in "iu" and kind != wanted.kind:
+        most = MOST_EXACT[wanted.kind]
+        return array.astype(wanted) if -most <= array.min() and array.max() <= most else None
+    return array.astype(wanted, copy=False) if not array.size or np.can_cast(array.dtype, wanted, "safe") else None
+
+
+def whole_ns(value: Any, where: str) -> int:
+    """Nanoseconds as an integer; DataError of another number, such as seconds."""
+    try:
+        return index(value)
+    except TypeError:
+        raise DataError(f"{where} is {value!r}"[:200], expected="integer nanoseconds") from None
 
 
 def checked_mapping(value: object, of: type, where: str) -> Mapping[str, Any]:
@@ -157,6 +190,8 @@ def checked_mapping(value: object, of: type, where: str) -> Mapping[str, Any]:
     """
     if not isinstance(value, Mapping):
         raise DataError(f"{where} is of type {type(value).__name__}", expected=f"a mapping from names to {of.__name__}")
+    if wrong := [type(k).__name__ for k in value if not isinstance(k, str)]:
+        raise DataError(f"{where} holds a name of type {wrong[0]}", expected="str")
     if wrong := [type(v).__name__ for v in value.values() if not isinstance(v, of)]:
         raise DataError(f"{where} holds a value of type {wrong[0]}", expected=of.__name__)
     return MappingProxyType({k: checked_mapping(v, str, where) if of is Mapping else v for k, v in value.items()})

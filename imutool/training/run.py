@@ -20,7 +20,7 @@ from imutool.bias import hybrid, linear, model_file, neural_ode, static
 from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode as neural_ode_network
 from imutool.bias.networks.network import BiasNetwork
-from imutool.bias.networks.threads import side_by_side
+from imutool.bias.networks.threads import settings_of_a_new_process, side_by_side
 from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
 from imutool.errors import ConfigError
@@ -50,6 +50,7 @@ def checkpoint_path(out: Path) -> Path:
     return out.with_name(f"{out.name}.checkpoint")
 
 
+@settings_of_a_new_process()
 def train(
     logs: Sequence[Path],
     out: Path,

@@ -166,3 +166,9 @@ def test_what_is_no_diagnosis_is_refused(tmp_path: Path) -> None:
         export(tmp_path, tmp_path / "out", format="gazebo")
     with pytest.raises(ConfigError, match="one IMU"):
         export(diagnosed(tmp_path / "d"), tmp_path / "out", format="gazebo", imu="/imu0")
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    source = diagnosed(tmp_path / "d")
+    with pytest.raises(ConfigError, match=r"out: cannot be written \(Not a directory\)"):
+        export(source, source / "noise.toml" / "out", format="toml")

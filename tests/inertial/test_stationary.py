@@ -45,6 +45,12 @@ def test_a_resting_log_is_one_stretch_in_nearly_its_whole_length():
     assert found[0][0] < EDGE_S
 
 
+def test_noise_of_one_axis_above_the_others_breaks_no_rest():
+    t_ns, gyro, accel = made(1800.0)
+    found = in_seconds(Imu(t_ns, BIAS + (gyro - BIAS) * np.array([1.0, 1.0, 3.0]), accel))
+    assert len(found) <= 10  # with the margin of three equal axes 22: an Allan deviation ends at a quarter of a stretch
+
+
 def test_the_ends_of_rest_are_found_to_two_blocks():
     t_ns, gyro, accel = made(20.0)
     t = t_ns * 1e-9

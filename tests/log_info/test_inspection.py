@@ -27,7 +27,7 @@ from imutool.sensor.made_up_flight import flight
 PERIOD_NS = 5_000_000
 START_NS = 1_700_000_000_000_000_000
 GYRO_STD, ACCEL_STD = 2.4e-3, 0.03
-NOISE_TOLERANCE = 0.15  # the calmest quarter of 1 s windows is a few per cent below the true value; the rest is chance
+NOISE_TOLERANCE = 0.05  # of a quarter of 120 s: three deviations
 IMAGE_BYTES = 1_000_000
 HOSTILE_S = 4.0  # CPU seconds for 2000 samples, ten times what they take
 
@@ -162,8 +162,8 @@ def test_clipping_is_seen_and_noise_and_coarse_steps_are_not(tmp_path):
 
 
 def test_rest_noise_and_gravity_of_a_resting_sensor(tmp_path):
-    (found,) = logged(tmp_path, resting())["imu"]
-    assert found["stationary_s"] > 19.0
+    (found,) = logged(tmp_path, resting(24_000))["imu"]
+    assert found["stationary_s"] > 119.0
     assert found["stationary"][0]["first_ns"] == START_NS
     assert found["accel_at_rest_m_s2"] == pytest.approx(GRAVITY_M_S2, abs=0.01)
     noise = found["noise"]
@@ -172,6 +172,12 @@ def test_rest_noise_and_gravity_of_a_resting_sensor(tmp_path):
     assert noise["gyro_density"] == pytest.approx([GYRO_STD * np.sqrt(0.005)] * 3, rel=NOISE_TOLERANCE)
     assert noise["accel_density"] == pytest.approx([ACCEL_STD * np.sqrt(0.005)] * 3, rel=NOISE_TOLERANCE)
     assert found["warnings"] == []
+
+
+def test_the_noise_of_a_noisier_axis_is_not_that_of_its_calmest_seconds(tmp_path):
+    imu = resting(24_000)
+    (found,) = logged(tmp_path, replace(imu, gyro=imu.gyro[0] + (imu.gyro - imu.gyro[0]) * [1.0, 2.0, 4.0]))["imu"]
+    assert found["noise"]["gyro_std_rad_s"] == pytest.approx(GYRO_STD * np.array([1.0, 2.0, 4.0]), rel=NOISE_TOLERANCE)
 
 
 def test_without_rest_there_is_no_noise_estimate(tmp_path):

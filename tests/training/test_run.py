@@ -117,6 +117,23 @@ def test_the_same_command_writes_the_same_bytes(logs: list[Path], expected: byte
     assert [epoch.step for epoch in said] == [0, 2, 4, 6] * 2
 
 
+def test_a_script_s_settings_of_pytorch_change_no_training_and_stay(logs: list[Path], expected: bytes, tmp_path: Path) -> None:
+    """A seed gives one model, and what a script draws after a training does not depend on it."""
+    with torch.random.fork_rng(), torch.no_grad():
+        torch.manual_seed(7)
+        drawn = torch.rand(4, dtype=torch.float64)
+        torch.manual_seed(7)
+        torch.set_default_dtype(torch.float64)
+        try:
+            train(logs, tmp_path / "m.safetensors", method="neural_ode", settings=TINY)
+            assert torch.get_default_dtype() == torch.float64
+        finally:
+            torch.set_default_dtype(torch.float32)
+        assert torch.equal(torch.rand(4, dtype=torch.float64), drawn)
+        assert not torch.is_grad_enabled()
+    assert (tmp_path / "m.safetensors").read_bytes() == expected
+
+
 @pytest.mark.parametrize("line", [4, 8])
 def test_ctrl_c_between_two_steps_leaves_a_checkpoint_that_resume_takes_up(
     logs: list[Path], expected: bytes, tmp_path: Path, line: int

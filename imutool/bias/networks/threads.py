@@ -8,9 +8,10 @@ on starting and ending them.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import TypeVar
 
@@ -19,8 +20,32 @@ import torch
 T = TypeVar("T")
 R = TypeVar("R")
 _pool: ContextVar[ThreadPoolExecutor | None] = ContextVar("_pool", default=None)
+_training = threading.RLock()  # PyTorch's random numbers and default type belong to the whole process
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: _pool.set(None))  # a forked process has none of the threads
+
+
+@contextmanager
+def settings_of_a_new_process() -> Iterator[None]:
+    """Use PyTorch's settings of a new process, and give the caller's back.
+
+    So with its random numbers. A training of one seed would otherwise depend on what a script set before, and set what the
+    script draws after.
+    """
+    with _training:
+        dtype, device = torch.get_default_dtype(), torch.get_default_device()
+        gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
+        with (
+            torch.random.fork_rng(gpus),
+            torch.inference_mode(False),
+            torch.enable_grad(),
+            nullcontext() if device.type == "cpu" else torch.device("cpu"),
+        ):
+            torch.set_default_dtype(torch.float32)
+            try:
+                yield
+            finally:
+                torch.set_default_dtype(dtype)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import struct
+import threading
 from collections.abc import Callable, Mapping
 from functools import cache
 from io import BytesIO
@@ -153,19 +154,26 @@ def unpack(
     return data
 
 
-_unpacker = zstandard.ZstdDecompressor()
+class _Unpacker(threading.local):
+    """Decompressor of each thread: with one for all, a sound chunk does not unpack while another thread unpacks."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_unpacker = _Unpacker()
 
 
 def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memoryview:
     """Decompresses, and never allocates more than `size`, whatever the packed bytes say."""
     if compression == "zstd":
         if size == 0:
-            if _unpacker.stream_reader(packed).read(1):
+            if _unpacker.zstd.stream_reader(packed).read(1):
                 raise ValueError("the zstd frame holds something, the chunk nothing")
             return b""
         if (stated := zstandard.frame_content_size(packed)) not in (-1, size):
             raise ValueError(f"the zstd frame says {stated} bytes, the chunk {size}")
-        data: bytes = _unpacker.decompress(packed, max_output_size=size)
+        data: bytes = _unpacker.zstd.decompress(packed, max_output_size=size)
         return data
     if compression == "lz4":
         context = lz4.frame.create_decompression_context()  # `LZ4FrameDecompressor` would copy the packed bytes first
@@ -207,17 +215,9 @@ def chunk_head(data: bytes, packed: bytes, compression: str, start_ns: int, end_
 
 CHUNK_INDEX = int(Opcode.CHUNK_INDEX)
 FIRST = struct.Struct("<QQQQI")  # start, end, offset and length of the chunk, bytes of its message index offsets
-
-
 SECOND = struct.Struct("<QI")  # bytes of the message indexes, bytes of the compression's name
-
-
 LAST = struct.Struct("<QQ")  # bytes of the messages packed, and unpacked
-
-
 PAIR = struct.Struct("<HQ")  # channel id, and where its MessageIndex record begins
-
-
 SINGLE_ENTRY = struct.Struct("<QQQQIHQQI4sQQ")  # all of it for one channel and a compression of four letters
 
 

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -180,7 +179,7 @@ def _true_bias(recording: Recording) -> Mapping[str, Scalars]:
     """True biases in the log, while the IMU runs."""
     imu = recording.imu
     known = {kind: recording.scalars[topic] for kind, topic in TRUE_BIAS.items() if topic in recording.scalars}
-    return MappingProxyType({kind: b.between(int(imu.t_ns[0]), int(imu.t_ns[-1])) for kind, b in known.items()})
+    return {kind: b.between(int(imu.t_ns[0]), int(imu.t_ns[-1])) for kind, b in known.items()}
 
 
 def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> tuple[tuple[Trace, ...], list[str]]:
@@ -214,7 +213,7 @@ def _score(run: Run, known: TruthSpan, align: Alignment) -> tuple[Trace, str]:
     rows, true, valid = known
     path = run.path_from(run.imu.rows(rows), StartPose.of(true))
     moved, motion = aligned(path, true, valid, align)
-    figures = MappingProxyType(evaluate(path, true, valid))
+    figures = evaluate(path, true, valid)
     trace = Trace(run, moved, errors(moved, true, valid), figures=figures, spectra=_spectra(run))
     if not run.is_aided:  # only an integration goes on from a true pose as from its own
         trace = replace(trace, drift=drift_since_reset(path, true, valid), windows=windows(path, true, valid))

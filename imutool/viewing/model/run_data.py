@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -66,11 +66,11 @@ class Run:
 
     def aided(self, aids: Aids, prior: BiasPrior) -> Run:
         """The same samples, with a smoothed path by the aids of the log; `prior` is that of the bias that is left."""
+        return replace(self, name=f"{self.name} aided", path_from=partial(_aided_path, prior=prior, aids=aids))
 
-        def smoothed(imu: Imu, start: StartPose) -> Poses:
-            return aided_path(imu, start, prior, aids)
 
-        return replace(self, name=f"{self.name} aided", path_from=smoothed)
+def _aided_path(imu: Imu, start: StartPose, prior: BiasPrior, aids: Aids) -> Poses:
+    return aided_path(imu, start, prior, aids)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ def spectra(imu: Imu) -> Mapping[str, Spectrum]:
     Samples count as evenly spaced by their median period, so jitter and gaps blur lines a little.
     """
     if len(imu) < MIN_SAMPLES:
-        return MappingProxyType({})
+        return {}
     rate_hz = 1.0 / imu.period_s
     length = min(len(imu), max(MIN_SAMPLES, round(WINDOW_S * rate_hz)))
     densities = {}
@@ -221,7 +221,7 @@ def spectra(imu: Imu) -> Mapping[str, Spectrum]:
         along = np.ascontiguousarray(values.T)  # twice as fast
         frequency_hz, density = welch(along, rate_hz, nperseg=length, detrend="constant")
         densities[kind] = Spectrum(frequency_hz[1:], density.T[1:])  # without the constant part
-    return MappingProxyType(densities)
+    return densities
 
 
 MAX_CURVE_ROWS = 300_000  # of a curve that is drawn whole (25 minutes at 200 Hz); an hour would take a viewer over 1 GB

@@ -32,8 +32,14 @@ def require_rerun() -> None:
     Raises:
         ConfigError: Rerun is not installed.
     """
-    os.environ.setdefault(LOGGING, LOG_LEVELS)  # read when Rerun is first imported
-    required("rerun", "view", package="the viewer", where="view")
+    if LOGGING in os.environ:
+        required("rerun", "view", package="the viewer", where="view")
+        return
+    os.environ[LOGGING] = LOG_LEVELS  # read when Rerun is first imported, and not for other programs of the caller
+    try:
+        required("rerun", "view", package="the viewer", where="view")
+    finally:
+        os.environ.pop(LOGGING, None)
 
 
 def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:

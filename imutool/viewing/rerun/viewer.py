@@ -20,7 +20,7 @@ from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import connect, scene
 from imutool.viewing.rerun.connect import Listener
-from imutool.viewing.rerun.sdk import LOG_LEVELS, LOGGING, recording_name, require_rerun, rerun_version
+from imutool.viewing.rerun.sdk import recording_name, require_rerun, rerun_version
 
 MEMORY_LIMIT = "50%"  # of the machine's memory; the viewer's default is three quarters
 START_TIMEOUT_S = 10.0  # for a viewer that runs but does not listen yet, as from a slow disk; a dead one is seen at once
@@ -120,9 +120,7 @@ def run(*arguments: str) -> subprocess.Popen[bytes]:
     Raises:
         ConfigError: the program is missing or cannot be started.
     """
-    env = {name: value for name, value in os.environ.items() if (name, value) != (LOGGING, LOG_LEVELS)}
     quiet: Mapping[str, Any] = {
-        "env": env,
         "stdin": subprocess.DEVNULL,
         "stdout": subprocess.DEVNULL,
         "stderr": subprocess.DEVNULL,

@@ -1,15 +1,16 @@
-"""Reading a log does not fault its buffers in anew for every chunk."""
+"""Chunks are unpacked by many threads at once, and their buffers are not faulted in anew for every chunk."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from imutool.mcap_io.codec.records import keep_buffers
+from imutool.mcap_io.codec.records import chunk_head, keep_buffers, pack, unpack
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Imu, Recording
 
@@ -41,3 +42,12 @@ def test_buffers_are_used_again_from_chunk_to_chunk(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", COUNT_FAULTS, path], capture_output=True, text=True, check=True)
     unpacked_pages = len(images) * (1 << 20) // PAGE
     assert int(done.stdout) < unpacked_pages / 4  # unhelped it is twice the pages, one for the packed and one for the unpacked
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_threads_unpack_their_own_chunks_at_once(compression: str) -> None:
+    contents = [np.random.default_rng(k).integers(0, 4, 200_000, np.uint8).tobytes() for k in range(8)]
+    chunks = [chunk_head(data, pack(compression)(data), compression, 0, 1) + pack(compression)(data) for data in contents]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda chunk: bytes(unpack(chunk, 0)), 8 * chunks))
+    assert found == 8 * contents
