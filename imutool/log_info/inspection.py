@@ -267,8 +267,7 @@ def _noise(imu: Imu, samples: list[slice]) -> ImuNoise | None:
         chosen_by, measured = (np.concatenate(parts)[:, first::2].var(axis=1, ddof=1) for first in (0, 1))
         calm = np.argsort(chosen_by.sum(axis=1))[: max(1, round(CALM_SHARE * len(measured)))]
         std.append(np.sqrt(measured[calm].mean(axis=0)))
-    gyro, accel = std
-    root_s = np.sqrt(imu.period_s)
+    gyro, accel, root_s = *std, np.sqrt(imu.period_s)
     return ImuNoise(gyro.tolist(), (gyro * root_s).tolist(), accel.tolist(), (accel * root_s).tolist())
 
 
