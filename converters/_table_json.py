@@ -25,6 +25,7 @@ START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,
 LEAST_ROWS = 5  # objects of an array that is a table
 MOST_NUMBERS = 9  # in an array that belongs to one sample, as a matrix does
 LEAST_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
+FAR = 2**1000  # beyond which an integer is no float64
 Row = dict[str, Any]
 
 
@@ -45,9 +46,9 @@ def load_json(path: Path, columns: Columns) -> None:
             for kind, rows in _kinds(node).items():
                 tables["/".join(filter(None, (name, kind)))] = rows
         elif isinstance(node, list):
-            columns.add(name, np.array([np.nan if value is None else value for value in node]))
+            columns.add(name, _numbers(node))
         else:
-            columns.numbers[name] = float(node)
+            columns.numbers[name] = float(_numbers([node])[0])
     name_headerless(columns)
     sensors = sensors_among(tables) if len(tables) > 1 else {}
     for name, rows in tables.items():
@@ -103,6 +104,12 @@ def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:
     else:
         for number, child in enumerate(node):
             yield from _nodes(child, f"{name}.{number}" if name else str(number))
+
+
+def _numbers(values: list[Any]) -> np.ndarray:
+    """Numbers as an array: nothing is NaN, and an integer that no array holds is infinite."""
+    array = np.array([np.nan if value is None else value for value in values])
+    return array if array.dtype != object else np.array([v if -FAR < v < FAR else np.inf for v in array], dtype=np.float64)
 
 
 def _is_matrix(node: Any) -> bool:

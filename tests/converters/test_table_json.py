@@ -114,3 +114,9 @@ def test_other_json_is_refused_in_one_sentence(tmp_path):
     (tmp_path / "package.json").write_text(json.dumps({"name": "page", "version": "1.0.0", "files": ["a", "b"]}))
     with pytest.raises(DataError, match="holds no columns of numbers"):
         table.read_sequence(table.sequences(tmp_path / "package.json")[0])
+
+
+def test_integers_beyond_every_number_harm_nothing_else(tmp_path):
+    document = {"serial": 10**400, **DOCUMENTS["arrays"], "flags": [10**400] * COUNT}
+    imu = read(tmp_path / "log.json", json.dumps(document)).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO)
