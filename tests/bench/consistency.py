@@ -14,7 +14,9 @@ chi-square's. The coverage is the share of windows within the ellipsoids that sh
 and noise, learns each from `TRAINING` logs of one switching-on, and judges it by the exact poses of `TESTS` logs of others:
 here the poses have no error, and there are windows enough to see a few points. V1_01 is compared with its recomputed truth.
 With `--factor` a second coverage stands beside the first: each log's covariance of the bias times a factor by which the other
-logs' 68 % ellipsoids hold 68 % of their windows (split conformal prediction, with the logs as the sample).
+logs' 68 % ellipsoids hold 68 % of their windows (split conformal prediction, with the logs as the sample). With `--learned` the
+logarithm of that factor is a linear function of a window's motion (`support.covariance_factors`), learned from the other logs
+by the likelihood of their errors: a covariance as one more head of the model, as AirIMU has (Qiu et al., arXiv 2310.04874).
 
 The calibration's share of a window's covariance is that of the slope: its unknowns are the same at every sample, and what goes
 with the motion mostly cancels over 15 s, which the samples' covariances one by one do not show. What a measurement is worth is
@@ -38,10 +40,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from support.covariance_factors import Judgement, coverage, features_of, with_factor, with_head
 from support.error_growth import Judged, Motion
 from support.nees import consistency
 from support.switchings_on import Switchings, log
@@ -57,27 +59,10 @@ from imutool.inertial.windows import running_product, step_means
 from imutool.mcap_io.read import read
 from imutool.recording import Poses, Recording
 
-SHARES = (0.68, 0.95, 0.997)
 STARTS = ("truth", "auto", "smooth")
 WINDOWS_S = (1.0, 5.0, 15.0)
 RECOMPUTED = "/ground_truth_recomputed/pose"
 TRAINING, TESTS = 4, 3
-
-MOST_FACTOR, PRIOR_LOGS = 16.0, 3  # of a covariance; n logs of three axes show the factor's logarithm to sqrt(2 / 3n)
-BISECTIONS = 40
-
-
-class Judgement(NamedTuple):
-    """Errors of a log's windows, and their covariance: the bias's part, and that of noise, poses and measurement."""
-
-    error: Float64[np.ndarray, "m 3"]
-    bias: Float64[np.ndarray, "m 3 3"]
-    other: Float64[np.ndarray, "m 3 3"]
-
-    def squares(self, factor: float | Float64[np.ndarray, "m 1 1"] = 1.0) -> Float64[np.ndarray, " m"]:
-        """Normalised squares of the errors, with a factor on the bias's part."""
-        P = factor * self.bias + self.other
-        return np.asarray(np.einsum("mi,mi->m", self.error, np.linalg.solve(P, self.error[..., None])[..., 0]))
 
 
 class Case(NamedTuple):
@@ -99,6 +84,7 @@ def main() -> None:
     parser.add_argument("--start", action="append", choices=STARTS)
     parser.add_argument("--each-log", action="store_true")
     parser.add_argument("--factor", action="store_true")
+    parser.add_argument("--learned", action="store_true")
     options = parser.parse_args()
     found: dict[tuple[str, str], list[Judgement]] = defaultdict(list)
     starts = options.start or STARTS
@@ -112,7 +98,8 @@ def main() -> None:
     for start in starts:
         for (of, quantity), logs in found.items():
             if of == start:
-                print(f"{start:7}{quantity:16}{'all':24}", told(logs), with_factor(logs) if options.factor else "")
+                also = with_factor(logs) if options.factor else with_head(logs) if options.learned else ""
+                print(f"{start:7}{quantity:16}{'all':24}", told(logs), also)
 
 
 def recorded(paths: list[Path], model: Path | None) -> Iterator[Case]:
@@ -180,7 +167,9 @@ def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
     for length_s in WINDOWS_S:
         grown = one.errors(length_s, from_s)
         for name, axes in (("attitude", slice(0, 3)), ("velocity", slice(3, 6))):
-            yield f"{name} {length_s:g} s", Judgement(grown.error[:, axes], *(P[:, axes, axes] for P in grown[1:]))
+            parts = (P[:, axes, axes] for P in grown[1:])
+            features = features_of(one.motion, one.motion.windows(length_s, from_s))[: len(grown.error)]
+            yield f"{name} {length_s:g} s", Judgement(grown.error[:, axes], *parts, features)
 
 
 def rest_bias(model: BiasModel, begun: InitialBias, one: Judged, from_s: float, recording: Recording) -> Judgement:
@@ -192,7 +181,8 @@ def rest_bias(model: BiasModel, begun: InitialBias, one: Judged, from_s: float, 
         T = slope_of(one.motion, rows, S)
         errors.append(gyro_offset(one.motion, rows))
         covariances.append(one.stated.rest[rows, :3, :3].mean(axis=0) + T @ T.T)
-    return Judgement(np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), np.tile(measured, (len(errors), 1, 1)))
+    every, features = np.tile(measured, (len(errors), 1, 1)), features_of(one.motion, one.motion.windows(TRUTH_S, from_s))
+    return Judgement(np.reshape(errors, (-1, 3)), np.reshape(covariances, (-1, 3, 3)), every, features)
 
 
 def gyro_offset(motion: Motion, rows: slice) -> Float64[np.ndarray, "3"]:
@@ -226,52 +216,13 @@ def measured_variance(model: BiasModel, one: Judged, recording: Recording) -> Fl
 
 def told(logs: list[Judgement]) -> str:
     """The figures of `support.nees` in a line."""
-    error, bias, other = (np.concatenate(parts) for parts in zip(*logs, strict=True))
+    error, bias, other, _ = (np.concatenate(parts) for parts in zip(*logs, strict=True))
     if not len(error):
         return "no window"
     found = consistency(error, bias + other)
     bounds = f"95 % bounds {found['nees_lower']:.2f} to {found['nees_upper']:.2f}"
     covered = coverage(np.concatenate([log.squares() for log in logs]))
     return f"NEES {found['nees_mean']:6.2f}  {bounds}  windows {found['samples']:3.0f}  coverage {covered}"
-
-
-def coverage(squares: Float64[np.ndarray, " m"]) -> str:
-    """Shares of windows within the ellipsoids of `SHARES`."""
-    return " / ".join(f"{100 * (squares <= chi2.ppf(share, 3)).mean():.0f}" for share in SHARES) + " %"
-
-
-def with_factor(logs: list[Judgement]) -> str:
-    """Coverage with each log's covariance times the factor that the other logs ask for."""
-    logs = [log for log in logs if len(log.error)]
-    if len(logs) < 2:
-        return ""
-    needed = [needed_factors(log) for log in logs]
-    factors = [factor_of([n for n in needed if n is not own]) for own in needed]
-    squares = np.concatenate([log.squares(factor) for log, factor in zip(logs, factors, strict=True)])
-    return f" with a factor of {np.exp(np.mean(np.log(factors))):.2f}: {coverage(squares)}"
-
-
-def needed_factors(log: Judgement) -> Float64[np.ndarray, " m"]:
-    """Factor on the bias's covariance that puts each window on its ellipsoid of `SHARES[0]`, by bisection of its logarithm."""
-    low, high = np.full(len(log.error), -np.log(MOST_FACTOR)), np.full(len(log.error), np.log(MOST_FACTOR))
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        outside = log.squares(np.exp(middle)[:, None, None]) > chi2.ppf(SHARES[0], 3)
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    return np.asarray(np.exp(0.5 * (low + high)))
-
-
-def factor_of(needed: list[Float64[np.ndarray, " _"]]) -> float:
-    """Conformal quantile of what the windows of n logs need, each log with the same weight.
-
-    The share asked for is n + 1 to n larger, since the next log is none of these. The logarithm of the factor has a prior of
-    about 0.5 around zero: that of n logs counts n / (n + `PRIOR_LOGS`).
-    """
-    weight = np.concatenate([np.full(len(of_log), 1.0 / len(of_log)) for of_log in needed]) / len(needed)
-    ordered = np.argsort(values := np.concatenate(needed))
-    level = min(SHARES[0] * (1.0 + 1.0 / len(needed)), 1.0)
-    row = min(int(np.searchsorted(np.cumsum(weight[ordered]), level - 1e-9)), len(values) - 1)
-    return float(values[ordered[row]] ** (len(needed) / (len(needed) + PRIOR_LOGS)))
 
 
 if __name__ == "__main__":
