@@ -7,6 +7,7 @@ Each array of objects becomes a table; an object with an array of samples in it 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from ._table_text import Columns, read_csv
 
 START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,))')
 LEAST_ROWS = 5  # objects of an array that is a table
-MOST_NUMBERS = 9  # in an array that belongs to one sample, as a matrix does
+MOST_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix does
 LEAST_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
 FAR = 2**1000  # beyond which an integer is no float64
 Row = dict[str, Any]
@@ -136,17 +137,23 @@ def _names_beside(parent: Row, node: Any) -> list[str]:
 
 
 def _kinds(records: list[Row]) -> dict[str, list[Row]]:
-    """Rows of the records, apart where these have different fields, by the fields that the others lack."""
+    """Rows of the records, apart where many have fields that the others lack, under the name of such a field.
+
+    A row without any of these fields is of the table `other`.
+    """
     every = [row for record in records for row in _rows(record)]
-    kinds: dict[tuple[str, ...], list[Row]] = {}
-    for row in every:
-        kinds.setdefault(tuple(sorted(row)), []).append(row)
-    large = {fields: rows for fields, rows in kinds.items() if len(rows) > LEAST_SHARE * len(every)}
-    common = set.intersection(*map(set, large)) if large else set()
-    own = [{*fields} - common for fields in large]
-    if len(large) < 2 or any(one <= other for one in own for other in own if one is not other):
+    counts = Counter(frozenset(row) for row in every)
+    large = [fields for fields, count in counts.items() if count > LEAST_SHARE * len(every)]
+    own = [fields.difference(*(other for other in large if other is not fields)) for fields in large]
+    if len(large) < 2 or not all(own):
         return {"": every}
-    return {re.split(r"[.\[]", min(fields))[0]: rows for fields, rows in zip(own, large.values(), strict=True)}
+    tops = [re.split(r"[.\[]", min(fields))[0] for fields in own]
+    names = tops if len({*tops}) == len(tops) else [min(fields) for fields in own]
+    kinds: dict[str, list[Row]] = {}
+    for row in every:
+        fits = (name for name, fields in zip(names, own, strict=True) if fields & row.keys())
+        kinds.setdefault(next(fits, "other"), []).append(row)
+    return kinds
 
 
 def _rows(record: Row) -> list[Row]:
@@ -172,7 +179,7 @@ def _flatten(node: Row, name: str, flat: Row, batches: dict[str, list[Any]]) -> 
             _flatten(value, inner, flat, batches)
         elif not isinstance(value, list):
             flat[inner] = value
-        elif len(value) <= MOST_NUMBERS and all(isinstance(each, int | float | None) for each in value):
+        elif len(value) <= MOST_NUMBERS and not any(isinstance(each, dict | list) for each in value):
             flat |= {f"{inner}[{n}]": each for n, each in enumerate(value)}
         else:
             batches[inner] = value

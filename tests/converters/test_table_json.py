@@ -120,3 +120,16 @@ def test_integers_beyond_every_number_harm_nothing_else(tmp_path):
     document = {"serial": 10**400, **DOCUMENTS["arrays"], "flags": [10**400] * COUNT}
     imu = read(tmp_path / "log.json", json.dumps(document)).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, GYRO)
+
+
+def test_rows_of_two_kinds_below_one_name_are_both_kept_and_so_is_a_rare_third(tmp_path):
+    rows = [row for t, g, a in SAMPLES for row in ({"t_ms": t, "data": {"gyro": g}}, {"t_ms": t, "data": {"acc": a}})]
+    rare = [{"t_ms": 5, "battery_V": 3.9}, {"t_ms": 15, "battery_V": 3.8}]
+    found = read(tmp_path / "log.json", json.dumps([*rows, *rare]))
+    np.testing.assert_allclose(found.imus["/imu0"].gyro, GYRO)
+    assert any("battery" in topic for topic in found.scalars)
+
+
+def test_words_of_a_sample_make_no_rows(tmp_path):
+    tagged = [{**row, "tags": ["walk", "fast"]} for row in FLAT]
+    assert np.array_equal(read(tmp_path / "log.json", json.dumps(tagged)).imus["/imu0"].t_ns, 10_000_000 * np.arange(COUNT))
