@@ -22,19 +22,21 @@ from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
 
 LIMIT = 4 << 30  # bytes of numbers in one file
-HDF5, MAT5, PARQUET, ZIP = b"\x89HDF\r\n\x1a\n", b"MATLAB 5.0 MAT-file", b"PAR1", b"PK\x03\x04"
-OLD_EXCEL = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
+    "mat": b"MATLAB 5.0 MAT-file",
+    "hdf5": b"\x89HDF\r\n\x1a\n",
+    "parquet": b"PAR1",
+    "sheet": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
+}
+ZIP = b"PK\x03\x04"
 SHEETS = "xl/workbook.xml", "xl/workbook.bin", "content.xml"  # members of Excel's and LibreOffice's files
 
 
 def kind_of(head: bytes, path: Path) -> str:
     """Kind of a table file by its first bytes; empty for any other file."""
-    if head.startswith(MAT5):
-        return "mat"
-    if head.startswith(HDF5) or head[512:].startswith(HDF5):
-        return "hdf5"
-    if head.startswith((PARQUET, OLD_EXCEL)):
-        return "parquet" if head.startswith(PARQUET) else "sheet"
+    for kind, magic in MAGIC.items():
+        if head.startswith(magic) or (kind == "hdf5" and head[512:].startswith(magic)):
+            return kind
     if head.startswith(ZIP):
         names = _members(path)
         if any(name.endswith(".npy") for name in names) or names & {*SHEETS}:

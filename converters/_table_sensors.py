@@ -100,14 +100,15 @@ def _rows_of_kinds(start: str) -> tuple[str, int, dict[str, str]] | None:
     mark, rows = _split_rows(start)
     header = rows.pop(0) if rows and not any(map(is_number, rows[0])) else []
     for place in range(PLACES):
-        kinds = [row[place].strip().strip('"') for row in rows if len(row) > place]
+        long = [row for row in rows if len(row) > place]
+        kinds = [row[place].strip().strip('"') for row in long]
         counts = Counter(kinds)
         by_name = place < len(header) and re.fullmatch(DEVICE, header[place].strip())
         if not 2 <= len(counts) <= MOST_NAMES or len(kinds) < LEAST_ROWS * len(counts):
             continue
         are_words = all(re.fullmatch(KIND, kind) for kind in counts)
         widths: dict[str, set[int]] = {}
-        for row, kind in zip(rows, kinds, strict=False):
+        for row, kind in zip(long, kinds, strict=True):
             widths.setdefault(kind, set()).add(len(row))
         apart = len(set.union(*widths.values())) > 1 and (are_words or all(len(each) == 1 for each in widths.values()))
         turns = sum(one != other for one, other in pairwise(kinds)) / len(kinds)
