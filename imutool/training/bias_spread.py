@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
 from imutool.training import closed_form
+from imutool.training.closed_form import REST_PRIOR
 from imutool.training.training_windows import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
@@ -36,6 +38,11 @@ LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 18), 3.0  # of the usual walk; how far sensors differ from it, as a deviation
+WALK_WINDOW_S, MOST_WINDOWS, FEWEST_WINDOWS = 5.0, 24, 3
+LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
+POSE_ERROR_S = (0.2, 2.0, 8.0, 30.0)  # how long errors of the poses last
+ERROR_SHARES = np.geomspace(0.02, 1.5, 7)  # of the residuals: errors of the poses, and noise of the windows
 BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
 
 
@@ -89,7 +96,7 @@ def store_statistics(
     model.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     model.prior_std.copy_(torch.from_numpy(turn_on.std))
     model.truth_std.copy_(_start_spread(scored, left, rest))
-    model.walk_std.copy_(_walk(scored, left, rest, window_s))
+    model.walk_std.copy_(_walk(scored, left, rest))
     at_rest = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases)]
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
     return turn_on
@@ -180,28 +187,68 @@ def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float6
     return out
 
 
-def _walk(
-    model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
-) -> Float[Tensor, "6"]:
-    """How far rest biases walk in a second^1/2: the means over a log's two halves differ by walk sqrt(T / 3).
+@torch.no_grad()
+def _walk(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
+    """Random walk of each sensor's rest bias, in its unit per second^1/2; the axes of a sensor share it.
 
-    They also differ by their own errors, whose variances are subtracted: the walk is at least the usual one.
+    The mean of its logarithm, given what all logs show and a normal prior about that of `USUAL_WALK`.
     """
-    begins = torch.searchsorted(pool.log, torch.arange(len(pool.names), device=pool.log.device))
-    length = torch.bincount(pool.log)
-    later = torch.arange(len(pool.t), device=pool.log.device) - begins[pool.log] >= length[pool.log] // 2
-    names = tuple(f"{name} {half}" for name in pool.names for half in ("early", "late"))
-    halves = replace(pool, log=2 * pool.log + later, names=names, floors=pool.floors.repeat_interleave(2, dim=0))
-    both, out = rest.repeat_interleave(2, dim=0), []
+    walk = torch.from_numpy(USUAL_WALK).to(rest, copy=True)
+    logarithm = torch.from_numpy(np.log(WALKS)).to(pool.t.device)
     for sensor in pool.sensors:
-        columns = COLUMNS[sensor]
-        solution = closed_form.solve(model, sensor, halves, both, window_s[sensor], matrix=False, part="all")
-        both[:, columns] = solution.rest
-        change, variance = solution.rest[1::2] - solution.rest[::2], solution.std.square()
-        beyond = change.square() - variance[1::2] - variance[::2]
-        out.append((beyond * (3.0 * pool.rate_hz / length)[:, None]).mean(0).clamp_min(0.0).sqrt())
-    walk = torch.cat([*out, *[rest.new_zeros(3)] * (len(SENSORS) - len(out))])
-    return torch.maximum(walk, torch.from_numpy(USUAL_WALK).to(walk))
+        shown = of_each(partial(_log_likelihood_of_walks, model, sensor, pool, rest), range(len(pool.names)))
+        likely = torch.softmax(sum(shown) - 0.5 * (logarithm / math.log(WALK_FACTOR)).square(), dim=0)
+        walk[COLUMNS[sensor]] *= float((likely * logarithm).sum().exp())
+    return walk
+
+
+def _log_likelihood_of_walks(
+    model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], log: int
+) -> Float[Tensor, " walks"]:
+    """Logarithm of the likelihood of each of `WALKS`, given the residuals of one log's windows.
+
+    In world axes a residual is the bias, carried through the window, with the difference of the poses' errors at both ends and
+    with noise of the window's own. The bias is constant but for its walk. The poses' errors last for a while. How large and
+    how long these errors are, is not known: all sizes and times of a grid count alike.
+    """
+    begin, end = (int(torch.searchsorted(pool.log, log, right=right)) for right in (False, True))
+    n = pool.samples(min(max((end - begin) / pool.rate_hz / MOST_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
+    first = begin + n * torch.arange((end - begin - 1) // n, device=pool.log.device)
+    first = first[torch.isin(first, pool.starts(n, "all"))]
+    if len(first) < FEWEST_WINDOWS:
+        return torch.zeros(len(WALKS), dtype=torch.float64, device=first.device)
+    first = first[:: -(-len(first) // MOST_WINDOWS)]
+    windows = pool.windows(first, n, rest[pool.log[first]])
+    e, J = closed_form.sensor_residual(model, sensor, windows)
+    J = J.sum(1)
+    if sensor == "gyro":  # from the body at a window's end to the world
+        e, J = windows.R_end @ e[..., None], windows.R_end @ J
+    e, J = e.double().reshape(-1, 1), J.double()
+    begins, ends = (pool.t[place].double() for place in (first, first + n))
+    since = (begins + ends) / 2 - (begins[0] + ends[0]) / 2
+    of_bias = torch.einsum("iac,jbc->iajb", J, J)
+    walked = (of_bias * torch.minimum(since[:, None], since)[:, None, :, None]).flatten(2).flatten(0, 1)
+    constant = REST_PRIOR[sensor] ** 2 * of_bias.flatten(2).flatten(0, 1)
+    lasting = [_of_differences(begins, ends, error_s) for error_s in POSE_ERROR_S]
+    poses = torch.stack([torch.kron(of_time, torch.eye(3).to(of_time)) for of_time in lasting])
+    variances = (torch.from_numpy(ERROR_SHARES).to(e) ** 2 * e.square().mean())[:, None, None]
+    own = variances * torch.eye(len(e)).to(e)
+    errors = (variances[:, None, None] * poses[:, None] + own).flatten(0, 2)
+    found = []
+    for walk in (WALKS * USUAL_WALK[COLUMNS[sensor].start]).tolist():
+        L = torch.linalg.cholesky(constant + walk**2 * walked + errors)
+        whitened = torch.linalg.solve_triangular(L, e.expand(len(L), -1, 1), upper=False)
+        chi_square, logdet = whitened.square().sum((1, 2)), 2.0 * L.diagonal(dim1=1, dim2=2).log().sum(1)
+        found.append(torch.logsumexp(-0.5 * (chi_square + logdet), dim=0))
+    return torch.stack(found)
+
+
+def _of_differences(begins: Float[Tensor, " m"], ends: Float[Tensor, " m"], error_s: float) -> Float[Tensor, "m m"]:
+    """Covariance of end minus begin of an error of unit variance that decays by e in `error_s`."""
+    t_s = torch.cat([ends, begins])
+    decayed = torch.exp(-(t_s[:, None] - t_s).abs() / error_s)
+    (ends_ends, ends_begins), (begins_ends, begins_begins) = (rows.chunk(2, dim=1) for rows in decayed.chunk(2))
+    return ends_ends - ends_begins - begins_ends + begins_begins
 
 
 @torch.no_grad()
