@@ -25,7 +25,7 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
 from imutool.training import closed_form
-from imutool.training.closed_form import REST_PRIOR
+from imutool.training.closed_form import nuisance_jacobian
 from imutool.training.training_windows import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
@@ -38,11 +38,12 @@ LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
-WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 18), 3.0  # of the usual walk; how far sensors differ from it, as a deviation
-WALK_WINDOW_S, MOST_WINDOWS, FEWEST_WINDOWS = 5.0, 24, 3
+WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # of the usual walk; how far sensors differ from it, as a deviation
+WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS = 2.5, 24, 3
 LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
-POSE_ERROR_S = (0.2, 2.0, 8.0, 30.0)  # how long errors of the poses last
-ERROR_SHARES = np.geomspace(0.02, 1.5, 7)  # of the residuals: errors of the poses, and noise of the windows
+AVERAGED_S, AVERAGED = 1.0, 8  # windows that begin within this time, whose mean has less of the poses' noise
+POSE_ERROR_S = (0.3, 3.0, 30.0)  # how long errors of the poses last
+POSE_SHARES, ERROR_SHARES = np.geomspace(1e-2, 1e4, 7), np.geomspace(1e-6, 2.0, 30)  # of windows' variance; of residuals'
 BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
 
 
@@ -207,40 +208,60 @@ def _log_likelihood_of_walks(
 ) -> Float[Tensor, " walks"]:
     """Logarithm of the likelihood of each of `WALKS`, given the residuals of one log's windows.
 
-    In world axes a residual is the bias, carried through the window, with the difference of the poses' errors at both ends and
-    with noise of the window's own. The bias is constant but for its walk. The poses' errors last for a while. How large and
-    how long these errors are, is not known: all sizes and times of a grid count alike.
+    In world axes a residual is the bias, carried through the window, with the log's nuisances, the difference of the poses'
+    errors at both ends and noise of the window's own. The bias is constant but for its walk. How large the errors are and how
+    long those of the poses last, is not known: all sizes, shares and times of a grid count alike.
+    """
+    found = _walked_residuals(model, sensor, pool, rest, log)
+    if found is None:
+        return torch.zeros(len(WALKS), dtype=torch.float64, device=pool.t.device)
+    y, walked, poses = found
+    errors = torch.from_numpy(POSE_SHARES).to(y)[:, None, None, None] * poses + torch.eye(len(y)).to(y)
+    L = torch.linalg.cholesky(errors.flatten(0, 1))
+    by_L = torch.linalg.solve_triangular(L, walked.expand_as(L), upper=False)
+    eigenvalues, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, by_L.mT, upper=False))
+    square = (V.mT @ torch.linalg.solve_triangular(L, y.expand(len(L), -1, 1), upper=False))[..., 0].square()
+    walks = (torch.from_numpy(WALKS).to(y) * USUAL_WALK[COLUMNS[sensor].start]) ** 2
+    scale = torch.from_numpy(ERROR_SHARES).to(y) * y.square().mean()
+    variance = scale[:, None, None] + walks[:, None, None, None] * eigenvalues.clamp_min(0.0)
+    log_likelihood = -0.5 * (square / variance + variance.log()).sum(-1) - torch.diagonal(L, dim1=1, dim2=2).log().sum(1)
+    return torch.logsumexp(log_likelihood.flatten(1), dim=1)
+
+
+def _walked_residuals(
+    model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], log: int
+) -> tuple[Float[Tensor, "r 1"], Float[Tensor, "r r"], Float[Tensor, "times r r"]] | None:
+    """Combinations of a log's residuals that no constant of the log changes, if there are any.
+
+    Returns:
+        The combinations, and their covariances by a bias with a walk of one and by poses with errors of one, for each of
+        `POSE_ERROR_S`.
     """
     begin, end = (int(torch.searchsorted(pool.log, log, right=right)) for right in (False, True))
     n = pool.samples(min(max((end - begin) / pool.rate_hz / MOST_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
     first = begin + n * torch.arange((end - begin - 1) // n, device=pool.log.device)
-    first = first[torch.isin(first, pool.starts(n, "all"))]
-    if len(first) < FEWEST_WINDOWS:
-        return torch.zeros(len(WALKS), dtype=torch.float64, device=first.device)
-    first = first[:: -(-len(first) // MOST_WINDOWS)]
-    windows = pool.windows(first, n, rest[pool.log[first]])
-    e, J = closed_form.sensor_residual(model, sensor, windows)
-    J = J.sum(1)
-    if sensor == "gyro":  # from the body at a window's end to the world
-        e, J = windows.R_end @ e[..., None], windows.R_end @ J
-    e, J = e.double().reshape(-1, 1), J.double()
-    begins, ends = (pool.t[place].double() for place in (first, first + n))
-    since = (begins + ends) / 2 - (begins[0] + ends[0]) / 2
-    of_bias = torch.einsum("iac,jbc->iajb", J, J)
-    walked = (of_bias * torch.minimum(since[:, None], since)[:, None, :, None]).flatten(2).flatten(0, 1)
-    constant = REST_PRIOR[sensor] ** 2 * of_bias.flatten(2).flatten(0, 1)
-    lasting = [_of_differences(begins, ends, error_s) for error_s in POSE_ERROR_S]
-    poses = torch.stack([torch.kron(of_time, torch.eye(3).to(of_time)) for of_time in lasting])
-    variances = (torch.from_numpy(ERROR_SHARES).to(e) ** 2 * e.square().mean())[:, None, None]
-    own = variances * torch.eye(len(e)).to(e)
-    errors = (variances[:, None, None] * poses[:, None] + own).flatten(0, 2)
-    found = []
-    for walk in (WALKS * USUAL_WALK[COLUMNS[sensor].start]).tolist():
-        L = torch.linalg.cholesky(constant + walk**2 * walked + errors)
-        whitened = torch.linalg.solve_triangular(L, e.expand(len(L), -1, 1), upper=False)
-        chi_square, logdet = whitened.square().sum((1, 2)), 2.0 * L.diagonal(dim1=1, dim2=2).log().sum(1)
-        found.append(torch.logsumexp(-0.5 * (chi_square + logdet), dim=0))
-    return torch.stack(found)
+    later = torch.linspace(0, min(pool.samples(AVERAGED_S), n // 2), AVERAGED, device=first.device).long()
+    first = first[torch.isin(first[:, None] + later, pool.starts(n, "all")).all(1)]
+    first = first[:: max(1, -(-len(first) // MOST_WINDOWS))]
+    means: Tensor = pool.t.new_zeros(3, 0)
+    for start in first + later[:, None]:
+        windows = pool.windows(start, n, rest[pool.log[start]])
+        e, by_sample = closed_form.sensor_residual(model, sensor, windows)
+        gyro, accel = (u - bias[:, None] for u, bias in map(windows.segment.of, SENSORS))
+        of_all = torch.cat([by_sample.sum(1), nuisance_jacobian(sensor, windows, gyro, accel), e[..., None]], dim=2)
+        if sensor == "gyro":  # from the body at a window's end to the world
+            of_all = windows.R_end @ of_all
+        means = of_all.double() / AVERAGED if not means.numel() else means + of_all.double() / AVERAGED
+    constants, e = means.flatten(0, 1).split((max(means.shape[-1] - 1, 0), 1), dim=1)
+    if len(e) < constants.shape[1] + LEAST_COMBINATIONS:
+        return None
+    free = torch.linalg.qr(constants, mode="complete")[0][:, constants.shape[1] :].mT
+    begins, ends = (pool.t[first + at].double() for at in (int(later[-1]) // 2, int(later[-1]) // 2 + n))
+    since = (begins + ends - begins[0] - ends[0]) / 2
+    by_bias = torch.block_diag(*means[..., :3])
+    lasting = [torch.minimum(since[:, None], since), *(_of_differences(begins, ends, error_s) for error_s in POSE_ERROR_S)]
+    walked, *poses = [torch.kron(of_time, torch.eye(3).to(of_time)) for of_time in lasting]
+    return free @ e, free @ by_bias @ walked @ by_bias.mT @ free.mT, free @ torch.stack(poses) @ free.mT
 
 
 def _of_differences(begins: Float[Tensor, " m"], ends: Float[Tensor, " m"], error_s: float) -> Float[Tensor, "m m"]:
