@@ -25,7 +25,6 @@ from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
 from imutool.training import closed_form
-from imutool.training.closed_form import nuisance_jacobian
 from imutool.training.training_windows import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
@@ -39,7 +38,7 @@ FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # of the usual walk; how far sensors differ from it, as a deviation
-WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS = 2.5, 24, 3
+WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS, LEAST_SQUARE = 2.5, 24, 3, 1e-18
 LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
 AVERAGED_S, AVERAGED = 1.0, 8  # windows that begin within this time, whose mean has less of the poses' noise
 POSE_ERROR_S = (0.3, 3.0, 30.0)  # how long errors of the poses last
@@ -190,10 +189,7 @@ def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float6
 
 @torch.no_grad()
 def _walk(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
-    """Random walk of each sensor's rest bias, in its unit per second^1/2; the axes of a sensor share it.
-
-    The mean of its logarithm, given what all logs show and a normal prior about that of `USUAL_WALK`.
-    """
+    """Random walk of the rest biases: the mean of its logarithm, given all logs and a normal prior about `USUAL_WALK`."""
     walk = torch.from_numpy(USUAL_WALK).to(rest, copy=True)
     logarithm = torch.from_numpy(np.log(WALKS)).to(pool.t.device)
     for sensor in pool.sensors:
@@ -212,8 +208,7 @@ def _log_likelihood_of_walks(
     errors at both ends and noise of the window's own. The bias is constant but for its walk. How large the errors are and how
     long those of the poses last, is not known: all sizes, shares and times of a grid count alike.
     """
-    found = _walked_residuals(model, sensor, pool, rest, log)
-    if found is None:
+    if (found := _walked_residuals(model, sensor, pool, rest, log)) is None:
         return torch.zeros(len(WALKS), dtype=torch.float64, device=pool.t.device)
     y, walked, poses = found
     errors = torch.from_numpy(POSE_SHARES).to(y)[:, None, None, None] * poses + torch.eye(len(y)).to(y)
@@ -222,7 +217,7 @@ def _log_likelihood_of_walks(
     eigenvalues, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, by_L.mT, upper=False))
     square = (V.mT @ torch.linalg.solve_triangular(L, y.expand(len(L), -1, 1), upper=False))[..., 0].square()
     walks = (torch.from_numpy(WALKS).to(y) * USUAL_WALK[COLUMNS[sensor].start]) ** 2
-    scale = torch.from_numpy(ERROR_SHARES).to(y) * y.square().mean()
+    scale = torch.from_numpy(ERROR_SHARES).to(y) * y.square().mean().clamp_min(LEAST_SQUARE)
     variance = scale[:, None, None] + walks[:, None, None, None] * eigenvalues.clamp_min(0.0)
     log_likelihood = -0.5 * (square / variance + variance.log()).sum(-1) - torch.diagonal(L, dim1=1, dim2=2).log().sum(1)
     return torch.logsumexp(log_likelihood.flatten(1), dim=1)
@@ -231,11 +226,9 @@ def _log_likelihood_of_walks(
 def _walked_residuals(
     model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], log: int
 ) -> tuple[Float[Tensor, "r 1"], Float[Tensor, "r r"], Float[Tensor, "times r r"]] | None:
-    """Combinations of a log's residuals that no constant of the log changes, if there are any.
+    """Combinations of a log's residuals that no constant of the log changes, if there are enough.
 
-    Returns:
-        The combinations, and their covariances by a bias with a walk of one and by poses with errors of one, for each of
-        `POSE_ERROR_S`.
+    Also their covariances by a walk of one, and by errors of one of the poses for each of `POSE_ERROR_S`.
     """
     begin, end = (int(torch.searchsorted(pool.log, log, right=right)) for right in (False, True))
     n = pool.samples(min(max((end - begin) / pool.rate_hz / MOST_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
@@ -243,33 +236,30 @@ def _walked_residuals(
     later = torch.linspace(0, min(pool.samples(AVERAGED_S), n // 2), AVERAGED, device=first.device).long()
     first = first[torch.isin(first[:, None] + later, pool.starts(n, "all")).all(1)]
     first = first[:: max(1, -(-len(first) // MOST_WINDOWS))]
-    means: Tensor = pool.t.new_zeros(3, 0)
+    means = []
     for start in first + later[:, None]:
         windows = pool.windows(start, n, rest[pool.log[start]])
         e, by_sample = closed_form.sensor_residual(model, sensor, windows)
         gyro, accel = (u - bias[:, None] for u, bias in map(windows.segment.of, SENSORS))
-        of_all = torch.cat([by_sample.sum(1), nuisance_jacobian(sensor, windows, gyro, accel), e[..., None]], dim=2)
-        if sensor == "gyro":  # from the body at a window's end to the world
-            of_all = windows.R_end @ of_all
-        means = of_all.double() / AVERAGED if not means.numel() else means + of_all.double() / AVERAGED
-    constants, e = means.flatten(0, 1).split((max(means.shape[-1] - 1, 0), 1), dim=1)
+        of_all = torch.cat([by_sample.sum(1), closed_form.nuisance_jacobian(sensor, windows, gyro, accel), e[..., None]], dim=2)
+        means.append((windows.R_end @ of_all if sensor == "gyro" else of_all).double())  # in world axes
+    mean = torch.stack(means).mean(0)
+    constants, e = mean[..., :-1].flatten(0, 1), mean[..., -1:].flatten(0, 1)
     if len(e) < constants.shape[1] + LEAST_COMBINATIONS:
         return None
     free = torch.linalg.qr(constants, mode="complete")[0][:, constants.shape[1] :].mT
     begins, ends = (pool.t[first + at].double() for at in (int(later[-1]) // 2, int(later[-1]) // 2 + n))
-    since = (begins + ends - begins[0] - ends[0]) / 2
-    by_bias = torch.block_diag(*means[..., :3])
-    lasting = [torch.minimum(since[:, None], since), *(_of_differences(begins, ends, error_s) for error_s in POSE_ERROR_S)]
-    walked, *poses = [torch.kron(of_time, torch.eye(3).to(of_time)) for of_time in lasting]
-    return free @ e, free @ by_bias @ walked @ by_bias.mT @ free.mT, free @ torch.stack(poses) @ free.mT
+    since, J = (begins + ends - begins[0] - ends[0]) / 2, mean[..., :3]
+    walked = torch.einsum("iac,ij,jbc->iajb", J, torch.minimum(since[:, None], since), J).flatten(2).flatten(0, 1)
+    poses = [torch.kron(_of_differences(begins, ends, error_s), torch.eye(3).to(e)) for error_s in POSE_ERROR_S]
+    return free @ e, free @ walked @ free.mT, free @ torch.stack(poses) @ free.mT
 
 
 def _of_differences(begins: Float[Tensor, " m"], ends: Float[Tensor, " m"], error_s: float) -> Float[Tensor, "m m"]:
     """Covariance of end minus begin of an error of unit variance that decays by e in `error_s`."""
-    t_s = torch.cat([ends, begins])
-    decayed = torch.exp(-(t_s[:, None] - t_s).abs() / error_s)
-    (ends_ends, ends_begins), (begins_ends, begins_begins) = (rows.chunk(2, dim=1) for rows in decayed.chunk(2))
-    return ends_ends - ends_begins - begins_ends + begins_begins
+    t_s, one = torch.cat([begins, ends]), torch.eye(len(begins)).to(begins)
+    minus = torch.cat([-one, one], dim=1)
+    return minus @ torch.exp(-(t_s[:, None] - t_s).abs() / error_s) @ minus.mT
 
 
 @torch.no_grad()
