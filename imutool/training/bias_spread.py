@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +37,12 @@ LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
+WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # of the usual walk; how far sensors differ from it, as a deviation
+WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS, LEAST_SQUARE = 2.5, 24, 3, 1e-18
+LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
+AVERAGED_S, AVERAGED = 1.0, 8  # windows that begin within this time, whose mean has less of the poses' noise
+POSE_ERROR_S = (0.3, 3.0, 30.0)  # how long errors of the poses last
+POSE_SHARES, ERROR_SHARES = np.geomspace(1e-2, 1e4, 7), np.geomspace(1e-6, 2.0, 30)  # of windows' variance; of residuals'
 BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
 
 
@@ -89,7 +96,7 @@ def store_statistics(
     model.prior_mean.copy_(torch.from_numpy(turn_on.mean))
     model.prior_std.copy_(torch.from_numpy(turn_on.std))
     model.truth_std.copy_(_start_spread(scored, left, rest))
-    model.walk_std.copy_(_walk(scored, left, rest, window_s))
+    model.walk_std.copy_(_walk(scored, left, rest))
     at_rest = [np.where(shown, rows, 0.0) for rows in rest_differences(scored.frozen(), _samples(left), biases)]
     model.rest_std.copy_(torch.from_numpy(shift_at_rest(at_rest, std.cpu().double().numpy())))
     return turn_on
@@ -180,28 +187,79 @@ def shift_at_rest(differences: Sequence[Float64[np.ndarray, "_ 6"]], std: Float6
     return out
 
 
-def _walk(
-    model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"], window_s: Mapping[Sensor, Sequence[float]]
-) -> Float[Tensor, "6"]:
-    """How far rest biases walk in a second^1/2: the means over a log's two halves differ by walk sqrt(T / 3).
-
-    They also differ by their own errors, whose variances are subtracted: the walk is at least the usual one.
-    """
-    begins = torch.searchsorted(pool.log, torch.arange(len(pool.names), device=pool.log.device))
-    length = torch.bincount(pool.log)
-    later = torch.arange(len(pool.t), device=pool.log.device) - begins[pool.log] >= length[pool.log] // 2
-    names = tuple(f"{name} {half}" for name in pool.names for half in ("early", "late"))
-    halves = replace(pool, log=2 * pool.log + later, names=names, floors=pool.floors.repeat_interleave(2, dim=0))
-    both, out = rest.repeat_interleave(2, dim=0), []
+@torch.no_grad()
+def _walk(model: BiasNetwork, pool: Pool, rest: Float[Tensor, "logs 6"]) -> Float[Tensor, "6"]:
+    """Random walk of the rest biases: the mean of its logarithm, given all logs and a normal prior about `USUAL_WALK`."""
+    walk = torch.from_numpy(USUAL_WALK).to(rest, copy=True)
+    logarithm = torch.from_numpy(np.log(WALKS)).to(pool.t.device)
     for sensor in pool.sensors:
-        columns = COLUMNS[sensor]
-        solution = closed_form.solve(model, sensor, halves, both, window_s[sensor], matrix=False, part="all")
-        both[:, columns] = solution.rest
-        change, variance = solution.rest[1::2] - solution.rest[::2], solution.std.square()
-        beyond = change.square() - variance[1::2] - variance[::2]
-        out.append((beyond * (3.0 * pool.rate_hz / length)[:, None]).mean(0).clamp_min(0.0).sqrt())
-    walk = torch.cat([*out, *[rest.new_zeros(3)] * (len(SENSORS) - len(out))])
-    return torch.maximum(walk, torch.from_numpy(USUAL_WALK).to(walk))
+        shown = of_each(partial(_log_likelihood_of_walks, model, sensor, pool, rest), range(len(pool.names)))
+        likely = torch.softmax(sum(shown) - 0.5 * (logarithm / math.log(WALK_FACTOR)).square(), dim=0)
+        walk[COLUMNS[sensor]] *= float((likely * logarithm).sum().exp())
+    return walk
+
+
+def _log_likelihood_of_walks(
+    model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], log: int
+) -> Float[Tensor, " walks"]:
+    """Logarithm of the likelihood of each of `WALKS`, given the residuals of one log's windows.
+
+    In world axes a residual is the bias, carried through the window, with the log's nuisances, the difference of the poses'
+    errors at both ends and noise of the window's own. The bias is constant but for its walk. How large the errors are and how
+    long those of the poses last, is not known: all sizes, shares and times of a grid count alike.
+    """
+    if (found := _walked_residuals(model, sensor, pool, rest, log)) is None:
+        return torch.zeros(len(WALKS), dtype=torch.float64, device=pool.t.device)
+    y, walked, poses = found
+    errors = torch.from_numpy(POSE_SHARES).to(y)[:, None, None, None] * poses + torch.eye(len(y)).to(y)
+    L = torch.linalg.cholesky(errors.flatten(0, 1))
+    by_L = torch.linalg.solve_triangular(L, walked.expand_as(L), upper=False)
+    eigenvalues, V = torch.linalg.eigh(torch.linalg.solve_triangular(L, by_L.mT, upper=False))
+    square = (V.mT @ torch.linalg.solve_triangular(L, y.expand(len(L), -1, 1), upper=False))[..., 0].square()
+    walks = (torch.from_numpy(WALKS).to(y) * USUAL_WALK[COLUMNS[sensor].start]) ** 2
+    scale = torch.from_numpy(ERROR_SHARES).to(y) * y.square().mean().clamp_min(LEAST_SQUARE)
+    variance = scale[:, None, None] + walks[:, None, None, None] * eigenvalues.clamp_min(0.0)
+    log_likelihood = -0.5 * (square / variance + variance.log()).sum(-1) - torch.diagonal(L, dim1=1, dim2=2).log().sum(1)
+    return torch.logsumexp(log_likelihood.flatten(1), dim=1)
+
+
+def _walked_residuals(
+    model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], log: int
+) -> tuple[Float[Tensor, "r 1"], Float[Tensor, "r r"], Float[Tensor, "times r r"]] | None:
+    """Combinations of a log's residuals that no constant of the log changes, if there are enough.
+
+    Also their covariances by a walk of one, and by errors of one of the poses for each of `POSE_ERROR_S`.
+    """
+    begin, end = (int(torch.searchsorted(pool.log, log, right=right)) for right in (False, True))
+    n = pool.samples(min(max((end - begin) / pool.rate_hz / MOST_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
+    first = begin + n * torch.arange((end - begin - 1) // n, device=pool.log.device)
+    later = torch.linspace(0, min(pool.samples(AVERAGED_S), n // 2), AVERAGED, device=first.device).long()
+    first = first[torch.isin(first[:, None] + later, pool.starts(n, "all")).all(1)]
+    first = first[:: max(1, -(-len(first) // MOST_WINDOWS))]
+    means = []
+    for start in first + later[:, None]:
+        windows = pool.windows(start, n, rest[pool.log[start]])
+        e, by_sample = closed_form.sensor_residual(model, sensor, windows)
+        gyro, accel = (u - bias[:, None] for u, bias in map(windows.segment.of, SENSORS))
+        of_all = torch.cat([by_sample.sum(1), closed_form.nuisance_jacobian(sensor, windows, gyro, accel), e[..., None]], dim=2)
+        means.append((windows.R_end @ of_all if sensor == "gyro" else of_all).double())  # in world axes
+    mean = torch.stack(means).mean(0)
+    constants, e = mean[..., :-1].flatten(0, 1), mean[..., -1:].flatten(0, 1)
+    if len(e) < constants.shape[1] + LEAST_COMBINATIONS:
+        return None
+    free = torch.linalg.qr(constants, mode="complete")[0][:, constants.shape[1] :].mT
+    begins, ends = (pool.t[first + at].double() for at in (int(later[-1]) // 2, int(later[-1]) // 2 + n))
+    since, J = (begins + ends - begins[0] - ends[0]) / 2, mean[..., :3]
+    walked = torch.einsum("iac,ij,jbc->iajb", J, torch.minimum(since[:, None], since), J).flatten(2).flatten(0, 1)
+    poses = [torch.kron(_of_differences(begins, ends, error_s), torch.eye(3).to(e)) for error_s in POSE_ERROR_S]
+    return free @ e, free @ walked @ free.mT, free @ torch.stack(poses) @ free.mT
+
+
+def _of_differences(begins: Float[Tensor, " m"], ends: Float[Tensor, " m"], error_s: float) -> Float[Tensor, "m m"]:
+    """Covariance of end minus begin of an error of unit variance that decays by e in `error_s`."""
+    t_s, one = torch.cat([begins, ends]), torch.eye(len(begins)).to(begins)
+    minus = torch.cat([-one, one], dim=1)
+    return minus @ torch.exp(-(t_s[:, None] - t_s).abs() / error_s) @ minus.mT
 
 
 @torch.no_grad()
