@@ -23,7 +23,8 @@ def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[Decimat
     """
     y = np.clip(y, -LARGEST, LARGEST)
     step = np.diff(t)
-    gaps = np.flatnonzero(step > max(GAP_FACTOR * median(step), np.sum(step) / (2 * buckets))) if len(step) else np.zeros(0, int)
+    longer = max(GAP_FACTOR * median(step), np.sum(step) / (2 * buckets)) if len(step) else 0.0
+    gaps = np.flatnonzero(step > longer)
     keep = np.arange(len(t))
     if len(t) > 2 * buckets:
         edges = np.linspace(0, len(t), buckets + 1).astype(int)
