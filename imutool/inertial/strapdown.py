@@ -89,7 +89,7 @@ def dead_reckon(
 
 
 def gaps_crossed(path: Poses, longer_s: float, start_ns: int) -> str:
-    """Gaps of the IMU that an integration crosses, in words, from `start_ns` on; empty without one."""
+    """Gaps of the IMU that an integration crosses, in words; times count from `start_ns`."""
     t = seconds(path.t_ns, start_ns)
     gaps = np.flatnonzero(np.diff(t) > longer_s)
     if not len(gaps):
