@@ -25,11 +25,11 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, find_aids, parse_aids
-from imutool.inertial.strapdown import StartPose, along_truth, drift
+from imutool.inertial.strapdown import StartPose, along_truth, drift, gaps_crossed
 from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import writing
-from imutool.recording import Imu, Poses, Recording, seconds
+from imutool.recording import Imu, Poses, Recording
 
 logger = logging.getLogger(__name__)
 
@@ -99,8 +99,8 @@ def _evaluated(
         fit = judge(model, start, [model_samples(model, recording.imu)], about) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
-        if name == RAW:
-            _warn_of_gaps(integrated, recording.name)
+        if name == RAW and (gaps := gaps_crossed(integrated, GAP_S, int(recording.imu.t_ns[0]))):
+            logger.warning("%s: %s", recording.name, gaps)
         estimates = {PURE: integrated}
         if aids is not None:
             estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), residual_prior(start, std), aids)
@@ -135,16 +135,6 @@ def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str
     rms = [float(np.sqrt(np.mean(errors**2))) for errors in (found.orientation_rad, found.velocity_m_s)]
     velocity = rms[1] if truth.has_positions else None
     return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": velocity, "drift_window_s": DRIFT_S}
-
-
-def _warn_of_gaps(path: Poses, name: str) -> None:
-    """Log the gaps of the IMU that an integration crosses."""
-    t = seconds(path.t_ns, int(path.t_ns[0]))
-    gaps = np.flatnonzero(np.diff(t) > GAP_S)
-    if len(gaps):
-        length, first = np.diff(t)[gaps].sum(), t[gaps[0]]
-        kept = "the integration keeps the last sample over a gap, and the scores include this"
-        logger.warning("%s: gaps of the IMU: %d, %.1f s in all, the first at %.3f s; %s", name, len(gaps), length, first, kept)
 
 
 def _over(imu: Imu, true: Poses) -> Imu:

@@ -194,8 +194,10 @@ def _combine(
         for kind in KINDS:
             name = f"{sensor}_{kind}"
             still = UNKNOWN if rest is None else rest.axes(sensor, kind)
-            if kind == "density":  # a fit to vibration may exceed the upper bound
-                still = [s if s is None or b is None or s <= b else None for s, b in zip(still, at_most[sensor], strict=True)]
+            if rest is not None and kind == "density":  # a fit to vibration may exceed the upper bound by more than its error
+                errors = [slopes.std.get(kind, 0.0) for slopes in rest.slopes[sensor]]
+                bounds = zip(still, errors, at_most[sensor], strict=True)
+                still = [s if s is None or b is None or s - std <= b else None for s, std, b in bounds]
             moving = UNKNOWN if motion is None or kind == "instability" else motion.axes(sensor, kind)
             values[name] = [s if s is not None else m if b else None for s, m, b in zip(still, moving, accepted, strict=True)]
             used = (rest, still != UNKNOWN), (motion, values[name] != still)
@@ -285,7 +287,7 @@ def rows(identified: IdentifiedNoise) -> list[tuple[str, ...]]:
         if identified.at_rest is not None and None in getattr(identified.noise, name):
             table.append((f"{name} at most", *map(_number, identified.at_most[sensor]), unit, identified.at_rest.how))
         differences = map(_number, identified.samples[sensor])
-        table.append((f"{name} of samples", *differences, unit, "second differences of the samples"))
+        table.append((f"{name} of samples", *differences, unit, "calm second differences; 5/6 of white noise"))
         if motion is not None:
             axes = {f"{sensor}_{kind}": motion.axes(sensor, kind) for kind in ("density", "walk")}
             table += [(f"{n} in motion", *map(_number, v), UNITS[n], motion.how) for n, v in axes.items() if v != UNKNOWN]

@@ -109,9 +109,13 @@ class Intervals:
         self.count += len(number)
 
     def add_run(self, numbers: tuple[int, int], stamps_ns: tuple[int, int], count: int) -> None:
-        """Add a run of samples by its first and last one."""
-        self.add(np.array(numbers), np.array(stamps_ns))
-        self.count += count - 2
+        """Add a run of samples by its first and last one; a long run, too, is one interval."""
+        self.add(np.array(numbers[:1]), np.array(stamps_ns[:1]))
+        if not self.left_out:
+            first, last = self.intervals[-1]
+            self.intervals[-1] = first, max(last, stamps_ns[1])
+        self._last = numbers[1]
+        self.count += count - 1
 
     def where(self) -> dict[str, Any]:
         """Count and intervals, by the names of `Finding`."""

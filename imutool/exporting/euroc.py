@@ -22,6 +22,7 @@ from imutool.noise.datasheet import Noise
 from imutool.recording import Frames, Poses, Recording, Scalars, unit_quaternions
 
 BLOCK_ROWS = 10_000
+FEWEST = 2  # samples
 IMU_COLUMNS = (
     "timestamp [ns]",
     *(f"w_RS_S_{axis} [rad s^-1]" for axis in "xyz"),
@@ -66,6 +67,8 @@ def write(
         velocities = {name: t.metadata[VELOCITY_KEY] for name, t in opened.topics.items() if VELOCITY_KEY in t.metadata}
     with FolderTarget(out, log, signed="mav0/imu0/sensor.yaml", holds="mav0", overwrite=overwrite) as folder:
         recording = read(log, imu=topic)
+        if len(recording.imu) < FEWEST:
+            raise LogError(f"{topic} has {len(recording.imu)} samples", where=log, expected=f"{FEWEST} or more, for a rate")
         with writing(out):
             writer = _Asl(folder / "mav0", recording, tell)
             writer.imu(given)

@@ -88,6 +88,16 @@ def dead_reckon(
     return Poses(imu.t_ns, p_wb, q_wb, v_w)
 
 
+def gaps_crossed(path: Poses, longer_s: float, start_ns: int) -> str:
+    """Gaps of the IMU that an integration crosses, in words; times count from `start_ns`."""
+    t = seconds(path.t_ns, start_ns)
+    gaps = np.flatnonzero(np.diff(t) > longer_s)
+    if not len(gaps):
+        return ""
+    found = f"gaps of the IMU: {len(gaps)}, {np.diff(t)[gaps].sum():.1f} s in all, the first at {t[gaps[0]]:.3f} s"
+    return f"{found}; the integration keeps the last sample over a gap, and the scores include this"
+
+
 def along_truth(imu: Imu, truth: Poses, where: str) -> tuple[Poses, Poses, Bool[np.ndarray, " n"]]:
     """Dead-reckoned trajectory, the truth on the same stamps, and the mask of valid rows.
 

@@ -182,6 +182,7 @@ def test_an_axis_that_stands_still_is_said_and_distrusted_when_it_does_for_long(
     short = look(with_values(made, slice(1000, 1300), 1, 0.0123))
     assert only(short, "stuck").values["axis"] == "gyro.y"
     assert (only(short, "stuck").count, short.verdict) == (300, "usable")
+    assert only(short, "stuck").intervals_ns == ((int(made.stamp_ns[1000]), int(made.stamp_ns[1299])),)
     long = look(with_values(made, slice(1000, 5000), 1, 0.0123))
     assert long.verdict == "quarantine"
     assert "gyro.y stands still" in long.reasons[0]

@@ -198,6 +198,14 @@ def test_a_page_escapes_what_comes_from_the_log(folder: Path) -> None:
     assert "\u202e" not in page
 
 
+def test_a_page_of_a_log_cleaned_with_force_does_not_deny_it(folder: Path) -> None:
+    found = replace(survey(folder / "spoiled.mcap"), reasons=("nobody trusts it",))
+    assert "it is not cleaned" in cleaning_page.html([found])
+    forced = cleaning_page.html([replace(found, settings=CleaningSettings(force=True))])
+    assert "it is not cleaned" not in forced
+    assert "not trustworthy" in forced
+
+
 def test_rules_are_named_and_a_wrong_name_suggests_the_nearest(folder: Path, imutool: Command) -> None:
     done = imutool("clean", "spoiled.mcap", "--rule", "spikes", "--json", "-", cwd=folder)
     assert counts(json.loads(done.stdout)) == {"spikes": 3}

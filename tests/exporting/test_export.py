@@ -397,3 +397,11 @@ def test_export_imports_nothing_heavy(log: Path, tmp_path: Path) -> None:
     words = ("export", "log.mcap", "out", "--format", "euroc", "-q")
     assert loaded_by_command(words, {"torch", "rosbags", "matplotlib", "rerun", "allantools"}, cwd=tmp_path) == []
     assert (tmp_path / "out").exists()
+
+
+def test_a_log_of_one_sample_has_no_rate_and_is_named(tmp_path: Path) -> None:
+    made = flight(5, duration_s=2.0)
+    write(Recording("one", made.imu.rows(slice(1))), tmp_path / "one.mcap")
+    with pytest.raises(LogError, match=r"one\.mcap: /imu0 has 1 samples"):
+        export(tmp_path / "one.mcap", tmp_path / "out", format="euroc")
+    assert not (tmp_path / "out").exists()

@@ -361,3 +361,15 @@ def test_the_table_holds_what_was_found(tmp_path: Path) -> None:
     assert cells["gyro_density"][0] == f"{found.noise.gyro_density[0]:.2e}"
     assert cells["gyro_walk"][:3] == ("–", "–", "–")
     assert {row[4] for row in rows(found)[1:]} == set(UNITS.values())
+
+
+def test_white_noise_is_known_on_every_axis(tmp_path: Path) -> None:
+    """The fit scatters about the bound of its shortest times by less than its own error, and is no vibration."""
+    for seed in range(4):
+        drawn = np.random.default_rng(seed).standard_normal((20_000, 6))
+        t_ns = np.arange(len(drawn)) * 10_000_000
+        still = Imu(t_ns, 2e-3 * drawn[:, :3], [0.0, 0.0, GRAVITY_M_S2] + 2e-2 * drawn[:, 3:])
+        write(Recording(name="still", imu=still), tmp_path / f"{seed}.mcap")
+        found = identify(tmp_path / f"{seed}.mcap").noise
+        assert found.gyro_density == pytest.approx([2e-4] * 3, rel=0.05)
+        assert found.accel_density == pytest.approx([2e-3] * 3, rel=0.05)

@@ -16,6 +16,7 @@ VERDICTS = {
     "usable": "usable; the clean channel leaves out invalid samples, as listed below",
     "quarantine": "not trustworthy; it is not cleaned",
 }
+FORCED = "not trustworthy; the clean channel is written because `force` asks for it, and leaves out invalid samples alone"
 COLORS = {"note": "var(--held)", "warning": "var(--mark)", "error": "var(--before)"}
 STRIP = "display: block; width: 100%; min-width: 300px; height: 14px; background: var(--panel)"
 MIN_WIDTH = 0.002  # of the strip, so that one sample in an hour is visible
@@ -49,7 +50,8 @@ def _imu(survey: Survey) -> Iterator[str]:
 def _sentence(survey: Survey) -> str:
     seconds = (survey.end_ns - survey.start_ns) * 1e-9
     counts = f"{survey.valid} of {survey.messages} samples in {seconds:.1f} s are valid, {survey.missing} are missing"
-    parts = [f"{counts}: {VERDICTS[survey.verdict]}"]
+    forced = survey.verdict == "quarantine" and survey.settings.force
+    parts = [f"{counts}: {FORCED if forced else VERDICTS[survey.verdict]}"]
     if survey.scale[3] != 1.0:
         parts.append(f"accel is multiplied by {survey.scale[3]:.6g}")
     if survey.scale[0] != 1.0:

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
 from imutool.recording import Poses
 from imutool.units import AXES
 from imutool.viewing.html.drawing import Panel, Picture, legend
 from imutool.viewing.html.page import BEFORE, HELD, INK, LEVELS, MODELS
 from imutool.viewing.html.report_wording import best_run, format_quantity, run_name
-from imutool.viewing.model.run_data import RunData, Trace, path_rows, split_at_gaps
+from imutool.viewing.model.run_data import RunData, Trace, gap_rows, path_rows, split_at_gaps
 
 HEIGHT_INCH = 4.3
 MAX_POINTS = 1500  # of a path
@@ -70,7 +70,7 @@ def error_map(data: RunData) -> Picture | None:
     panels = []
     for kind, (error, unit) in kinds.items():
         title = f"{kind} error, at most {format_quantity(float(np.nanmax(error)), unit)}"
-        draw = partial(_draw_heat, points=points, error=error, title=title, unit=unit)
+        draw = partial(_draw_heat, points=points, holes=gap_rows(trace.path), error=error, title=title, unit=unit)
         panels.append(Panel(draw, HEIGHT_INCH, f"{kind} error of {trace.name} along the path from above, in colours"))
     whose = f"Path of {run_name(trace)}" if fits else "The true path"
     caption = f"{whose} from above, coloured by the error of {run_name(trace)}."
@@ -98,13 +98,16 @@ def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: 
     legend(figure, lines)
 
 
-def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"], title: str, unit: str) -> None:
+def _draw_heat(
+    figure: Any, *, points: Points, holes: Int64[np.ndarray, " _"], error: Float64[np.ndarray, " _"], title: str, unit: str
+) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.ticker import MaxNLocator
 
     axes = figure.subplots()
     starts = np.unique(np.linspace(0, len(points) - 1, min(len(points), MAX_POINTS)).astype(int))
+    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, holes) - 1)  # steps without a gap of the samples
     points, error = points[starts], np.fmax.reduceat(error, starts)  # the largest error of each step
     scale, unit = _unit_of(float(np.nanmax(error))) if unit == "m" else (1.0, unit)
     error = error * scale
@@ -112,10 +115,10 @@ def _draw_heat(figure: Any, *, points: Points, error: Float64[np.ndarray, " _"],
     edges = np.asarray(MaxNLocator(len(LEVELS), min_n_ticks=3).tick_values(0.0, top if top > 0.0 else 1.0))
     edges = edges[edges >= 0.0][: len(LEVELS) + 1]
     level = np.clip(np.searchsorted(edges, error, side="right") - 1, 0, len(edges) - 2)
-    axes.plot(points[:, 0], points[:, 1], color=HELD, lw=0.6)  # where the truth is unknown
+    axes.plot(*_pieces(points, whole), color=HELD, lw=0.6)  # where the truth is unknown
     colors = [LEVELS[round(k * (len(LEVELS) - 1) / max(len(edges) - 2, 1))] for k in range(len(edges) - 1)]
     for k, color in enumerate(colors):
-        here = (level == k) & np.isfinite(error)
+        here = (level == k) & np.isfinite(error) & whole
         x, y = _pieces(points, here)
         axes.plot(x, y, color=color, lw=2.2, label=f"{edges[k]:g} to {edges[k + 1]:g} {unit}", solid_capstyle="round")
     _equal(axes, points[:, :2], MIN_EXTENT_M)

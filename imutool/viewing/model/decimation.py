@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from imutool.array_types import Bool, Float64
-from imutool.recording.columns import true_ranges
+from imutool.recording import GAP_FACTOR
+from imutool.recording.columns import median, true_ranges
 
 PER_DECADE = 40  # points of a spectrum
 LARGEST = 1e300  # of a drawn value: beyond, the limits of an axis overflow
@@ -16,16 +17,23 @@ DecimatedLine = Float64[np.ndarray, " m"]  # shorter than the line it comes from
 
 
 def decimate_extremes(t: Line, y: Line, buckets: int = BUCKETS) -> tuple[DecimatedLine, DecimatedLine]:
-    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps."""
+    """Decimate a line to the lowest and highest sample of each bucket; gaps stay gaps.
+
+    Where samples are missing for longer than half a bucket, a NaN breaks the line: a straight one would pass for samples.
+    """
     y = np.clip(y, -LARGEST, LARGEST)
-    if len(t) <= 2 * buckets:
-        return t, y
-    edges = np.linspace(0, len(t), buckets + 1).astype(int)
-    values = y[np.minimum(edges[:-1, None] + np.arange(np.diff(edges).max()), edges[1:, None] - 1)]
-    known = ~np.isnan(values)
-    lowest, highest = np.where(known, values, np.inf).argmin(axis=1), np.where(known, values, -np.inf).argmax(axis=1)
-    keep = np.unique(np.where(known.any(axis=1), [lowest, highest], 0) + edges[:-1])
-    return t[keep], y[keep]
+    step = np.diff(t)
+    longer = max(GAP_FACTOR * median(step), np.sum(step) / (2 * buckets)) if len(step) else 0.0
+    gaps = np.flatnonzero(step > longer)
+    keep = np.arange(len(t))
+    if len(t) > 2 * buckets:
+        edges = np.linspace(0, len(t), buckets + 1).astype(int)
+        values = y[np.minimum(edges[:-1, None] + np.arange(np.diff(edges).max()), edges[1:, None] - 1)]
+        known = ~np.isnan(values)
+        lowest, highest = np.where(known, values, np.inf).argmin(axis=1), np.where(known, values, -np.inf).argmax(axis=1)
+        keep = np.union1d(np.where(known.any(axis=1), [lowest, highest], 0) + edges[:-1], [*gaps, *(gaps + 1)]).astype(int)
+    at = np.searchsorted(keep, gaps) + 1
+    return np.insert(t[keep], at, (t[gaps] + t[gaps + 1]) / 2.0), np.insert(y[keep], at, np.nan)
 
 
 def true_intervals(t: Line, mask: Bool[np.ndarray, " n"]) -> list[tuple[float, float]]:

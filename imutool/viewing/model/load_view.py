@@ -14,12 +14,13 @@ import numpy as np
 
 from imutool import __version__
 from imutool.array_types import Bool
+from imutool.bias.model import GAP_S
 from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
 from imutool.file_location import Location
 from imutool.inertial.aids import Aids, find_aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
-from imutool.inertial.strapdown import StartPose, stretch_with_truth, with_velocity
+from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
 from imutool.viewing.model.events import Event, events_within, finding_events, stop_events, survey_events, worst_error_events
 from imutool.viewing.model.read_log import read_log
@@ -192,11 +193,13 @@ def _scored(runs: Sequence[Run], truth: Poses, where: str, align: Alignment) -> 
         scored = list(pool.map(partial(_score, align=align), runs, known))
     traces, motions = tuple(trace for trace, _ in scored), [motion for _, motion in scored if motion]
     started = seconds(traces[0].path.t_ns[:1], int(runs[0].imu.t_ns[0]))[0]
+    gaps = gaps_crossed(traces[0].path, GAP_S, int(runs[0].imu.t_ns[0]))
     how = "errors are without alignment" if align == "none" else f"paths and errors are shown after alignment {align}"
     return traces, [
         f"Paths start at the true pose, {started:.2f} s into the log; {how}.",
         *(["The figures, drift and windows are without alignment."] if motions else []),
         *motions,
+        *([f"{gaps[0].upper()}{gaps[1:]}."] if gaps else []),
     ]
 
 
@@ -233,7 +236,7 @@ def _decimation_note(imu: Imu) -> list[str]:
     """Note on a log too long to be drawn whole."""
     if len(imu) <= MAX_CURVE_ROWS:
         return []
-    return [f"Curves of {len(imu)} samples are drawn with at most {MAX_CURVE_ROWS} rows that include every local extreme."]
+    return [f"Curves of {len(imu)} samples are drawn with at most {MAX_CURVE_ROWS} rows: the extremes of each stretch."]
 
 
 METADATA_PREFIX = "imutool"  # of the names of metadata records that imutool writes

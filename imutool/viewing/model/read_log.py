@@ -20,7 +20,7 @@ from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.mcap_io.recovery.losses import describe
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.temperature import with_temperatures
-from imutool.mcap_io.topics import DERIVED_KEY
+from imutool.mcap_io.topics import DERIVED_KEY, UNSET_FIX
 from imutool.recording import Imu, Recording
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.viewing.model.run_data import LogTimes, Run
@@ -144,7 +144,8 @@ def _sound_samples(batches: Sequence[ImuBatch], survey: Survey, where: str) -> t
         why = error.what
         samples, logged = _columns(list(map(Cleaner(survey), batches)))
     if len(samples) < MIN_SAMPLES:
-        raise LogError(f"has {len(samples)} samples that can be shown", where=where, expected=f"at least {MIN_SAMPLES}")
+        what, unset = f"has {len(samples)} samples that can be shown", survey.messages >= MIN_SAMPLES and not survey.end_ns
+        raise LogError(what, where=where, expected=f"at least {MIN_SAMPLES}", fix=UNSET_FIX if unset else "")
     return samples, logged, why
 
 

@@ -176,12 +176,16 @@ def level_start(imu: Imu) -> StartPose:
     return StartPose(level.as_quat(scalar_first=True), np.zeros(3), np.zeros(3))
 
 
-def split_at_gaps(poses: Poses) -> list[Poses]:
-    """Split poses at their gaps (as `Poses.at` defines them), so that no line crosses one."""
+def gap_rows(poses: Poses) -> Int64[np.ndarray, " m"]:
+    """Rows that follow a gap, as `Poses.at` defines it."""
     if len(poses) < 2:
-        return [poses]
-    gap_ns = nanoseconds(max(GAP_FACTOR * poses.period_s, MIN_GAP_S))
-    edges = [0, *(np.flatnonzero(np.diff(poses.t_ns) > gap_ns) + 1).tolist(), len(poses)]
+        return np.zeros(0, np.int64)
+    return np.flatnonzero(np.diff(poses.t_ns) > nanoseconds(max(GAP_FACTOR * poses.period_s, MIN_GAP_S))) + 1
+
+
+def split_at_gaps(poses: Poses) -> list[Poses]:
+    """Split poses at their gaps, so that no line crosses one."""
+    edges = [0, *gap_rows(poses).tolist(), len(poses)]
     return [poses.rows(slice(first, last)) for first, last in pairwise(edges)]
 
 

@@ -340,6 +340,18 @@ def test_thinning_a_line_keeps_its_ends_of_scale_its_order_and_its_length_in_bou
     np.testing.assert_array_equal(y[thin_t.astype(int)], thin_y)
 
 
+@pytest.mark.parametrize("rate_hz", [1, 8000])
+@pytest.mark.parametrize("samples", [500, 20_000])
+def test_no_line_crosses_a_gap(samples: int, rate_hz: int) -> None:
+    rows = np.arange(samples)
+    rows = rows[(rows < 0.4 * samples) | (rows >= 0.5 * samples)]
+    t, y = rows / rate_hz, np.sin(0.01 * rows)
+    drawn_t, drawn_y = decimation.decimate_extremes(t, y)
+    (hole,) = np.flatnonzero(np.isnan(drawn_y))
+    assert drawn_t[[hole - 1, hole + 1]].tolist() == [(0.4 * samples - 1) / rate_hz, 0.5 * samples / rate_hz]
+    assert drawn_t[hole - 1] < drawn_t[hole] < drawn_t[hole + 1]
+
+
 def test_a_mask_becomes_stretches_of_time() -> None:
     t = np.arange(6) / 2.0
     mask = np.array([True, True, False, True, False, True])

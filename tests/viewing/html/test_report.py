@@ -340,6 +340,29 @@ def test_the_path_is_coloured_by_its_error_and_the_largest_keeps_its_colour(seen
     assert report_paths.error_map(replace(seen, truth=None)) is None
 
 
+def test_gaps_of_the_samples_are_no_path_and_are_said(flown: Recording) -> None:
+    number = np.arange(len(flown.imu))
+    cut = replace(flown, imu=flown.imu.rows((number < 2000) | (number >= 2500)))  # at 200 Hz
+    holed, whole = (build(one, [Run.raw(one.imu)]) for one in (cut, flown))
+    assert any(note.startswith("Gaps of the IMU: 1, 2.5 s in all, the first at 9.995 s") for note in holed.notes)
+    assert not any("Gaps of the IMU" in note for note in whole.notes)
+    for data, parts in ((holed, 2), (whole, 1)):
+        assert [path.count("M") for path in lines(panel(data, report_signals.signals))] == 3 * [parts]
+        longest = max(step for path in lines(panel(data, report_paths.error_map)) for step in steps(path))
+        assert longest < 10.0  # points; the 2.5 s would be a line of 70
+
+
+def lines(svg: str) -> list[str]:
+    """Paths of the curves that have a title."""
+    return re.findall(r'<g id="[^"]*curve-\d+"><title>[^<]*</title>\s*<path d="([^"]*)"', svg)
+
+
+def steps(path: str) -> list[float]:
+    """Lengths of the drawn steps of a path."""
+    parts = [np.array([pair.split() for pair in part.split("L")], dtype=float) for part in path.split("M")[1:]]
+    return [float(length) for part in parts for length in np.linalg.norm(np.diff(part, axis=0), axis=1)]
+
+
 def empty(drawn: dict[str, np.ndarray]) -> set[str]:
     """Levels that no step of the path is in have no corners, and no curve."""
     return {f"{k} to {k + 1} m" for k in range(7)} - set(drawn)

@@ -295,3 +295,10 @@ def test_of_samples_between_two_poses_the_poses_around_them_are_shown(made: Reco
     )
     assert data.truth is not None
     assert data.truth.t_ns.tolist() == [start_ns, end_ns]
+
+
+def test_of_stamps_that_were_never_set_the_refusal_says_what_to_do(made: Recording, tmp_path: Path) -> None:
+    batch = batch_of(made.imu)
+    write_log(batch._replace(stamp_ns=np.zeros_like(batch.stamp_ns)), tmp_path / "unset.mcap")
+    with pytest.raises(LogError, match="--restamp takes the log times"):
+        load(tmp_path / "unset.mcap")
