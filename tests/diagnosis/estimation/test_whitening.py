@@ -101,6 +101,14 @@ def test_level_of_white_noise_is_its_size(seed: int, count: int) -> None:
     np.testing.assert_allclose(w(STD * white(seed, count))[6:].std(axis=0), 1.0, atol=LEVEL)
 
 
+@pytest.mark.parametrize("rows_in_one_run", [520, 780, 1040])
+def test_level_of_white_noise_is_its_size_where_one_to_three_segments_count(rows_in_one_run: int) -> None:
+    """A recording at 50 Hz has few segments between its held-out blocks, and a median over few is skewed."""
+    usable = np.arange(4096) < rows_in_one_run
+    power = [level(white(seed, 4096), usable, 50.0, NoiseSettings()).std ** 2 for seed in range(20)]
+    assert abs(float(np.mean(power)) - 1.0) < LEVEL
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_level_counts_what_is_left_of_a_simulations_noise_where_a_motion_hides_it(seed: int) -> None:
     """Noise of twice the size below a tenth of the rate, as of a simulation that moves up to there."""
