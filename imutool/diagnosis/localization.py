@@ -15,12 +15,13 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.stats import chi2, mannwhitneyu
 
-from imutool.array_types import Bool, Float64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import IMU_SIGNALS, AlignedLog, Pair, Variables
 from imutool.diagnosis.result import Extent, Finding, Located
 from imutool.diagnosis.settings import LocalizationSettings
 from imutool.units import AXES, SENSORS
 
+CALM_SHARE = 0.25  # of the seconds, that a misfit which comes and goes leaves alone
 TIMES = ("after", "in the first")  # how a regime of the time begins, above and below its threshold
 Samples = Float64[np.ndarray, "_ k"]
 
@@ -47,13 +48,13 @@ def locate_residual(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations of unexplained residuals, by running means that stand out; else everywhere.
+    """Locations of unexplained residuals, by running means that stand out of those of the calm seconds; else everywhere.
 
     `p_values` are those of white noise, by signal.
     """
     count = settings.mean_samples
     means = [np.asarray(uniform_filter1d(pair.real - a, count, axis=0)) for pair, a in zip(pairs, after, strict=True)]
-    located = _locate_logs(pairs, means, floor / np.sqrt(count), p_values, settings, certain=p_values)
+    located = _locate_logs(pairs, means, floor / np.sqrt(count), p_values, settings, p_values, averaged=count)
     return [place for place in located if place.signal in p_values]
 
 
@@ -64,13 +65,14 @@ def _locate_logs(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
     certain: Container[str],
+    averaged: int = 0,
 ) -> list[Located]:
     """Strongest first, log by log: `log` is the pair's name where there are several."""
     logs = list(dict.fromkeys(pair.name for pair in pairs))
     out = []
     for log in logs:
         segments = [(pair, misfit) for pair, misfit in zip(pairs, misfits, strict=True) if pair.name == log]
-        located = _locate_log(segments, floor, p_values, settings, certain)
+        located = _locate_log(segments, floor, p_values, settings, certain, averaged)
         out += [msgspec.structs.replace(place, log=log) if len(logs) > 1 else place for place in located]
     return sorted(out, key=lambda place: place.p_value)
 
@@ -81,6 +83,7 @@ def _locate_log(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
     certain: Container[str],
+    averaged: int,
 ) -> list[Located]:
     """Segments of one log share its clock; each has its own constant."""
     t_s = np.concatenate([pair.stamp_s for pair, _ in segments])
@@ -88,7 +91,7 @@ def _locate_log(
     each = [pair.variables() for pair, _ in segments]
     common = set.intersection(*map(set, each))  # a channel that is constant, or starts late, is not in every segment
     variables = {n: (unit, np.concatenate([own[n][1] for own in each])) for n, (unit, _) in each[0].items() if n in common}
-    return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals, certain)
+    return locate(t_s, misfit, floor, variables, p_values, settings, segments[0][0].signals, certain, averaged)
 
 
 def _converter_output(samples: Float64[np.ndarray, "n k"], findings: Sequence[Finding]) -> Float64[np.ndarray, "n k"]:
@@ -113,30 +116,33 @@ def locate(
     settings: LocalizationSettings | None = None,
     signals: Mapping[str, slice] = IMU_SIGNALS,
     certain: Container[str] = (),
+    averaged: int = 0,
 ) -> list[Located]:
     """Locations of a misfit by signal, strongest first; samples may span several segments.
 
     Args:
         t_s: stamps of the samples.
-        misfit: real minus expected samples, without noise.
+        misfit: real minus expected samples, without noise, or running means with it.
         noise: standard deviation of a sample, by column.
         variables: what a regime can be of, by name, with unit and values at the samples.
         p_values: of the misfit by signal.
         settings: those of a diagnosis by default.
         signals: columns by signal; the axes of a signal of three are named.
         certain: signals that have a misfit; where no single second shows it, it lies everywhere.
+        averaged: samples of a running mean, if the misfit has noise.
     """
     settings = settings or LocalizationSettings()
     located = []
     scaled = (misfit - np.median(misfit, axis=0)) / noise
     seconds, window = np.unique(np.floor((t_s - t_s[0]) / settings.window_s), return_inverse=True)
     for signal, columns in signals.items():
-        part = scaled[:, columns] ** 2
-        axes_power = part.sum(axis=0)
+        by_axis = np.stack([np.bincount(window, weights=column) for column in (scaled[:, columns] ** 2).T], axis=1)
+        inside = by_axis.sum(axis=1) > settings.clear_squares
+        if averaged:
+            by_axis, inside = _beyond_noise(by_axis, np.bincount(window), averaged, settings)
+        axes_power, power = by_axis.sum(axis=0), by_axis.sum(axis=1)
         least = max(settings.clear_squares, settings.axis_share * axes_power.max())
         axes = np.flatnonzero(axes_power > least).tolist()
-        power = np.bincount(window, weights=part.sum(axis=1))
-        inside = power > settings.clear_squares
         if axes and not inside.any() and signal in certain:
             inside = np.ones(len(power), bool)
         if not axes or not inside.any():
@@ -154,6 +160,21 @@ def locate(
             )
         )
     return sorted(located, key=lambda place: place.p_value)
+
+
+def _beyond_noise(
+    power: Float64[np.ndarray, "w k"], counts: Int64[np.ndarray, " w"], averaged: int, settings: LocalizationSettings
+) -> tuple[Float64[np.ndarray, "w k"], Bool[np.ndarray, " w"]]:
+    """Squares of windows beyond those of noise, and the windows in which an axis stands out of the calmest quarter.
+
+    A sample of running means has a square of one in white noise, and its neighbours nearly the same one.
+    """
+    usual = np.maximum(np.quantile(power / counts[:, None], CALM_SHARE, axis=0), 1.0) * counts[:, None]
+    independent = np.maximum(counts * 3.0 * averaged / (2.0 * averaged**2 + 1.0), 1.0)  # by the sum of squared correlations
+    stands_out = power > usual * (chi2.isf(settings.window_p_value, independent) / independent)[:, None]
+    noise = usual if stands_out.any() else counts[:, None]
+    inside = stands_out.any(axis=1)
+    return np.maximum(power - noise, 0.0) * (inside | ~inside.any())[:, None], inside
 
 
 def intervals(begins_s: Float64[np.ndarray, " w"], settings: LocalizationSettings) -> list[tuple[float, float]]:

@@ -239,6 +239,7 @@ class LocalizationSettings(Settings, frozen=True):
     least_youden: Share = 0.35  # Youden's index from which a regime is named
     p_value: Share = 1e-3  # of a regime, and of a finding that no single window shows
     mean_samples: Count = 9  # of the running mean of an unexplained residual
+    window_p_value: Share = 1e-6  # below which a window of an axis of that residual is more than noise
 
 
 class HeldOutSettings(Settings, frozen=True):

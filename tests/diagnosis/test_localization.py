@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.localization import locate, locate_findings
+from imutool.diagnosis.localization import locate, locate_findings, locate_residual
+from imutool.diagnosis.result import Located
 from imutool.diagnosis.settings import LocalizationSettings
 from imutool.sensor.samples import IdealMotion
 
@@ -47,6 +48,26 @@ def test_a_misfit_that_is_certain_and_shows_in_no_second_lies_everywhere() -> No
     assert one.intervals_s == ((0.0, DURATION_S),)
     assert one.p_value == 1e-4
     assert locate(T, weak, NOISE, {}, {"accel": 1e-4}) == []
+
+
+@pytest.mark.parametrize(("rate_hz", "noisier"), [(50.0, 1.0), (200.0, 1.0), (200.0, 3.0)])
+def test_a_residual_lies_where_it_stands_out_of_the_noise(rate_hz: float, noisier: float) -> None:
+    """A burst on one axis of residuals that are all noise, also where the noise is more than is known."""
+    t_s, rng = np.arange(int(80.0 * rate_hz)) / rate_hz, np.random.default_rng(5)
+    residual = noisier * NOISE * rng.normal(size=(len(t_s), 6))
+    alone = located_residual(residual, rate_hz)
+    assert [(one.signal, one.intervals_s) for one in alone] == [("gyro", ((0.0, 80.0),))], "certain, and in no second"
+    residual[:, 1] += 15.0 * NOISE[1] * np.sin(2.0 * np.pi * 3.0 * t_s) * ((t_s >= 30.5) & (t_s < 39.5))
+    (one,) = located_residual(residual, rate_hz)
+    assert (one.signal, one.axes, one.intervals_s) == ("gyro", ("y",), ((30.0, 40.0),))
+
+
+def located_residual(residual: np.ndarray, rate_hz: float) -> list[Located]:
+    """As a diagnosis locates what no finding explains."""
+    t_s, every, nothing = np.arange(len(residual)) / rate_hz, np.ones(len(residual), bool), np.zeros_like(residual)
+    ideal = IdealMotion(t_s, nothing[:, :3], nothing[:, 3:], nothing[:, :3])
+    pair = Pair("log", t_s, residual, every, ~every, ideal=ideal)
+    return locate_residual([pair], [nothing], NOISE, {"gyro": 1e-9}, LocalizationSettings())
 
 
 @pytest.mark.parametrize("column", range(6))
