@@ -48,7 +48,7 @@ def locate_residual(
     p_values: Mapping[str, float],
     settings: LocalizationSettings,
 ) -> list[Located]:
-    """Locations of unexplained residuals, by running means that stand out of those of the calm seconds; else everywhere.
+    """Locations of unexplained residuals: running means beyond those of calm seconds, or all.
 
     `p_values` are those of white noise, by signal.
     """
