@@ -226,16 +226,17 @@ def _log_likelihood_of_walks(
 def _walked_residuals(
     model: BiasNetwork, sensor: Sensor, pool: Pool, rest: Float[Tensor, "logs 6"], log: int
 ) -> tuple[Float[Tensor, "r 1"], Float[Tensor, "r r"], Float[Tensor, "times r r"]] | None:
-    """Combinations of a log's residuals that no constant of the log changes, if there are enough.
-
-    Also their covariances by a walk of one, and by errors of one of the poses for each of `POSE_ERROR_S`.
-    """
+    """Combinations of a log's residuals that no constant changes; their covariances by walks and by pose errors of one."""
     begin, end = (int(torch.searchsorted(pool.log, log, right=right)) for right in (False, True))
     n = pool.samples(min(max((end - begin) / pool.rate_hz / MOST_WINDOWS, WALK_WINDOW_S), LONGEST_WALK_WINDOW_S[sensor]))
-    first = begin + n * torch.arange((end - begin - 1) // n, device=pool.log.device)
-    later = torch.linspace(0, min(pool.samples(AVERAGED_S), n // 2), AVERAGED, device=first.device).long()
-    first = first[torch.isin(first[:, None] + later, pool.starts(n, "all")).all(1)]
+    later = torch.linspace(0, min(pool.samples(AVERAGED_S), n // 2), AVERAGED, device=pool.t.device).long()
+    first = n * torch.arange(max(end - begin - 1 - int(later[-1]), 0) // n, device=pool.t.device)
+    at, trusted = first[:, None] + later, pool.trusted[begin:end]
+    broken = torch.cumsum(pool.late[begin:end] | ~trusted, dim=0)
+    first = begin + first[((broken[at + n] == broken[at]) & trusted[at]).all(1)]
     first = first[:: max(1, -(-len(first) // MOST_WINDOWS))]
+    if 3 * len(first) < 3 + len(closed_form.NUISANCE_STD[sensor]) + LEAST_COMBINATIONS:
+        return None
     means = []
     for start in first + later[:, None]:
         windows = pool.windows(start, n, rest[pool.log[start]])
@@ -245,8 +246,6 @@ def _walked_residuals(
         means.append((windows.R_end @ of_all if sensor == "gyro" else of_all).double())  # in world axes
     mean = torch.stack(means).mean(0)
     constants, e = mean[..., :-1].flatten(0, 1), mean[..., -1:].flatten(0, 1)
-    if len(e) < constants.shape[1] + LEAST_COMBINATIONS:
-        return None
     free = torch.linalg.qr(constants, mode="complete")[0][:, constants.shape[1] :].mT
     begins, ends = (pool.t[first + at].double() for at in (int(later[-1]) // 2, int(later[-1]) // 2 + n))
     since, J = (begins + ends - begins[0] - ends[0]) / 2, mean[..., :3]

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
 from imutool.bias_start.initial_bias import AT_REST_STD
+from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
 from imutool.training.bias_spread import MOST_TAIL, TURN_ON_STD, USUAL_STD, shift_at_rest, speed_of, turn_on_prior
@@ -120,3 +121,13 @@ def test_a_walk_is_found_where_the_poses_show_it(
     model = train(paths, tmp_path / "model.safetensors", method="linear", settings=TrainSettings(compare=False))
     assert (model.walk_std[:3] == model.walk_std[0]).all()
     assert least < model.walk_std[0] < most
+
+
+def test_logs_too_short_for_a_walk_leave_it_as_usual(tmp_path: Path) -> None:
+    kind = Switchings(rest_s=1.0, duration_s=7.0)
+    paths = [tmp_path / f"{seed}.mcap" for seed in range(4)]
+    for seed, path in enumerate(paths):
+        write(log(seed, 0, kind), path)
+    settings = TrainSettings(compare=False, gyro_window_s=(0.5, 1.0), accel_window_s=(0.5, 1.0))
+    model = train(paths, tmp_path / "model.safetensors", method="linear", settings=settings)
+    np.testing.assert_allclose(model.walk_std, USUAL_WALK, rtol=0.05)
