@@ -122,14 +122,14 @@ def locate(
 
     Args:
         t_s: stamps of the samples.
-        misfit: real minus expected samples, without noise, or running means with it.
+        misfit: real minus expected samples, without noise; with `averaged` their running means, which have noise.
         noise: standard deviation of a sample, by column.
         variables: what a regime can be of, by name, with unit and values at the samples.
         p_values: of the misfit by signal.
         settings: those of a diagnosis by default.
         signals: columns by signal; the axes of a signal of three are named.
         certain: signals that have a misfit; where no single second shows it, it lies everywhere.
-        averaged: samples of a running mean, if the misfit has noise.
+        averaged: samples of a running mean, or 0.
     """
     settings = settings or LocalizationSettings()
     located = []
@@ -167,14 +167,15 @@ def _beyond_noise(
 ) -> tuple[Float64[np.ndarray, "w k"], Bool[np.ndarray, " w"]]:
     """Squares of windows beyond those of noise, and the windows in which an axis stands out of the calmest quarter.
 
-    A sample of running means has a square of one in white noise, and its neighbours nearly the same one.
+    `power` holds the sums of squares. A running mean of white noise has a square of one, and neighbours are nearly equal.
     """
     usual = np.maximum(np.quantile(power / counts[:, None], CALM_SHARE, axis=0), 1.0) * counts[:, None]
     independent = np.maximum(counts * 3.0 * averaged / (2.0 * averaged**2 + 1.0), 1.0)  # by the sum of squared correlations
     stands_out = power > usual * (chi2.isf(settings.window_p_value, independent) / independent)[:, None]
-    noise = usual if stands_out.any() else counts[:, None]
     inside = stands_out.any(axis=1)
-    return np.maximum(power - noise, 0.0) * (inside | ~inside.any())[:, None], inside
+    if not inside.any():
+        return np.maximum(power - counts[:, None], 0.0), inside
+    return np.maximum(power - usual, 0.0) * inside[:, None], inside
 
 
 def intervals(begins_s: Float64[np.ndarray, " w"], settings: LocalizationSettings) -> list[tuple[float, float]]:

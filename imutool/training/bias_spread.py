@@ -37,12 +37,13 @@ LEAST_TRUSTED, FEWEST_STARTS = 0.5, 4
 FLOOR_STD = {"gyro": 5e-5, "accel": 2e-3}
 VEHICLE_M2_S = 1.0  # density of velocity above which the filter's usual bound is not believed
 SPEED_WINDOWS_S = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
-WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # of the usual walk; how far sensors differ from it, as a deviation
+WALKS, WALK_FACTOR = np.geomspace(0.01, 30.0, 24), 3.0  # multiples of the usual walk; deviation of the prior, as a factor
 WALK_WINDOW_S, MOST_WINDOWS, LEAST_COMBINATIONS, LEAST_SQUARE = 2.5, 24, 3, 1e-18
 LONGEST_WALK_WINDOW_S = {"gyro": 30.0, "accel": 5.0}  # a bias of the gyro tilts the accelerometer's windows
 AVERAGED_S, AVERAGED = 1.0, 8  # windows that begin within this time, whose mean has less of the poses' noise
 POSE_ERROR_S = (0.3, 3.0, 30.0)  # how long errors of the poses last
-POSE_SHARES, ERROR_SHARES = np.geomspace(1e-2, 1e4, 7), np.geomspace(1e-6, 2.0, 30)  # of windows' variance; of residuals'
+POSE_SHARES = np.geomspace(1e-2, 1e4, 7)  # variance of the poses' errors, by that of a window's own noise
+ERROR_SHARES = np.geomspace(1e-6, 2.0, 30)  # variance of a window's own noise, by the mean square of the residuals
 BY_CHANCE = 0.01  # probability that logs seem to show a shift of the bias at rest where there is none
 
 
@@ -205,8 +206,8 @@ def _log_likelihood_of_walks(
     """Logarithm of the likelihood of each of `WALKS`, given the residuals of one log's windows.
 
     In world axes a residual is the bias, carried through the window, with the log's nuisances, the difference of the poses'
-    errors at both ends and noise of the window's own. The bias is constant but for its walk. How large the errors are and how
-    long those of the poses last, is not known: all sizes, shares and times of a grid count alike.
+    errors at both ends and noise of the window's own. The bias is constant but for its walk. It is not known how large
+    the errors are and how long those of the poses last: all sizes, shares and times of a grid count alike.
     """
     if (found := _walked_residuals(model, sensor, pool, rest, log)) is None:
         return torch.zeros(len(WALKS), dtype=torch.float64, device=pool.t.device)

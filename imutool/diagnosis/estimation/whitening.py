@@ -264,7 +264,7 @@ def spectrum(
 def median_of_medians(count: int) -> float:
     """Median of the median of exponential variables of mean one: ln 2 for an odd count.
 
-    For an even count its ratio to the mean is that of the next odd count, to 1 %.
+    An even count takes the ratio of median and mean from the next odd count, which is right to 1 %.
     """
     return float(np.log(2.0)) * mean_of_median(count) / mean_of_median(count + 1 - count % 2)
 
