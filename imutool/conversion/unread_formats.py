@@ -33,6 +33,8 @@ FORMATS = {  # what a file that begins like this is, and what to do
 
 def describe_unread(start: bytes) -> tuple[str, str]:
     """What a file with these first bytes is, and what to do; empty where that is not known."""
+    if not start:
+        return "the file is empty", ""
     if program := compression(start):
         return f"it is compressed with {program}", f"Unpack it first, for instance with {program} -d"
     found = (said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL))
