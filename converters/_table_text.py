@@ -110,14 +110,14 @@ def text_of(raw: bytes) -> str:
         return raw.decode("utf-8-sig", "ignore") if cut else raw.decode("cp1252", "replace")
 
 
-def is_text_table(head: bytes) -> bool:
-    """Whether text has a row of at least four numbers."""
+def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
+    """Whether text has a row of at least so many numbers."""
     if b"\0" in head and not head.startswith(UTF16):
         return False
     lines = text_of(head).splitlines()
     rows = [line for line in lines[:-1] or lines if line.strip()]
-    delimiter = _delimiter(rows)
-    return any(_is_row(row, delimiter, LEAST_NUMBERS) for row in rows[:LOOKED_AT])
+    delimiter = _delimiter(rows, least)
+    return any(_is_row(row, delimiter, least) for row in rows[:LOOKED_AT])
 
 
 def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
@@ -211,7 +211,7 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     """
     rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
     rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
-    rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) < MOSTLY * width]  # CAL, CAL, ...
+    rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) <= max(MOSTLY * width, 1)]  # CAL, CAL
     if len(rows) > 2 and _are_units(rows[-2]) and len({*rows[-1]} - {""}) < len(rows[-1]) / 2:
         rows.pop()  # below the units RaceChrono writes the device of each column
     units: list[str] = []

@@ -251,7 +251,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         else np.zeros((len(q_wxyz), 3))
     )
     if not table.position:
-        remarks.notes.append("the truth has no positions: those of its poses are zero, and nothing is compared with them")
+        remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
     q_wxyz = np.where(q_wxyz.any(axis=1, keepdims=True), q_wxyz, np.nan)  # zeros stand where a pose is missing

@@ -81,6 +81,20 @@ def unit_by_gravity(
     return (name, t) if size == units[name] and t > LEAST_T else None
 
 
+def steady_force(
+    t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+) -> float | None:
+    """Median size (m/s²) of the mean specific force over 2 s, turned back by the gyro.
+
+    It is about gravity, unless gravity was taken out. None of a log too short for it.
+    """
+    both = _together(t_ns, gyro, t_ns, accel)
+    if both is None:
+        return None
+    rate, force = (_in_windows(values) for values in both)
+    return float(np.median(_turned_back(rate, force)))
+
+
 def _in_windows(values: Float64[np.ndarray, "c 3"]) -> Float64[np.ndarray, "w k 3"]:
     """Means over TURN_S, in windows of WINDOW_S."""
     inside, length = round(TURN_S / STEP_S), round(WINDOW_S / TURN_S)
