@@ -12,10 +12,10 @@ TIME_WORDS = (
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
+    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2|m_?per_?s_?2",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "mg": r"mg",
     "g": r"gs?",

@@ -17,7 +17,7 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_dates import calendar_times
+from ._table_dates import calendar_times, join_dates
 from ._table_names import unit_named
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
@@ -169,8 +169,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
     commas: list[str] = []
     empty: list[str] = []
-    for place, (named, fields) in enumerate(zip(names, zip(*whole, strict=True), strict=True), 1):
-        texts = [text.strip().strip('"') for text in fields]
+    fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
+    join_dates(names, fields)
+    for place, (named, texts) in enumerate(zip(names, fields, strict=True), 1):
         if not any(texts):
             empty.append(named)
             continue

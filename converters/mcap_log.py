@@ -20,7 +20,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._source import find_folders, head, name
+from ._source import find_folders, head, name, with_suffix
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
@@ -121,7 +121,7 @@ def _parts(folder: Path) -> list[Path]:
     """
     if b"rosbag2_bagfile_information" in head(folder / METADATA):
         return []
-    files = [path for path in folder.glob("*.mcap") if path.is_file() and path.stat().st_size]
+    files = [path for path in with_suffix(folder, ".mcap") if path.is_file() and path.stat().st_size]
     named = {int(match[2]): (match[1], path) for path in files if (match := re.fullmatch(PART, path.stem))}
     parts = [named[number][1] for number in sorted(named)]
     one_name = len(files) == len(named) and len({stem for stem, _ in named.values()}) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.recording.joined_imu import in_order, sensor_delay, unit_by_gravity
+from imutool.recording.joined_imu import in_order, joined, sensor_delay, unit_by_gravity
 
 RNG = np.random.default_rng(11)
 DURATION_S = 60.0
@@ -62,6 +62,19 @@ def test_a_log_at_rest_or_of_vibration_shows_none():
     assert sensor_delay(gyro_ns, noise, accel_ns, np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.05, accel.shape)) is None
     assert sensor_delay(gyro_ns, noise, accel_ns, accel) is None
     assert sensor_delay(gyro_ns[:400], noise[:400], accel_ns[:250], accel[:250]) is None
+
+
+def test_of_one_clock_a_sample_that_one_sensor_lacks_is_left_out_and_nothing_is_interpolated():
+    gyro_ns, gyro, _, accel = measured(0.0)
+    accel = accel[: len(gyro_ns)].copy()
+    gyro_ns, gyro = gyro_ns[: len(accel)], gyro[: len(accel)].copy()
+    gyro[50], accel[70] = np.nan, np.nan
+    imu, notes = joined(gyro_ns, gyro, gyro_ns.copy(), accel, "/imu0")
+    kept = np.delete(np.arange(len(gyro)), [50, 70])
+    assert np.array_equal(imu.t_ns, gyro_ns[kept])
+    assert np.array_equal(imu.gyro, gyro[kept])
+    assert np.array_equal(imu.accel, accel[kept])
+    assert all("not finite" in note for note in notes)
 
 
 def test_a_clock_that_is_set_back_is_said_with_what_is_missing():

@@ -210,8 +210,9 @@ def joined(
     """
     rates, forces = in_order(gyro_ns, gyro, f"{name} gyro"), in_order(accel_ns, accel, f"{name} accel")
     notes = rates.notes + forces.notes
-    if np.array_equal(rates.t_ns, forces.t_ns):
-        return Imu(rates.t_ns, rates.values, forces.values), notes
+    if np.array_equal(gyro_ns, accel_ns):  # one row for both: a sample that one of them lacks is none
+        t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
+        return Imu(t_ns, rates.values[first], forces.values[second]), notes
     if len(rates.t_ns) < 2 or len(forces.t_ns) < 2 or rates.t_ns[0] >= forces.t_ns[-1] or rates.t_ns[-1] <= forces.t_ns[0]:
         raise DataError("gyro and accelerometer share no time", where=name, expected="two sensors that run together")
     after = np.clip(np.searchsorted(forces.t_ns, rates.t_ns), 1, len(forces.t_ns) - 1)

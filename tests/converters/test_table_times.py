@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,31 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
         f'gyro = {names[1:4]}\ngyro_unit = "rad/s"\naccel = {names[4:]}\naccel_unit = "m/s^2"\n'
     )
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
+def test_gps_weeks_and_the_time_in_them_are_utc_across_the_end_of_a_week(tmp_path):
+    names = ["GPS Week", "TOW (s)", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    since_ms = (2394 * 604_800 + 604_800 - 10) * 1000 + 4 * np.arange(COUNT)
+    week, ms = np.divmod(since_ms, 604_800_000)
+    log = read(write_csv(tmp_path / "log.csv", names, [week, ms / 1000, *GYRO.T, *ACCEL.T]))
+    t_ns = log.imus["/imu0"].t_ns
+    assert np.array_equal(np.diff(t_ns), np.full(COUNT - 1, NEXT_NS))
+    assert np.datetime64(int(t_ns[0]), "ns") == np.datetime64("2025-11-29T23:59:32")  # 18 leap seconds before that of GPS
+
+
+@pytest.mark.parametrize(
+    ("date", "clock"), [("29.11.2025", "%H:%M:%S,%f"), ("2025-11-29", "%H:%M:%S.%f"), ("11/29/2025", "%I:%M:%S.%f %p")]
+)
+def test_a_date_and_a_clock_in_two_columns_are_one_time(tmp_path, date, clock):
+    start = datetime(2025, 11, 29, 23, 59, 50)
+    dated = {"29.11.2025": "%d.%m.%Y", "2025-11-29": "%Y-%m-%d", "11/29/2025": "%m/%d/%Y"}[date]
+    times = [start + timedelta(milliseconds=4 * n) for n in range(COUNT)]
+    lines = ["Date;Time;wx [rad/s];wy [rad/s];wz [rad/s];ax [m/s^2];ay [m/s^2];az [m/s^2]"]
+    for t, row in zip(times, np.column_stack([GYRO, ACCEL]).tolist(), strict=True):
+        lines.append(";".join([t.strftime(dated), t.strftime(clock), *map(repr, row)]))
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    t_ns = read(tmp_path / "log.csv").imus["/imu0"].t_ns
+    assert np.array_equal(t_ns, np.datetime64(start, "ns").astype(np.int64) + NEXT_NS * np.arange(COUNT))
 
 
 @pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms", "Fs_imu", "gyro_rate_hz"])
