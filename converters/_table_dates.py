@@ -67,7 +67,7 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
 
 
 def join_dates(names: list[str], fields: list[list[str]]) -> None:
-    """Make one column of a column of dates and the column of their clocks, where a table has one of each."""
+    """Make one column of a column of dates and that of their clocks."""
     dates = [n for n, texts in enumerate(fields) if re.fullmatch(DAY, next(iter(texts), ""))]
     clocks = [n for n, texts in enumerate(fields) if re.fullmatch(DAYTIME, next(iter(texts), ""), re.IGNORECASE)]
     if len(dates) != 1 or len(clocks) != 1:
@@ -80,7 +80,7 @@ def join_dates(names: list[str], fields: list[list[str]]) -> None:
 
 
 def gps_times(week: Int64[np.ndarray, " n"], ns: Int64[np.ndarray, " n"]) -> tuple[Int64[np.ndarray, " n"], int]:
-    """Nanoseconds since 1970 (UTC) of GPS weeks, counted without rollover, and of the time in them; the leap seconds."""
+    """Nanoseconds since 1970 (UTC) of GPS weeks and the time in them, and the leap seconds."""
     since_1970 = GPS_EPOCH_NS + week * WEEK_NS + ns
     leap_s = next((count for start, count in LEAP_SECONDS if since_1970[0] >= np.datetime64(start, "ns").astype(np.int64)), 0)
     return since_1970 - leap_s * 10**9, leap_s

@@ -54,7 +54,24 @@ def sensor_delay(
     parts = [peak for part in range(PARTS) if (peak := _peak(products[:, part], lags)) is not None]
     if len(parts) < LEAST_PARTS:
         return None
-    return SensorDelay(whole * STEP_S, float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5)
+    spread_s = float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5
+    return SensorDelay(whole * STEP_S, max(spread_s, _least_std(both, products.sum(axis=1))))
+
+
+def _least_std(
+    both: tuple[Float64[np.ndarray, "c 3"], Float64[np.ndarray, "c 3"]], products: Float64[np.ndarray, "k 3"]
+) -> float:
+    """Least standard deviation (s) of the lag of two signals, by what they do not have in common.
+
+    It is that of Cramer and Rao for a delay, tan(acos r) / (w sqrt(n)): r is the correlation, w the rms frequency (rad/s), and
+    n = 3 T w / pi the independent samples of three axes. A motion that repeats has the same error in each stretch.
+    """
+    together, measured, predicted = products.T
+    r = float(np.clip((together / np.sqrt(np.maximum(measured * predicted, 1e-300))).max(), LEAST_CORRELATION, 1.0))
+    turn = -np.cross(*both)
+    w = float(np.sqrt((np.gradient(turn, STEP_S, axis=0) ** 2).sum() / max(float((turn**2).sum()), 1e-300)))
+    samples = 3.0 * STEP_S * len(turn) * w / np.pi
+    return float(np.sqrt(1.0 - r**2) / r / (w * np.sqrt(samples))) if w > 0.0 else float("inf")
 
 
 def unit_by_gravity(
