@@ -63,7 +63,8 @@ def load(path: Path, kind: str) -> Columns:
     columns.join_stamps()
     join_gps_weeks(columns)
     if not columns.values:
-        raise DataError("holds no columns of numbers", where=path, expected="a time, three rates and three accelerations")
+        why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
+        raise DataError(f"holds no columns of numbers{why}", where=path, expected="a time, three rates and three accelerations")
     return columns
 
 

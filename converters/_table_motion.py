@@ -8,7 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.recording.joined_imu import in_order, steady_force, unit_by_gravity
+from imutool.errors import DataError
+from imutool.recording.joined_imu import joined, steady_force, unit_by_gravity
 
 from ._table_map import Proposal
 from ._table_names import spaced_name
@@ -68,8 +69,11 @@ def _rows(
     if len(gyro) != len(accel):
         return None
     t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
-    kept = in_order(t_ns, np.concatenate([gyro, accel], axis=1), "")
-    return (kept.t_ns, kept.values[:, :3], kept.values[:, 3:]) if len(kept.t_ns) else None
+    try:
+        imu, _ = joined(t_ns, gyro, t_ns, accel, "")  # rows may hold one of the two
+    except DataError:
+        return None
+    return (imu.t_ns, imu.gyro, imu.accel) if len(imu) else None
 
 
 def side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:

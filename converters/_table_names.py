@@ -17,7 +17,7 @@ UNITS = {
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
-    "mg": r"mg",
+    "mg": r"mg|milli[ -]?gs?",
     "g": r"gs?",
     "ns": r"ns|nanoseconds?|nsec",
     "us": r"us|µs|microseconds?|usec",

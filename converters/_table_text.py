@@ -38,6 +38,7 @@ STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[+-]?(0?,\d+|\d+,(\d\d?|\d{4,}))([eE][+-]?\d+)?")  # in quotes; of 1,234 it may mark thousands
 
 
 @dataclass
@@ -176,7 +177,7 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
             empty.append(named)
             continue
         name = named or f"column {place}"
-        if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
+        if any((COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA).fullmatch(text) for text in texts[:100]):
             texts[:] = [text.replace(",", ".") for text in texts]
             commas.append(name)
         if (values := _numbers(texts)) is not None:

@@ -119,10 +119,10 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
                 where=path,
                 fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart], own_times=own_times)}",
             )
-        named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
+        named = {key: value if isinstance(value, str) else ", ".join(value) for key, value in proposal.entries.items()}
         counted = {key for key, value in named.items() if value.startswith(COUNTED)}
         shown = {key: value for key, value in named.items() if key.removesuffix("_unit") not in counted}
-        said = "columns: " + ", ".join(f"{key} = {value}" for key, value in shown.items())
+        said = "columns: " + "; ".join(f"{key} = {value}" for key, value in shown.items())
         remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
         maps.append(msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz, "topic": topic}, TableMap))
     return maps

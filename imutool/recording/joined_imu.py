@@ -185,6 +185,7 @@ def _peak(products: Float64[np.ndarray, "k 3"], lags: Int64[np.ndarray, " k"]) -
 
 
 SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
+LEAST_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
 
@@ -227,8 +228,8 @@ def joined(
     """
     rates, forces = in_order(gyro_ns, gyro, f"{name} gyro"), in_order(accel_ns, accel, f"{name} accel")
     notes = rates.notes + forces.notes
-    if np.array_equal(gyro_ns, accel_ns):  # one row for both: a sample that one of them lacks is none
-        t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
+    t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
+    if len(t_ns) > LEAST_COMMON * max(len(rates.t_ns), len(forces.t_ns)):  # one clock: a sample that one of them lacks is none
         return Imu(t_ns, rates.values[first], forces.values[second]), notes
     if len(rates.t_ns) < 2 or len(forces.t_ns) < 2 or rates.t_ns[0] >= forces.t_ns[-1] or rates.t_ns[-1] <= forces.t_ns[0]:
         raise DataError("gyro and accelerometer share no time", where=name, expected="two sensors that run together")

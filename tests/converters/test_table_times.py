@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 
 RATE_HZ = 250.0
 COUNT = 5000
@@ -70,6 +70,33 @@ def test_a_date_and_a_clock_in_two_columns_are_one_time(tmp_path, date, clock):
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     t_ns = read(tmp_path / "log.csv").imus["/imu0"].t_ns
     assert np.array_equal(t_ns, np.datetime64(start, "ns").astype(np.int64) + NEXT_NS * np.arange(COUNT))
+
+
+def test_rows_that_hold_one_sensor_each_are_one_imu_whose_unit_the_motion_shows(tmp_path):
+    lines = ["timestamp_ns,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"]
+    for n, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        lines.append(f"{NEXT_NS * n},{','.join(map(repr, gyro))},,,")
+        lines += [f"{NEXT_NS * n + 700_000},,,,{','.join(map(repr, accel))}"] if n % 2 == 0 else []
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    imu = read(tmp_path / "log.csv").imus["/imu0"]
+    assert np.array_equal(imu.t_ns, NEXT_NS * np.arange(1, COUNT - 1))
+    np.testing.assert_array_equal(imu.gyro, GYRO[1:-1])
+
+
+def test_decimal_commas_in_quotes_are_read_and_what_is_no_number_is_said(tmp_path):
+    names = ["time [s]", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    rows = [",".join(f'"{value:.6f}"'.replace(".", ",") for value in row) for row in np.column_stack([T_S, GYRO, ACCEL])]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+    np.testing.assert_allclose(read(tmp_path / "log.csv").imus["/imu0"].gyro, GYRO, atol=1e-6)
+    lines = [
+        ",".join([*names, "n"]),
+        *(",".join([*[f'"{n},{100 + k}"' for k in range(7)], "a b"[:: n % 2 + 1]]) for n in range(1, 99)),
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")  # thousands, or decimals
+    with pytest.raises(
+        DataError, match=r"no columns of numbers; time \[s\] is left out: its fields, as '1,100', are no numbers"
+    ):
+        read(tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms", "Fs_imu", "gyro_rate_hz"])
