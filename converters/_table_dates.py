@@ -21,6 +21,7 @@ LEAP_SECONDS = (  # by which GPS is ahead of UTC, since then
     ("1999-01-01", 13),
 )
 DAYTIME = r"\d\d?:\d\d:\d\d([.,]\d+)?( ?[ap]m)?"
+SPANS = "elapsed|duration|relative|since"  # in the name of a column of times that are none of the day
 DAY = r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([./])\d\d?\2\d{4}"
 DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123; 11/21/2026 3:04:05 PM
     r"(?:(?P<year>\d{4})(?P<mark>[-/._])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
@@ -69,7 +70,8 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
 def join_dates(names: list[str], fields: list[list[str]]) -> None:
     """Make one column of a column of dates and that of their clocks."""
     dates = [n for n, texts in enumerate(fields) if re.fullmatch(DAY, next(iter(texts), ""))]
-    clocks = [n for n, texts in enumerate(fields) if re.fullmatch(DAYTIME, next(iter(texts), ""), re.IGNORECASE)]
+    times = [n for n, texts in enumerate(fields) if re.fullmatch(DAYTIME, next(iter(texts), ""), re.IGNORECASE)]
+    clocks = [n for n in times if not re.search(SPANS, names[n], re.IGNORECASE)]
     if len(dates) != 1 or len(clocks) != 1:
         return
     (date,), (clock,) = dates, clocks
