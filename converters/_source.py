@@ -246,6 +246,11 @@ def head(path: Path, size: int = HEAD) -> bytes:
         return b""
 
 
+def with_suffix(folder: Path, suffix: str) -> list[Path]:
+    """Files of a folder with a suffix, in small or capital letters, in order."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == suffix) if folder.is_dir() else []
+
+
 def named_folder(source: Path) -> Path:
     """Folder with a name of its own: `.` and `..` have none."""
     return source.absolute() if ".." not in source.parts else source.resolve()

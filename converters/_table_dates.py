@@ -11,6 +11,18 @@ from imutool.array_types import Int64
 HOUR_NS = 3600 * 10**9
 HALF_DAY_S = 43_200
 LAST_NS = 2**63 - 1  # in the year 2262
+WEEK_NS, GPS_EPOCH_NS = 604_800 * 10**9, 315_964_800 * 10**9  # GPS counts weeks since 1980-01-06
+LEAP_SECONDS = (  # by which GPS is ahead of UTC, since then
+    ("2017-01-01", 18),
+    ("2015-07-01", 17),
+    ("2012-07-01", 16),
+    ("2009-01-01", 15),
+    ("2006-01-01", 14),
+    ("1999-01-01", 13),
+)
+DAYTIME = r"\d\d?:\d\d:\d\d([.,]\d+)?( ?[ap]m)?"
+SPANS = "elapsed|duration|relative|since"  # in the name of a column of times that are none of the day
+DAY = r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([./])\d\d?\2\d{4}"
 DATE = re.compile(  # 2026-11-21T15:04:05.123Z, also with a blank and an offset; 21.11.2026 15:04:05,123; 11/21/2026 3:04:05 PM
     r"(?:(?P<year>\d{4})(?P<mark>[-/._])(?P<month>\d\d?)(?P=mark)(?P<day>\d\d?)"
     r"|(?P<first>\d\d?)(?P<sign>[./])(?P<second>\d\d?)(?P=sign)(?P<last>\d{4}))(?:[T ]+|_|--?)"
@@ -53,6 +65,27 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
     if slashes:
         notes.append(f"its dates count as {'day/month' if day_first else 'month/day'}/year")
     return np.array(stamps, np.int64), notes
+
+
+def join_dates(names: list[str], fields: list[list[str]]) -> None:
+    """Make one column of a column of dates and that of their clocks."""
+    dates = [n for n, texts in enumerate(fields) if re.fullmatch(DAY, next(iter(texts), ""))]
+    times = [n for n, texts in enumerate(fields) if re.fullmatch(DAYTIME, next(iter(texts), ""), re.IGNORECASE)]
+    clocks = [n for n in times if not re.search(SPANS, names[n], re.IGNORECASE)]
+    if len(dates) != 1 or len(clocks) != 1:
+        return
+    (date,), (clock,) = dates, clocks
+    both = [" ".join(each) for each in zip(fields[date], fields[clock], strict=True)]
+    if calendar_times(both) is not None:
+        names[clock], fields[clock] = f"{names[date]} {names[clock]}", both
+        del names[date], fields[date]
+
+
+def gps_times(week: Int64[np.ndarray, " n"], ns: Int64[np.ndarray, " n"]) -> tuple[Int64[np.ndarray, " n"], int]:
+    """Nanoseconds since 1970 (UTC) of GPS weeks and the time in them, and the leap seconds."""
+    since_1970 = GPS_EPOCH_NS + week * WEEK_NS + ns
+    leap_s = next((count for start, count in LEAP_SECONDS if since_1970[0] >= np.datetime64(start, "ns").astype(np.int64)), 0)
+    return since_1970 - leap_s * 10**9, leap_s
 
 
 def _clock_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]] | None:

@@ -20,6 +20,7 @@ from ._table_packed import opener, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
 from ._table_sensors import read_rows
 from ._table_text import Columns, is_text_table, read_csv, text_of
+from ._table_times import join_gps_weeks
 
 LIMIT = 4 << 30  # bytes of numbers in one file
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
@@ -60,8 +61,10 @@ def load(path: Path, kind: str) -> Columns:
     with refusing(path):
         LOADERS[kind](path, columns)
     columns.join_stamps()
+    join_gps_weeks(columns)
     if not columns.values:
-        raise DataError("holds no columns of numbers", where=path, expected="a time, three rates and three accelerations")
+        why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
+        raise DataError(f"holds no columns of numbers{why}", where=path, expected="a time, three rates and three accelerations")
     return columns
 
 

@@ -1,7 +1,8 @@
 """Folder with a table for each sensor, or with one of an IMU beside one of poses.
 
 The tables become groups: `gyro` and `accel`, or `imu` and `ground_truth`, and those of other files by their names. Poses are
-true by the name of their file, or where a motion capture wrote it; else they are the group `poses`.
+true by the name of their file, or where a motion capture wrote it; else they are the group `poses`. A table that holds a time
+alone (`time.csv` of gnss-ins-sim) is the clock of those that have none and as many rows.
 """
 
 from __future__ import annotations
@@ -9,16 +10,20 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
 from imutool.errors import DataError
 
 from ._source import head
 from ._table_files import kind_of, load
 from ._table_groups import TRUE_GROUPS, has_poses
 from ._table_mocap import is_mocap
-from ._table_packed import table_name, text_head
+from ._table_names import TIME_WORDS, name_and_unit, split_name
+from ._table_packed import read_bytes, table_name, text_head
 from ._table_propose import propose
-from ._table_sensors import SENSORS, name_columns, sensors_among
-from ._table_text import Columns, read_csv, text_of
+from ._table_sensors import SENSORS, name_columns, pairs_among, sensors_among
+from ._table_text import Columns, is_text_table, read_csv, text_of
+from ._table_times import rises
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40
@@ -31,7 +36,7 @@ IMU_GROUP, TRUTH_GROUP, POSES_GROUP = "imu", "ground_truth", "poses"
 def is_split(folder: Path) -> bool:
     """Whether the tables in a folder make one recording together.
 
-    They are of a gyroscope and an accelerometer, of no phone app, or of one IMU and of poses.
+    They are of a gyroscope and an accelerometer, of several such pairs, of no phone app, or of one IMU and of poses.
     """
     tables = _tables(folder)
     return bool(_groups(tables)) and not is_phone(folder)
@@ -43,18 +48,19 @@ def load_split(folder: Path) -> Columns:
     Raises:
         DataError: the table of the gyroscope, of the accelerometer or of the IMU cannot be read.
     """
-    tables, whole = _tables(folder), Columns()
+    tables, whole, clocks = _tables(folder), Columns(), _clocks(folder)
     groups = _groups(tables)
     for path in tables:
         group = groups.get(path, _stem(path))
-        sensor = group if group in SENSORS else ""
+        sensor = group.rpartition("/")[2] if path in groups and group.rpartition("/")[2] in SENSORS else ""
         try:
-            part = load(path, kind_of(head(path), path))
+            part = _load(path)
         except DataError as error:
             if path in groups:
                 raise
             whole.remarks.losses.append(f"{path.name} is left out: it {error.what}")
             continue
+        _give_time(part, path, clocks)
         if path in groups:
             verb = "are" if group == POSES_GROUP else "is"
             part.remarks.notes.append(f"the {group.replace('_', ' ')} {verb} {path.name}")
@@ -64,15 +70,73 @@ def load_split(folder: Path) -> Columns:
 
 
 def _tables(folder: Path) -> list[Path]:
-    files = sorted(path for path in folder.iterdir() if Path(table_name(path)).suffix.lower() in ENDINGS)
-    return [path for path in files[:MOST_TABLES] if kind_of(head(path), path)]
+    """Tables of a folder; narrow ones only beside a clock, which is none of them."""
+    files = _files(folder)
+    clocks = [path for path in files if _is_clock(path)]
+    return [path for path in files if path not in clocks and (kind_of(head(path), path) or (clocks and _is_narrow(path)))]
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if Path(table_name(path)).suffix.lower() in ENDINGS)[:MOST_TABLES]
+
+
+def _is_narrow(path: Path) -> bool:
+    """Whether a text has rows of numbers, too few for a time and a vector."""
+    start = head(path)
+    return not kind_of(start, path) and is_text_table(start, 1)
+
+
+def _is_clock(path: Path) -> bool:
+    """Whether a table is named as a time and holds nothing else."""
+    is_named = re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0])
+    return bool(is_named) and _is_narrow(path) and not is_text_table(head(path), 2)
+
+
+def _clocks(folder: Path) -> dict[str, tuple[np.ndarray, str]]:
+    """Times of the tables that hold nothing else, with their units, by the name of the table without its word for time."""
+    found = {}
+    for path in filter(_is_clock, _files(folder)):
+        (column, values), *_ = _load(path).values.items()
+        if rises(values):
+            name = re.sub(rf"_?{TIME_WORDS}$", "", split_name(_stem(path))[0])
+            found[name] = values, name_and_unit(column, "")[1]
+    return found
+
+
+def _give_time(part: Columns, path: Path, clocks: dict[str, tuple[np.ndarray, str]]) -> None:
+    """Add the time of the clock with as many rows to a table without one; of several that whose name its own begins with."""
+    has_time = any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(name)[0]) for name in part.values)
+    length = len(next(iter(part.values.values()), ()))
+    fits = [name for name, (values, _) in clocks.items() if len(values) == length]
+    if has_time or not fits:
+        return
+    values, unit = clocks[max(fits, key=lambda name: len(name) if _stem(path).lower().startswith(name) else -1)]
+    part.values = {"time": values, **part.values}
+    part.units["time"] = unit
+
+
+def _load(path: Path) -> Columns:
+    """Columns of a table, also of a narrow one.
+
+    Raises:
+        DataError: damaged, or without numbers.
+    """
+    if not _is_narrow(path):
+        return load(path, kind_of(head(path), path))
+    part = Columns()
+    read_csv(text_of(read_bytes(path)), part, path, least=3 if is_text_table(head(path), 3) else 1)
+    if not part.values:
+        raise DataError("holds no columns of numbers", where=path)
+    return part
 
 
 def _groups(tables: list[Path]) -> dict[Path, str]:
-    """Groups of the tables that make a recording: gyro and accel, or one IMU and poses; none otherwise."""
+    """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or one IMU and poses; else none."""
     sensors = sensors_among(_stem(path) for path in tables)
     if {*sensors.values()} == {*SENSORS}:
         return {path: sensors[_stem(path)] for path in tables if _stem(path) in sensors}
+    if several := pairs_among(_stem(path) for path in tables):
+        return {path: several[_stem(path)] for path in tables if _stem(path) in several}
     starts = {path: _start(path) for path in tables}
     captured = [path for path in tables if is_mocap(starts[path])]
     true = captured or [path for path in tables if re.fullmatch(POSES, _stem(path).lower())]

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 
 from ._table_map import IMU_TOPIC, Entries, Proposal
-from ._table_names import DIGITS, TIME_WORDS, name_and_unit, split_name, triples
+from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
 from ._table_rotations import order_by_motion
 from ._table_text import Columns
 from ._table_times import goes_on
@@ -58,7 +58,8 @@ LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set,
 
 def imus_apart(columns: Columns) -> dict[str, Columns]:
     """Columns without those of other IMUs, by topic; empty unless several pair by name."""
-    names = {column: split_name(column)[0] for column in columns.values if not is_true(column)}
+    spelled = {column: split_name(column)[0] for column in columns.values if not is_true(column)}
+    names = {column: name for column, name in spelled.items() if not re.search(ESTIMATED, name)}
     gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
     if len(gyros) < 2 or gyros.keys() != accels.keys():
         return {}

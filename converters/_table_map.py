@@ -19,7 +19,7 @@ from imutool.recording.message_log import KINDS
 from ._table_units import UNITS_OF
 
 IMU_TOPIC = "/imu0"
-NO_UNIT = "the names of the columns state no unit of the {}, and its values show none"
+NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
 Entries = dict[str, str | list[str]]  # of a map
 
@@ -120,7 +120,7 @@ class Proposal(msgspec.Struct):
             lines.append(
                 f"# it holds for {', '.join(several)}; for one of them alone, name its columns: gyro = [...], accel = [...]"
             )
-        if "time" in self.open:
+        if {"time", "time_unit"} & {*self.open}:
             lines.append("# without a column of times: rate_hz = 100.0, the samples a second, in place of time and time_unit")
         lines += [f"# {hint}" for hint in self.hints]
         lines.append(

@@ -12,12 +12,12 @@ TIME_WORDS = (
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|deg s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
+    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m s\^?-2|m_s_?2|m_?per_?s_?2",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
-    "mg": r"mg",
+    "mg": r"mg|milli[ -]?gs?",
     "g": r"gs?",
     "ns": r"ns|nanoseconds?|nsec",
     "us": r"us|µs|microseconds?|usec",
@@ -29,8 +29,9 @@ UNITS = {
     "cm": r"cm|centimet(er|re)s?",
     "mm": r"mm|millimet(er|re)s?",
 }
+RATE_OR_FORCE_UNITS = r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|m_(?:per_)?s_?2|mg"  # in a name
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
-ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth)(_|$)"  # no reading of a sensor
+ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth|ref|reference)(_|$)"  # no sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
@@ -109,10 +110,13 @@ def split_name(column: str) -> tuple[str, str]:
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")
     if not unit and (
         end := re.search(
-            r"(?:_in)?_(m?dps|(deg|rad)(_?(per_?)?s(ec(ond)?)?|ps)|mps2|ms2|m_(per_)?s_?2|mg|gs?|ns|us|ms|s|(nano|micro|milli)?sec(ond)?s?)$",
+            rf"(?:_in)?_({RATE_OR_FORCE_UNITS}|gs?|ns|us|ms|s|(nano|micro|milli)?sec(ond)?s?)$",
             name,
         )
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]
+    elif not unit and (inside := re.search(rf"_({RATE_OR_FORCE_UNITS})(?=_[xyz012]$)", name)):  # gyro_rad_s[0], acc_mg_x
+        unit = next(u for u, p in UNITS.items() if re.fullmatch(p, inside[1]))
+        name = name[: inside.start()] + name[inside.end() :]
     return name, unit

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-
-from imutool.array_types import Float64
-from imutool.recording.joined_imu import in_order, unit_by_gravity
 
 from ._table_groups import is_true, shared_group
 from ._table_headerless import perhaps
 from ._table_map import NO_UNIT, Proposal
+from ._table_motion import doubt_gravity, side_by_side, unit_by_motion
 from ._table_names import (
     CORE_MOTION,
     ESTIMATED,
@@ -46,12 +44,10 @@ from ._table_units import (
     GYRO_SI,
     TIME_NS,
     gravity_units,
-    is_motion_alone,
     raw_counts,
     unit_by_steps,
 )
 
-LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
 MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
 NO_IMU = ", and a recording of an IMU needs one"
@@ -66,6 +62,7 @@ def propose(columns: Columns) -> Proposal:
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
+    doubt_gravity(proposal, columns)
     if "gyro" in proposal.entries and "gyro" not in proposal.open:
         _propose_gyro_unit(proposal, columns)
     if not proposal.entries.keys() & {"gyro", "accel"}:
@@ -109,15 +106,6 @@ def _propose_sensor(
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
         _propose_unit(proposal, sensor, columns)
-    if sensor == "accel" and (unit := proposal.entries.get("accel_unit")):
-        level, _ = gravity_units(columns, chosen)
-        is_motion = is_motion_alone(columns, chosen) and not re.search(r"(^|_)raw(_|$)", spaced[chosen[0]])
-        if level * ACCEL_SI[str(unit)] < LEAST_GRAVITY or is_motion or re.search(r"(user|free)_?acc", spaced[chosen[0]]):
-            proposal.open.append("accel")
-            why = ", and all cancel out" if is_motion else ""
-            proposal.reasons.append(
-                f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}{why}: gravity was taken out"
-            )
 
 
 def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:
@@ -129,7 +117,7 @@ def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], colum
 
 def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
     """Unit of the gyro from the steps in which it counts, and from how gravity turns in the accelerometer."""
-    steps = unit_by_steps(_side_by_side(columns, proposal.entries["gyro"]))
+    steps = unit_by_steps(side_by_side(columns, proposal.entries["gyro"]))
     said = f"the gyro counts in steps of {steps[1]:.6g} {steps[0]}, as a common sensor does" if steps else ""
     stated = proposal.entries.get("gyro_unit", "")
     if stated and steps and steps[0] != stated:
@@ -137,27 +125,12 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
         proposal.reasons.append(f"the names of the columns say {stated}, and {said}")
     if "gyro_unit" not in proposal.open or stated:
         return
-    motion = _unit_by_motion(proposal, columns) if proposal.open == ["gyro_unit"] else None
+    motion = unit_by_motion(proposal, columns) if proposal.open == ["gyro_unit"] else None
     found = {unit: reason for unit, reason in ((steps[0] if steps else "", said), motion or ("", "")) if unit}
     if len(found) == 1:
         proposal.settle_gyro_unit(*found.popitem())
     else:
         proposal.reasons.extend(found.values())
-
-
-def _unit_by_motion(proposal: Proposal, columns: Columns) -> tuple[str, str] | None:
-    """Unit with which gravity turns as the gyro says, and the reason."""
-    t, gyro, accel = (_side_by_side(columns, np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
-    if len(gyro) != len(accel):
-        return None
-    t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
-    kept = in_order(t_ns, np.concatenate([gyro, accel], axis=1), "")
-    found = unit_by_gravity(kept.t_ns, kept.values[:, :3], kept.values[:, 3:], GYRO_SI) if len(kept.t_ns) else None
-    return found and (found[0], f"gravity turns in the accelerometer as a gyro in {found[0]} says (t = {found[1]:.1f})")
-
-
-def _side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
-    return np.stack([columns.values[name].astype(float) for name in names], axis=1)
 
 
 def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
@@ -169,7 +142,7 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
         if len(near) == 1:
             proposal.entries["accel_unit"] = near[0]
             return
-        if raw := raw_counts(_side_by_side(columns, proposal.entries[sensor])):
+        if raw := raw_counts(side_by_side(columns, proposal.entries[sensor])):
             said = f"±{raw[0]} g ({raw[1]} counts a g)"
             proposal.reasons.append(
                 f"the accel holds whole numbers of a median length of {level:.4g}: raw counts of a range of {said}?"

@@ -24,7 +24,7 @@ SENSORS = {  # words in the names of files and of sensors
     "accel": r"acc[el]?|accels?|accelerometers?|accelerations?|acelerometro|accelerometre|beschleunigung(ssensor)?",
 }
 OTHERS = r"bias|biases|calib|calibration|linear|linea[lr]|user|gravity|noise|allan|stride|labels?"
-UNCORRECTED = r"uncal|uncalib|uncalibrated|raw"  # taken where nothing else is there
+UNCORRECTED = r"uncal|uncalib|uncalibrated|raw|ref|reference"  # taken where nothing else is there: not calibrated, or ideal
 WORD = r"[A-Z]?[a-z]+|[A-Z]+"
 POSE = ["time", *(f"position_{a}" for a in "xyz"), *(f"quaternion[{k}]" for k in range(4))]
 SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
@@ -49,6 +49,24 @@ def sensors_among(names: Iterable[str]) -> dict[str, str]:
                 found.setdefault(sensor, []).append((any(re.fullmatch(UNCORRECTED, word) for word in words), name))
     best = {sensor: [name for is_raw, name in each if is_raw == min(each)[0]] for sensor, each in found.items()}
     return {names[0]: sensor for sensor, names in best.items() if len(names) == 1}
+
+
+def pairs_among(names: Iterable[str]) -> dict[str, str]:
+    """Groups (`imu0/gyro`) of the names of several IMUs; of one IMU none.
+
+    The two names of an IMU differ by the sensor alone: `gyro-0`, `accel-0`.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for name in names:
+        words = re.findall(rf"{WORD}|\d+", name)
+        sensors = [s for s, pattern in SENSORS.items() if any(re.fullmatch(pattern, word.lower()) for word in words)]
+        rest = [word.lower() for word in words if not re.fullmatch("|".join(SENSORS.values()), word.lower())]
+        if len(sensors) == 1 and not any(re.fullmatch(f"{OTHERS}|{UNCORRECTED}", word) for word in rest):
+            found.setdefault("_".join(rest), {})[name] = sensors[0]
+    whole = {rest: pair for rest, pair in found.items() if sorted(pair.values()) == sorted(SENSORS)}
+    if len(whole) < 2:
+        return {}
+    return {n: f"{re.sub(r'^(?=[0-9]|$)', 'imu', rest)}/{s}" for rest, pair in whole.items() for n, s in pair.items()}
 
 
 def read_rows(text: str, columns: Columns, path: Path) -> bool:
@@ -171,7 +189,9 @@ def _words(name: str) -> list[str]:
 
 
 def _axes(names: list[str]) -> dict[str, str]:
-    """Columns of the first three that differ by x, y, z alone, or by their place in an array."""
+    """Columns x, y, z, or the first three that differ by these alone, or by their place in an array."""
+    if {*"xyz"} <= {*names}:
+        return {axis: axis for axis in "xyz"}
     places = {name: "xyz"[int(match[1])] for name in names if (match := re.search(r"\[([0-2])\]$", name))}
     if len(places) == 3 and len({name[:-3] for name in places}) == 1:
         return places

@@ -17,7 +17,7 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_dates import calendar_times
+from ._table_dates import calendar_times, join_dates
 from ._table_names import unit_named
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
@@ -38,6 +38,7 @@ STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[+-]?(0?,\d+|\d+,(\d\d?|\d{4,}))([eE][+-]?\d+)?")  # in quotes; of 1,234 it may mark thousands
 
 
 @dataclass
@@ -110,14 +111,14 @@ def text_of(raw: bytes) -> str:
         return raw.decode("utf-8-sig", "ignore") if cut else raw.decode("cp1252", "replace")
 
 
-def is_text_table(head: bytes) -> bool:
-    """Whether text has a row of at least four numbers."""
+def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
+    """Whether text has a row of at least so many numbers."""
     if b"\0" in head and not head.startswith(UTF16):
         return False
     lines = text_of(head).splitlines()
     rows = [line for line in lines[:-1] or lines if line.strip()]
-    delimiter = _delimiter(rows)
-    return any(_is_row(row, delimiter, LEAST_NUMBERS) for row in rows[:LOOKED_AT])
+    delimiter = _delimiter(rows, least)
+    return any(_is_row(row, delimiter, least) for row in rows[:LOOKED_AT])
 
 
 def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
@@ -169,13 +170,14 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
     commas: list[str] = []
     empty: list[str] = []
-    for place, (named, fields) in enumerate(zip(names, zip(*whole, strict=True), strict=True), 1):
-        texts = [text.strip().strip('"') for text in fields]
+    fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
+    join_dates(names, fields)
+    for place, (named, texts) in enumerate(zip(names, fields, strict=True), 1):
         if not any(texts):
             empty.append(named)
             continue
         name = named or f"column {place}"
-        if delimiter != "," and any(COMMA_NUMBER.fullmatch(text) for text in texts[:100]):
+        if any((COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA).fullmatch(text) for text in texts[:100]):
             texts[:] = [text.replace(",", ".") for text in texts]
             commas.append(name)
         if (values := _numbers(texts)) is not None:
@@ -211,7 +213,7 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     """
     rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
     rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
-    rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) < MOSTLY * width]  # CAL, CAL, ...
+    rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) <= max(MOSTLY * width, 1)]  # CAL, CAL
     if len(rows) > 2 and _are_units(rows[-2]) and len({*rows[-1]} - {""}) < len(rows[-1]) / 2:
         rows.pop()  # below the units RaceChrono writes the device of each column
     units: list[str] = []

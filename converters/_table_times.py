@@ -11,6 +11,8 @@ from imutool.array_types import Float64
 from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
+from ._table_dates import WEEK_NS, gps_times
+from ._table_names import split_name, unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS, USUAL_TIME_NS
 
@@ -26,7 +28,34 @@ COUNTER = r"packet|count|index|seq|frame|sample(?![ _]?time)"  # in the name of 
 MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
 MOST_SKIPPED = 0.1  # share of a counter's steps that lost samples make longer; more may be packets of other sensors
 MOST_ODD = 0.01  # share of its steps that are no multiple of the usual one
+GPS_TIME = "gps_time [ns]"
+GPS_WEEK = r"(.*_)?(gps_?)?(week|wk|gwk|wn)(_?(no?|num(ber)?))?"
+TIME_OF_WEEK = r"(.*_)?((gps_?)?(tow|sow|time_?of_?week|sec(onds)?_?of_?week)|gps_?(time|sec(onds)?))"
+LEAST_WEEK, MOST_WEEK = 990, 5000  # of 1999, before which receivers counted again from 0, and of 2075
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
+
+
+def join_gps_weeks(columns: Columns) -> None:
+    """Make one column of the GPS week and the time in it, which begins again each week."""
+    spelled = {column: split_name(column) for column in columns.values}
+    weeks = [c for c, (name, _) in spelled.items() if re.fullmatch(GPS_WEEK, name) and columns.values[c].dtype.kind in "iu"]
+    times = [c for c, (name, _) in spelled.items() if re.fullmatch(TIME_OF_WEEK, name)]
+    if len(weeks) != 1 or len(times) != 1:
+        return
+    week, time = columns.values[weeks[0]].astype(np.int64), columns.values[times[0]].astype(float)
+    unit = unit_named(columns.units.get(times[0], "")) or spelled[times[0]][1]
+    fits = [unit] if unit in USUAL_TIME_NS else units_of_time(float(time[0]), float(np.median(np.diff(time))))
+    if len(week) != len(time) or len(fits) != 1 or not np.isfinite(time).all() or not LEAST_WEEK <= week.min() <= week.max():
+        return
+    ns = np.rint(time * USUAL_TIME_NS[fits[0]]).astype(np.int64)
+    if not 0 <= ns.min() <= ns.max() < WEEK_NS or week.max() > MOST_WEEK:
+        return
+    t_ns, leap_s = gps_times(week, ns)
+    for column in (weeks[0], times[0]):
+        del columns.values[column]
+        columns.texts.pop(column, None)
+    columns.values, columns.units[GPS_TIME] = {GPS_TIME: t_ns, **columns.values}, "ns"
+    columns.remarks.notes.append(f"{weeks[0]!r} and {times[0]!r} are UTC in the log, {leap_s} leap seconds behind GPS")
 
 
 def rises(values: np.ndarray) -> bool:

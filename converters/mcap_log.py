@@ -20,13 +20,13 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._source import find_folders, head, name
+from ._source import find_folders, head, name, with_suffix
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
-IMU = "sensor_msgs/msg/Imu", "cdr"  # defined ahead of the messages: a gyro's and an accelerometer's may be joined
+IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
 PART = r"(.*)_(\d+)"  # name of a part of a ROS 2 bag
 MOST_PAUSE_NS = 10 * 10**9  # between the parts of one recording, which a recorder splits as it goes
@@ -67,7 +67,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
             for number, channel in summary.channels.items():
                 schema = summary.schemas.get(channel.schema_id)
                 if images or not re.fullmatch(IMAGES, schema.name if schema else ""):
-                    if schema is not None and (schema.name, channel.message_encoding) == IMU:
+                    if schema is not None and _may_be_imu(schema.name, channel.message_encoding):
                         topics.append(_topic(schema, channel))
                     counts[channel.topic] = counts.get(channel.topic, 0) + of_channel.get(number, 0)
         own = {**metadata.pop("imutool", {}), "format": "mcap_log", "sequence": sequence.name}
@@ -82,6 +82,11 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     )
     log.remarks.notes += [f"{unchecked} chunks state no CRC: their messages are not checked"] if unchecked else []
     return log
+
+
+def _may_be_imu(schema_name: str, encoding: str) -> bool:
+    """Whether messages are an IMU or a part of one: their topics are defined ahead of them, as two may be joined."""
+    return encoding == "cdr" and bool(re.fullmatch(IMUS, schema_name))
 
 
 def _without_crc(file: BinaryIO, chunks: Iterable[Any]) -> int:
@@ -116,7 +121,7 @@ def _parts(folder: Path) -> list[Path]:
     """
     if b"rosbag2_bagfile_information" in head(folder / METADATA):
         return []
-    files = [path for path in folder.glob("*.mcap") if path.is_file() and path.stat().st_size]
+    files = [path for path in with_suffix(folder, ".mcap") if path.is_file() and path.stat().st_size]
     named = {int(match[2]): (match[1], path) for path in files if (match := re.fullmatch(PART, path.stem))}
     parts = [named[number][1] for number in sorted(named)]
     one_name = len(files) == len(named) and len({stem for stem, _ in named.values()}) == 1
@@ -165,7 +170,7 @@ def _read_parts(sequence: Sequence, images: bool) -> MessageLog:
             found = tuple(dict.fromkeys(message.topic for message in messages()))
             what = f"{path.name} was not finished: it is read up to its last whole chunk, at byte"
             remarks.losses.append(f"{what} {_whole_size(path)} of {path.stat().st_size}")
-        topics |= {topic.name: topic for topic in found if (topic.schema_name, topic.message_encoding) == IMU} | topics
+        topics |= {topic.name: topic for topic in found if _may_be_imu(topic.schema_name, topic.message_encoding)} | topics
         sources.append(messages)
     return MessageLog(
         sequence.name,

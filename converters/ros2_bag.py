@@ -22,7 +22,7 @@ from imutool.recording.message_log import Message, MessageLog, MessageTopic, Rem
 
 from . import Sequence
 from ._ros_types import definition_from_files, need_rosbags, ros2_definition
-from ._source import find_files, find_folders, head
+from ._source import find_files, find_folders, head, with_suffix
 
 GENERAL = True
 METADATA = "metadata.yaml"
@@ -80,7 +80,7 @@ def read(source: Path) -> Iterator[MessageLog]:
 
 
 def _is_bag(folder: Path) -> bool:
-    return _has_metadata(folder) or any(_has_messages(path) for path in folder.glob("*.db3"))
+    return _has_metadata(folder) or any(_has_messages(path) for path in with_suffix(folder, ".db3"))
 
 
 def _has_metadata(folder: Path) -> bool:
@@ -96,7 +96,7 @@ def _has_messages(path: Path) -> bool:
         with sqlite3.connect(f"file:{path}?immutable=1", uri=True) as database:
             names = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     except sqlite3.Error:
-        return path.suffix == ".db3"
+        return path.suffix.lower() == ".db3"
     return {"topics", "messages"} <= names
 
 
@@ -143,7 +143,7 @@ def _renamed(folder: Path, remarks: Remarks) -> bool:
     match = LISTED.search((folder / METADATA).read_text(encoding="utf-8", errors="replace") + "\n")
     named = [PurePath(line.strip()[2:].strip("'\" ")).name for line in match[1].splitlines()] if match else []
     missing = [name for name in named if not (folder / name).exists()]
-    there = sorted(path.name for path in folder.iterdir() if path.suffix in (".db3", ".mcap"))
+    there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".db3", ".mcap"))
     if not missing or not there:
         return False
     said = f"{METADATA} names {', '.join(missing)}, which the folder lacks; its files {', '.join(there)} were read instead"
@@ -170,8 +170,8 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
     elif _has_metadata(path) and not _renamed(path, remarks):
         readers = [DirectoryReader(path)]
     else:
-        readers = [Sqlite3Reader(file) for file in sorted(path.glob("*.db3"), key=_first_ns) if _has_messages(file)]
-        readers = readers or [McapReader(file) for file in sorted(path.glob("*.mcap"))]
+        readers = [Sqlite3Reader(file) for file in sorted(with_suffix(path, ".db3"), key=_first_ns) if _has_messages(file)]
+        readers = readers or [McapReader(file) for file in with_suffix(path, ".mcap")]
         if not _has_metadata(path):
             remarks.notes.append(f"the bag has no {METADATA}; its storage files were read in order of their first messages")
     for log in path.glob("*.db3-wal") if path.is_dir() else path.parent.glob(f"{path.name}-wal"):
@@ -187,5 +187,5 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
             yield readers
     except (ReaderError, apsw.Error, OSError, EOFError, zlib.error, *MALFORMED) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
-        fix = "Save what is intact of each .mcap with imutool repair, and convert that" if any(path.glob("*.mcap")) else ""
+        fix = "Save what is intact of each .mcap with imutool repair, and convert that" if with_suffix(path, ".mcap") else ""
         raise DataError(f"cannot be read as a ROS 2 bag ({reason})", where=path, fix=fix) from error

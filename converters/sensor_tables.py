@@ -26,7 +26,7 @@ from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
 from ._archive import is_zip, list_members, read_bounded, refusing
-from ._source import find_folders, name
+from ._source import find_folders, name, with_suffix
 from ._table_names import split_name
 from ._table_text import Columns, read_csv
 from ._table_times import begun_at_zero
@@ -121,7 +121,7 @@ def _files(path: Path) -> _Files:
     """Files of a zip, or of a folder, in which KITTI's lie two levels deeper."""
     if path.is_file():
         return _Files([*list_members(path).sizes], partial(_member, path))
-    found = [*path.glob("*.csv"), *path.glob("meta/*.csv"), *path.glob("oxts/*.txt"), *path.glob("oxts/data/*.txt")]
+    found = [*with_suffix(path, ".csv"), *path.glob("meta/*.csv"), *path.glob("oxts/*.txt"), *path.glob("oxts/data/*.txt")]
     return _Files([file.relative_to(path).as_posix() for file in found], lambda wanted: (path / wanted).read_bytes())
 
 

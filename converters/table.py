@@ -119,10 +119,10 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
                 where=path,
                 fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart], own_times=own_times)}",
             )
-        named = {key: value if isinstance(value, str) else "/".join(value) for key, value in proposal.entries.items()}
+        named = {key: value if isinstance(value, str) else ", ".join(value) for key, value in proposal.entries.items()}
         counted = {key for key, value in named.items() if value.startswith(COUNTED)}
         shown = {key: value for key, value in named.items() if key.removesuffix("_unit") not in counted}
-        said = "columns: " + ", ".join(f"{key} = {value}" for key, value in shown.items())
+        said = "columns: " + "; ".join(f"{key} = {value}" for key, value in shown.items())
         remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
         maps.append(msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz, "topic": topic}, TableMap))
     return maps
@@ -251,7 +251,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         else np.zeros((len(q_wxyz), 3))
     )
     if not table.position:
-        remarks.notes.append("the truth has no positions: those of its poses are zero, and nothing is compared with them")
+        remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
     q_wxyz = np.where(q_wxyz.any(axis=1, keepdims=True), q_wxyz, np.nan)  # zeros stand where a pose is missing

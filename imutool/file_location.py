@@ -205,7 +205,8 @@ def identity(where: Location) -> tuple[int, str]:
             return status.st_size, str(status.st_mtime_ns)
         return size_and_etag(where.fs.info(where.path))
     except io_errors(where) as error:
-        raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix="See who may read it") from error
+        fix = "" if isinstance(error, FileNotFoundError) else "See who may read it"
+        raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix=fix) from error
 
 
 def size_and_etag(about: Mapping[str, Any]) -> tuple[int, str]:

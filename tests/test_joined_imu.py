@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from imutool.recording.joined_imu import in_order, sensor_delay, unit_by_gravity
+from imutool.recording.joined_imu import in_order, joined, sensor_delay, unit_by_gravity
 
 RNG = np.random.default_rng(11)
 DURATION_S = 60.0
@@ -43,6 +43,29 @@ def test_a_planted_delay_is_found(delay_s):
     assert found.std_s < WITHIN_S
 
 
+def test_a_slow_motion_that_repeats_is_not_certain_of_a_delay():
+    """Its own acceleration goes with its turns, in each stretch alike, and looks like a delay of tens of milliseconds."""
+    t, step = 0.005 * np.arange(12_000), 1e-3
+
+    def moves(t: np.ndarray, sizes: tuple[float, ...], rates: tuple[float, ...], phases: tuple[float, ...]) -> np.ndarray:
+        begun = np.clip((t - 6.0) / 2.0, 0.0, 1.0)
+        begun = begun**2 * (3.0 - 2.0 * begun)
+        return np.stack([a * np.sin(w * t + p) for a, w, p in zip(sizes, rates, phases, strict=True)], axis=1) * begun[:, None]
+
+    def turned(t: np.ndarray) -> Rotation:
+        return Rotation.from_euler("xyz", moves(t, (0.35, 0.3, 1.2), (0.9, 0.7, 0.4), (4.0, 1.69, 0.26)))
+
+    def place(t: np.ndarray) -> np.ndarray:
+        return moves(t, (2.0, 1.5, 0.8), (0.5, 0.6, 0.8), (0.1, 5.11, 5.73))
+
+    gyro = (turned(t - step).inv() * turned(t + step)).as_rotvec() / (2 * step)
+    moved = (place(t + step) - 2 * place(t) + place(t - step)) / step**2 + [0.0, 0.0, 9.81]
+    t_ns = np.rint(1e9 * t).astype(np.int64)
+    found = sensor_delay(t_ns, gyro, t_ns, turned(t).inv().apply(moved) + RNG.normal(0.0, 0.02, (len(t), 3)))
+    assert found is not None
+    assert abs(found.seconds) < 3.0 * found.std_s
+
+
 @pytest.mark.parametrize("unit", UNITS)
 def test_the_unit_of_the_gyro_shows_where_gravity_turns(unit):
     gyro_ns, gyro, _, accel = measured(0.0, (400.0, 400.0))
@@ -62,6 +85,19 @@ def test_a_log_at_rest_or_of_vibration_shows_none():
     assert sensor_delay(gyro_ns, noise, accel_ns, np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 0.05, accel.shape)) is None
     assert sensor_delay(gyro_ns, noise, accel_ns, accel) is None
     assert sensor_delay(gyro_ns[:400], noise[:400], accel_ns[:250], accel[:250]) is None
+
+
+def test_of_one_clock_a_sample_that_one_sensor_lacks_is_left_out_and_nothing_is_interpolated():
+    gyro_ns, gyro, _, accel = measured(0.0)
+    accel = accel[: len(gyro_ns)].copy()
+    gyro_ns, gyro = gyro_ns[: len(accel)], gyro[: len(accel)].copy()
+    gyro[50], accel[70] = np.nan, np.nan
+    imu, notes = joined(gyro_ns, gyro, gyro_ns.copy(), accel, "/imu0")
+    kept = np.delete(np.arange(len(gyro)), [50, 70])
+    assert np.array_equal(imu.t_ns, gyro_ns[kept])
+    assert np.array_equal(imu.gyro, gyro[kept])
+    assert np.array_equal(imu.accel, accel[kept])
+    assert all("not finite" in note for note in notes)
 
 
 def test_a_clock_that_is_set_back_is_said_with_what_is_missing():

@@ -161,7 +161,7 @@ def find_model(name: str | Path, rate_hz: float | None = None) -> BiasModel:
         ConfigError: an unreadable physics.toml.
     """
     path = model_file(name)
-    if path.suffix == ".toml":
+    if path.suffix.lower() == ".toml":
         if rate_hz is None:
             raise ModelError("a physics.toml has no sample rate", where=path, expected="`rate_hz`")
         from imutool.bias import physics
@@ -178,7 +178,7 @@ def shared_model(name: str | Path, rate_hz: float) -> BiasModel:
     To read and check a model takes a worker an eighth of its time for a log of 2 MB.
     """
     path = model_file(name)
-    if path.suffix == ".toml" or not path.is_file():
+    if path.suffix.lower() == ".toml" or not path.is_file():
         return find_model(path, rate_hz)
     status = path.stat()
     return _load_once(path.absolute(), status.st_size, status.st_mtime_ns)
@@ -198,7 +198,7 @@ def model_file(name: str | Path) -> Path:
     if not isinstance(name, str | Path):
         raise ModelError(f"a model of type {type(name).__name__}", expected="a file, or the name of a model")
     path = Path(name)
-    return path if path.suffix in (".toml", ".safetensors") or path.exists() else shipped(str(name))
+    return path if path.suffix.lower() in (".toml", ".safetensors") or path.exists() else shipped(str(name))
 
 
 def shipped(name: str, where: object = None) -> Path:

@@ -70,8 +70,8 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
         streams: list[Iterator[tuple[Chunk, str | None]]] = [((chunk, None) for chunk in chunks(g)) for g in groups]
         for chunk, packing in heapq.merge(*streams, stream.chunks(), key=lambda item: item[0].start_ns):
             log.chunk(chunk, packing)
-        for topic, imu in pairs.joined(source.remarks):
-            series = Series(log.channel(topic, schemas.IMU), imu.t_ns, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
+        for topic, (log_times, imu) in pairs.joined(source.remarks):
+            series = Series(log.channel(topic, schemas.IMU), log_times, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
             for chunk in chunks([series]):
                 log.chunk(chunk)
         _write_trajectories(log, source, stream.paths)
@@ -152,7 +152,7 @@ class _Stream:
             if last is not None and abs(log_time - last) > longest and len(jumps) < MOST_JUMPS:
                 jumps.append((log_time, (log_time - last) * 1e-9))
             last = log_time
-            self._pairs.take(topic, payload)
+            self._pairs.take(topic, log_time, payload)
             self.paths.take(topic, payload)
             if number not in self._begun:
                 self._begin(number, topic)

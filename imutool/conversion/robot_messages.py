@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ from imutool.mcap_io.codec.ros2_definition import DescribedCdr, parse
 from imutool.recording.message_log import MessageTopic, named_kind
 
 PACKAGE = "px4_msgs/msg/"
+WHOLE_IMUS, SINGLE_SENSORS = ("SensorCombined", "VehicleImu"), ("SensorGyro", "SensorAccel")
 PATH = "nav_msgs/msg/Path"
 FLU_FROM_FRD = np.array([1.0, -1.0, -1.0])
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -41,9 +42,9 @@ def _row(name: str, count: int = 3) -> tuple[Field, ...]:
 
 @dataclass(frozen=True)
 class Px4:
-    """IMU or poses in the messages of a topic of PX4."""
+    """IMU, poses or a single sensor in the messages of a topic of PX4."""
 
-    schema_name: str
+    schema_name: str  # of the messages that are made; none of a single sensor
     ending: str  # of the topic that is made
     format: DescribedCdr
     kind: str
@@ -68,6 +69,9 @@ class Px4:
         def vector(name: str, count: int = 3) -> Float64[np.ndarray, " k"]:
             return np.array([at(message, field) for field in _row(name, count)], np.float64)
 
+        if self.kind in SINGLE_SENSORS:
+            values = FLU_FROM_FRD * [float(at(message, (axis,))) for axis in "xyz"]
+            return Sample((number("timestamp_sample") or number("timestamp")) * US, BODY, values.tolist())
         if self.kind == "VehicleOdometry":
             if number("pose_frame") not in KNOWN_FRAMES:
                 raise ValueError("the frame of the pose is not known")
@@ -102,13 +106,28 @@ def px4_of(topic: MessageTopic, *, has_imu: bool) -> Px4 | None:
     name = schemas.canonical(topic.schema_name)
     kind = name.removeprefix(PACKAGE)
     is_pose = kind == "VehicleOdometry"
-    if name == kind or kind not in ("SensorCombined", "VehicleImu", "VehicleOdometry") or (has_imu and not is_pose):
+    if name == kind or kind not in (*WHOLE_IMUS, "VehicleOdometry") or (has_imu and not is_pose):
         return None
+    return _px4(topic, kind, schemas.POSE if is_pose else schemas.IMU, "pose" if is_pose else "imu")
+
+
+def px4_sensors(topics: Iterable[MessageTopic]) -> dict[str, Px4]:
+    """Gyros and accelerometers of PX4 by topic; none where a topic holds both."""
+    kinds = {topic: schemas.canonical(topic.schema_name).removeprefix(PACKAGE) for topic in topics}
+    if {*WHOLE_IMUS} & {*kinds.values()}:
+        return {}
+    single = ((t, kind) for t, kind in kinds.items() if kind in SINGLE_SENSORS and t.message_encoding == "cdr")
+    found = {topic.name: _px4(topic, kind, "", "") for topic, kind in single}
+    return {name: form for name, form in found.items() if form is not None}
+
+
+def _px4(topic: MessageTopic, kind: str, schema_name: str, ending: str) -> Px4 | None:
+    """Access to the messages of a topic; None of a definition that cannot be read."""
     try:
-        form = DescribedCdr(parse(name, topic.schema))
+        form = DescribedCdr(parse(schemas.canonical(topic.schema_name), topic.schema))
     except LogError:
         return None
-    return Px4(schemas.POSE if is_pose else schemas.IMU, "pose" if is_pose else "imu", form, kind)
+    return Px4(schema_name, ending, form, kind)
 
 
 def pose_kind(topic: str) -> str:

@@ -198,7 +198,7 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
         ConfigError: several logs but `out` names a file, it is a URL or a stream, or a folder cannot be made.
     """
     slash, out = str(out).endswith(("/", os.sep)), local(str(out), "out")
-    if many and (out.suffix == SUFFIX or out.is_file()):
+    if many and (out.suffix.lower() == SUFFIX or out.is_file()):
         raise ConfigError("several sequences do not fit into one file", where=out, expected="a folder")
     into_folder = many or slash or out.is_dir()
     folder = out if into_folder else out.parent
@@ -233,7 +233,7 @@ def _is_part_of(target: Path, source: Path) -> bool:
     """
     if not target.exists():
         return False
-    inside = source.is_dir() and target.resolve().is_relative_to(source.resolve()) and target.suffix != SUFFIX
+    inside = source.is_dir() and target.resolve().is_relative_to(source.resolve()) and target.suffix.lower() != SUFFIX
     return inside or target.samefile(source)
 
 

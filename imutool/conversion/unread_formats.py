@@ -6,7 +6,7 @@ import re
 
 from imutool.file_location import compression
 
-ENOUGH = 32  # bytes of a file's start
+ENOUGH = 1024  # bytes of a file's start
 FORMATS = {  # what a file that begins like this is, and what to do
     rb"H Product:Blackbox": (
         "it is a blackbox log of Betaflight or INAV",
@@ -29,13 +29,21 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "Export it as CSV with SensorConnect, and convert that",
     ),
 }
+WITHOUT_NUMBERS = (
+    "it is text without a row of four numbers, which are the least of a table: a time and a vector",
+    "See whether the recorder wrote any rows, and how it separates their fields: by comma, semicolon, tab or blanks",
+)
 
 
 def describe_unread(start: bytes) -> tuple[str, str]:
     """What a file with these first bytes is, and what to do; empty where that is not known."""
     if not start:
-        return "the file is empty", ""
+        return "it is empty", "See whether the recorder was stopped properly"
     if program := compression(start):
         return f"it is compressed with {program}", f"Unpack it first, for instance with {program} -d"
     found = (said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL))
-    return next(found, ("", ""))
+    return next(found, WITHOUT_NUMBERS if _is_text(start) else ("", ""))
+
+
+def _is_text(start: bytes) -> bool:
+    return "".join(start.decode("utf-8-sig", "ignore").split()).isprintable() and b"\0" not in start

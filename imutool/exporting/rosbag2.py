@@ -48,9 +48,8 @@ def _check_readable(log: Log) -> None:
         LogError: the profile is another, or a topic is not in CDR or has no schema.
     """
     if log.index.header.profile != "ros2":
-        raise LogError(
-            f"the log's profile is {log.index.header.profile!r}", where=log.path, expected="'ros2', the only one rosbag2 holds"
-        )
+        what, expected = f"the log's profile is {log.index.header.profile!r}", "'ros2', the only one rosbag2 holds"
+        raise LogError(what, where=log.path, expected=expected, fix="Use `format=euroc`")
     for topic in log.topics.values():
         if topic.message_encoding != "cdr" or not topic.schema_name:
             what = (

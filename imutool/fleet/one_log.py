@@ -82,7 +82,12 @@ def work(task: Task, model: bytes | None = None) -> Result:
 
 def page_name(log: str) -> str:
     """Name of the page about a log."""
-    return log.removesuffix(".mcap") + ".html"
+    return f"{without_suffix(log)}.html"
+
+
+def without_suffix(log: str) -> str:
+    """Name of a log without `.mcap`, in small or capital letters."""
+    return log[: -len(".mcap")] if log.lower().endswith(".mcap") else log
 
 
 def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
@@ -95,7 +100,7 @@ def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
     try:
         if identity(target)[0] != done.target_bytes or (done.page and not target.with_name(page_name(target.name)).is_file()):
             return False
-        if whole or target.suffix != ".mcap":
+        if whole or target.suffix.lower() != ".mcap":
             return sha256(target) == done.target_sha256
         with Log(target):
             return True
@@ -276,4 +281,4 @@ COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {
 
 def target_name(name: str, command: str) -> str:
     """Output name for a log: logs and bags keep their names, reports end in .json."""
-    return name if command in {"debias", "repair"} else f"{name.removesuffix('.mcap')}.json"
+    return name if command in {"debias", "repair"} else f"{without_suffix(name)}.json"

@@ -258,7 +258,7 @@ def robot_of(name: str, pattern: str | None, log: Location) -> str:
     fits = robot_pattern(pattern)
     if fits is None:
         folder, _, file = name.rpartition("/")
-        return folder or file.removesuffix(".mcap")
+        return folder or re.sub(r"(?i)\.mcap$", "", file)
     if isinstance(fits, str):
         record, _, key = fits.rpartition(".")
         with Log(log) as opened:

@@ -55,9 +55,9 @@ def with_model_hash(settings: Settings) -> Settings:
     from imutool.bias.model_file import digest, find_model, library
 
     name = settings.model
-    if name is not None and Path(name).suffix in {".safetensors", ".toml"}:
+    if name is not None and Path(name).suffix.lower() in {".safetensors", ".toml"}:
         path = Path(name).absolute()
-        if path.suffix == ".safetensors":
+        if path.suffix.lower() == ".safetensors":
             find_model(path)  # before a thousand logs say the same
         return msgspec.structs.replace(settings, model=str(path), model_sha256=digest(path))
     if name is not None and name != "static":

@@ -29,6 +29,7 @@ CONVERTIBLE = {  # messages of which `convert` makes others
     "nav_msgs/msg/Path": "poses",
     "px4_msgs/msg/VehicleOdometry": "poses",
     "px4_msgs/msg/VehicleImu": "an IMU",
+    "px4_msgs/msg/SensorGyro": "an IMU",
 }
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
 NO_POSES = "the log has no true poses"

@@ -39,8 +39,8 @@ from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
-from imutool.recording import LEAST_PERIOD_S, Imu
-from imutool.recording.columns import clock_jumps, jump_warnings
+from imutool.recording import LEAST_PERIOD_S, Imu, nanoseconds
+from imutool.recording.columns import MOST_GAP_S, clock_jumps, jump_warnings
 from imutool.report import UNSET
 
 UNUSUAL = 0.5  # share by which a period may differ from the median, to count for the rate
@@ -125,14 +125,14 @@ def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> TopicInfo:
 
 def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     """Rate, jitter, largest gap and ends of the sorted times."""
-    ordered = np.sort(t_ns)
-    periods = np.diff(ordered)
+    periods = np.diff(ordered := np.sort(t_ns))
+    steady = periods[periods < nanoseconds(MOST_GAP_S)]  # that a clock is set is no jitter
     known = len(periods) > 0
     median = float(np.median(periods)) if known else 0.0
     usual = periods[np.abs(periods - median) <= UNUSUAL * median]  # the median itself is coarse where times are whole ms
     return Clock(
         rate_hz=1e9 / float(usual.mean()) if median > 0 else None,
-        jitter_s=float(np.std(periods)) * 1e-9 if known else None,
+        jitter_s=float(np.std(steady)) * 1e-9 if len(steady) else None,
         largest_gap_s=float(periods.max()) * 1e-9 if known else None,
         first_ns=int(ordered[0]) if len(ordered) else None,
         last_ns=int(ordered[-1]) if len(ordered) else None,

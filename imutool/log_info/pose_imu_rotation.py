@@ -94,7 +94,8 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]
     if explained > LEAST_EXPLAINED or rms_rad_s < UNLIKE_RAD_S:
         return []
     causes = (
-        "clocks that differ, poses of another recording or body, jumps or noise, or quaternions inverted or in another order"
+        "clocks that differ, a gyro in another unit, poses of another recording or body, jumps or noise, or quaternions"
+        " inverted or in another order"
     )
     return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
 

@@ -18,6 +18,7 @@ import numpy as np
 from imutool.array_types import Bool, Int64, Shaped
 from imutool.errors import DataError
 
+YEAR_S = 365.25 * 86400.0
 MOST_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps is a jump of their clock
 SET_BACK_NS = 1_000_000_000  # by which stamps go back at a jump; less is a sample that came late
 MOST_TOLD = 5  # jumps
@@ -291,6 +292,7 @@ def _between(starts: Int64[np.ndarray, " k"], count: int) -> list[slice]:
 def jump_warnings(jumps: Sequence[tuple[int, float]]) -> Iterator[str]:
     """Jumps of a clock in words."""
     for start_ns, step_s in jumps[:MOST_TOLD]:
-        yield f"the clock jumps by {step_s:+.6g} s to {start_ns} ns; a new stretch begins there"
+        years = f" ({abs(step_s) / YEAR_S:.1f} years)" if abs(step_s) > YEAR_S else ""
+        yield f"the clock jumps by {step_s:+.6g} s{years} to {start_ns} ns; a new stretch begins there"
     if len(jumps) > MOST_TOLD:
         yield f"the clock jumps {len(jumps) - MOST_TOLD} times more"

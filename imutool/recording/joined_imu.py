@@ -54,7 +54,24 @@ def sensor_delay(
     parts = [peak for part in range(PARTS) if (peak := _peak(products[:, part], lags)) is not None]
     if len(parts) < LEAST_PARTS:
         return None
-    return SensorDelay(whole * STEP_S, float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5)
+    spread_s = float(np.std(parts, ddof=1)) * STEP_S / len(parts) ** 0.5
+    return SensorDelay(whole * STEP_S, max(spread_s, _least_std(both, products.sum(axis=1))))
+
+
+def _least_std(
+    both: tuple[Float64[np.ndarray, "c 3"], Float64[np.ndarray, "c 3"]], products: Float64[np.ndarray, "k 3"]
+) -> float:
+    """Least standard deviation (s) of the lag of two signals, by what they do not have in common.
+
+    It is that of Cramer and Rao for a delay, tan(acos r) / (w sqrt(n)): r is the correlation, w the rms frequency (rad/s), and
+    n = 3 T w / pi the independent samples of three axes. A motion that repeats has the same error in each stretch.
+    """
+    together, measured, predicted = products.T
+    r = float(np.clip((together / np.sqrt(np.maximum(measured * predicted, 1e-300))).max(), LEAST_CORRELATION, 1.0))
+    turn = -np.cross(*both)
+    w = float(np.sqrt((np.gradient(turn, STEP_S, axis=0) ** 2).sum() / max(float((turn**2).sum()), 1e-300)))
+    samples = 3.0 * STEP_S * len(turn) * w / np.pi
+    return float(np.sqrt(1.0 - r**2) / r / (w * np.sqrt(samples))) if w > 0.0 else float("inf")
 
 
 def unit_by_gravity(
@@ -79,6 +96,20 @@ def unit_by_gravity(
     t = float((gains.mean(axis=1) * gains.shape[1] ** 0.5 / np.maximum(gains.std(axis=1, ddof=1), 1e-300)).min())
     name, size = sizes[best]
     return (name, t) if size == units[name] and t > LEAST_T else None
+
+
+def steady_force(
+    t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+) -> float | None:
+    """Median size (m/s²) of the mean specific force over 2 s, turned back by the gyro.
+
+    It is about gravity, unless gravity was taken out. None of a log too short for it.
+    """
+    both = _together(t_ns, gyro, t_ns, accel)
+    if both is None:
+        return None
+    rate, force = (_in_windows(values) for values in both)
+    return float(np.median(_turned_back(rate, force)))
 
 
 def _in_windows(values: Float64[np.ndarray, "c 3"]) -> Float64[np.ndarray, "w k 3"]:
@@ -154,6 +185,7 @@ def _peak(products: Float64[np.ndarray, "k 3"], lags: Int64[np.ndarray, " k"]) -
 
 
 SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
+LEAST_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
 
@@ -196,8 +228,9 @@ def joined(
     """
     rates, forces = in_order(gyro_ns, gyro, f"{name} gyro"), in_order(accel_ns, accel, f"{name} accel")
     notes = rates.notes + forces.notes
-    if np.array_equal(rates.t_ns, forces.t_ns):
-        return Imu(rates.t_ns, rates.values, forces.values), notes
+    t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
+    if len(t_ns) > LEAST_COMMON * max(len(rates.t_ns), len(forces.t_ns)):  # one clock: a sample that one of them lacks is none
+        return Imu(t_ns, rates.values[first], forces.values[second]), notes
     if len(rates.t_ns) < 2 or len(forces.t_ns) < 2 or rates.t_ns[0] >= forces.t_ns[-1] or rates.t_ns[-1] <= forces.t_ns[0]:
         raise DataError("gyro and accelerometer share no time", where=name, expected="two sensors that run together")
     after = np.clip(np.searchsorted(forces.t_ns, rates.t_ns), 1, len(forces.t_ns) - 1)

@@ -109,7 +109,7 @@ def test_what_an_effect_adds_is_taken_off(name: str, trajectory: Path, ideal: Re
 
 def test_scale_misalignment_and_mount_together_are_exact(trajectory: Path, ideal: Recording) -> None:
     names = ("gyro_scale", "gyro_misalignment", "accel_scale", "accel_misalignment", "mount_rotation")
-    file = written(trajectory.with_name("together.toml"), *(entry(name, EFFECTS[name][0]) for name in names))
+    file = written(trajectory.with_name("together.TOML"), *(entry(name, EFFECTS[name][0]) for name in names))
     before, after = left(file, along(trajectory, file, "together"), ideal)
     assert after < EXACT * before
 

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imutool.conversion.run import ConvertReport, convert
+from imutool.errors import LogError
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -23,9 +25,12 @@ PX4 = {
     "uint32 gyro_integral_dt\nint32 accelerometer_timestamp_relative\nfloat32[3] accelerometer_m_s2\nuint8 clipping\n",
     "px4_msgs/msg/VehicleImu": "uint64 timestamp\nuint64 timestamp_sample\nuint32 device\nfloat32[3] delta_angle\n"
     "float32[3] delta_velocity\nuint16 delta_angle_dt\nuint16 delta_velocity_dt\n",
+    "px4_msgs/msg/SensorGyro": "uint64 timestamp\nuint64 timestamp_sample\nuint32 device_id\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "float32 temperature\nuint32 error_count\nuint8[3] clip_counter\nuint8 samples\n",
     "px4_msgs/msg/VehicleOdometry": "uint64 timestamp\nuint64 timestamp_sample\nuint8 POSE_FRAME_NED = 1\nuint8 pose_frame\n"
     "float32[3] position\nfloat32[4] q\nfloat32[3] velocity\n",
 }
+PX4["px4_msgs/msg/SensorAccel"] = PX4["px4_msgs/msg/SensorGyro"]
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 for name, text in PX4.items():
     STORE.register(get_types_from_msg(text, name))
@@ -51,6 +56,11 @@ def integrated(n: int) -> Any:
     delta = 0.01 * FRD
     us = 10_000 * (n + 500) + 5_000  # the end of what it integrates
     return TYPES["px4_msgs/msg/VehicleImu"](0, us, 7, f32(delta * GYRO * (n + 1)), f32(delta * ACCEL), 10_000, 10_000)
+
+
+def single(kind: str, n: int, values: np.ndarray) -> Any:
+    us = 10_000 * (n + 500)
+    return TYPES[f"px4_msgs/msg/{kind}"](us + 90, us, 7, *f32(FRD * values), 41.0, 0, np.zeros(3, np.uint8), 8)
 
 
 def odometry(n: int, frame: int = 1) -> Any:
@@ -112,6 +122,28 @@ def test_px4s_imu_and_odometry_arrive_in_flu_and_enu(tmp_path, make):
         assert log.topics["/fmu/out/vehicle_odometry/pose"].pose_kind == "estimate"
         assert log.topics["/fmu/out/imu"].schema_name == kind  # PX4's own topic stays
     assert any("in FLU and ENU" in note for note in report.notes)
+
+
+@pytest.mark.parametrize(("ending", "whole"), [("", "/fmu/out/imu"), ("_1", "/fmu/out/sensor_imu_1")])
+def test_px4s_gyro_and_accelerometer_become_one_imu_at_the_log_times_of_the_gyro(tmp_path, ending, whole):
+    topics = {
+        f"/fmu/out/sensor_gyro{ending}": [(n, single("SensorGyro", n, GYRO * (n + 1))) for n in range(COUNT)],
+        f"/fmu/out/sensor_accel{ending}": [(n, single("SensorAccel", n, ACCEL)) for n in range(COUNT)],
+    }
+    if ending:  # a second pair in the same folder
+        topics |= {topic.replace("_1", "_0"): messages for topic, messages in topics.items()}
+    source = written(tmp_path / "bag.mcap", topics)
+    with Log(source) as log, pytest.raises(LogError, match="imutool convert makes an IMU of PX4's topics"):
+        log.only_imu()
+    report = convert(source, tmp_path / "out.mcap")
+    recording = read(tmp_path / "out.mcap", imu=whole)
+    np.testing.assert_allclose(recording.imu.gyro, GYRO * (np.arange(COUNT)[:, None] + 1), rtol=1e-6)
+    np.testing.assert_allclose(recording.imu.accel, np.tile(ACCEL, (COUNT, 1)), rtol=1e-6)
+    assert recording.imu.t_ns.tolist() == [10_000_000 * (n + 500) for n in range(COUNT)]
+    with (tmp_path / "out.mcap").open("rb") as file:
+        times = [message.log_time for _, _, message in make_reader(file).iter_messages(topics=[whole])]
+    assert times == [START_NS + STEP_NS * n for n in range(COUNT)]
+    assert any(note.endswith("in FLU") for note in report.notes)
 
 
 def test_a_log_that_was_converted_before_gets_no_second_topic(tmp_path):

@@ -136,18 +136,22 @@ def test_an_unknown_format_is_refused_with_the_nearest(source, tmp_path):
         convert(source, tmp_path / "out", format="eurok")
 
 
-@pytest.mark.parametrize("kind", ["empty folder", "folder of notes", "text file", "other archive"])
+@pytest.mark.parametrize("kind", ["empty folder", "folder of notes", "text file", "empty file", "header alone"])
 def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_path, kind):
     source = tmp_path / "source"
-    if kind == "text file":
+    texts = {"text file": "notes", "empty file": "", "header alone": "time,gx,gy,gz,ax,ay,az\n"}
+    if kind in texts:
         source = tmp_path / "notes.txt"
-        source.write_text("notes")
+        source.write_text(texts[kind])
     else:
         source.mkdir()
         if kind == "folder of notes":
             (source / "notes.txt").write_text("notes")
-    fix = " Name the file itself" if source.is_dir() else r"archive\.?$"
-    with pytest.raises(DataError, match=rf"no sequence found; expected a ROS bag, an MCAP log.*{fix}"):
+    what = (
+        "" if source.is_dir() else ": it is empty" if kind == "empty file" else ": it is text without a row of four numbers.*"
+    )
+    fix = "Name the file itself" if source.is_dir() else "See whether the recorder"
+    with pytest.raises(DataError, match=rf"no sequence found{what}; expected a ROS bag, an MCAP log.*{fix}"):
         convert(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -161,9 +165,10 @@ def test_an_existing_log_is_kept_unless_overwriting_is_asked_for(source, tmp_pat
     assert len(convert(source, tmp_path / "out", overwrite=True).written) == 3
 
 
-def test_several_sequences_do_not_go_into_one_file(source, tmp_path):
+@pytest.mark.parametrize("suffix", ["mcap", "MCAP"])
+def test_several_sequences_do_not_go_into_one_file(source, tmp_path, suffix):
     with pytest.raises(ConfigError, match="several sequences do not fit into one file"):
-        convert(source, tmp_path / "out.mcap")
+        convert(source, tmp_path / f"out.{suffix}")
 
 
 def test_two_sequences_of_one_name_are_refused(source, tmp_path):

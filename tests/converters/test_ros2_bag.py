@@ -139,6 +139,15 @@ def test_parts_without_metadata_are_read_in_the_order_of_their_times(convert, tm
     assert "goes back" not in done.stderr  # the writer names jumps of the clock
 
 
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_files_of_a_bag_may_end_in_capital_letters(convert, tmp_path, storage):
+    bag = unfinished(tmp_path / "walk", storage, 2)
+    for file in [*bag.iterdir()]:
+        file.rename(file.with_suffix(file.suffix.upper()))
+    assert convert(bag, tmp_path / "out.mcap").returncode == 0
+    assert len([topic for topic, *_ in messages_of(tmp_path / "out.mcap")[0] if topic == "/load"]) == 2 * COUNT
+
+
 def test_an_unfinished_part_is_read_up_to_its_last_whole_chunk(convert, tmp_path):
     bag = unfinished(tmp_path / "walk", "mcap", 2)
     with (bag / "run_1.mcap").open("wb") as file:

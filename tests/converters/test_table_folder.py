@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,49 @@ def test_a_folder_with_a_table_a_sensor_is_one_recording(tmp_path, folder):
     assert f"{gyro_name}: the gyro is {gyro_name}" in log.remarks.notes
 
 
+def simulated(folder: Path, runs: int) -> np.ndarray:
+    """Folder as gnss-ins-sim writes it: a time in a table of its own, tables without; the true accelerations."""
+    folder.mkdir()
+    t_s = 0.01 * np.arange(COUNT)
+    turn = np.stack([0 * t_s, 0 * t_s, np.sin(t_s)], axis=1)
+    tables = {"time": (["time (sec)"], t_s), "ref_gyro": ([f"ref_gyro_{a} (deg/s)" for a in "xyz"], turn)}
+    tables |= {"gps_time": (["gps_time (sec)"], t_s[::10]), "gps-0": (["lat (deg)", "lon (deg)", "alt (m)"], turn[::10])}
+    for run in range(runs):
+        tables[f"gyro-{run}"] = [f"gyro_{a} (deg/s)" for a in "xyz"], np.rad2deg(GYRO) + run
+        tables[f"accel-{run}"] = [f"accel_{a} (m/s^2)" for a in "xyz"], -ACCEL
+    for name, (names, values) in tables.items():
+        np.savetxt(folder / f"{name}.csv", values, header=",".join(names), delimiter=",", comments="")
+    return -ACCEL
+
+
+@pytest.mark.parametrize(("runs", "topics"), [(1, ["/imu0"]), (2, ["/imu0/imu", "/imu1/imu"])])
+def test_a_folder_of_gnss_ins_sim_has_its_times_in_a_table_of_their_own(tmp_path, runs, topics):
+    accel = simulated(tmp_path / "run", runs)
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence)
+    assert [*log.imus] == topics
+    for run, imu in enumerate(log.imus.values()):
+        np.testing.assert_allclose(imu.gyro, GYRO + np.deg2rad(run), rtol=1e-12)
+        np.testing.assert_array_equal(imu.accel, accel)
+        assert imu.t_ns.tolist() == [10_000_000 * n for n in range(COUNT)]
+    assert np.diff(log.scalars["/gps_0_lat_deg"].t_ns).tolist() == [100_000_000] * (COUNT // 10 - 1)
+    assert not log.remarks.losses
+
+
+def test_of_a_table_of_one_sensor_x_y_and_z_are_the_axes(tmp_path):
+    """PX4's sensor_gyro has three counters beside them."""
+    names = ["timestamp", "timestamp_sample", *(f"clip_counter[{k}]" for k in range(3)), *"xyz"]
+    t_us, zero = 1e6 * T_S, np.zeros((COUNT, 3))
+    for sensor, values in (("gyro", GYRO), ("accel", ACCEL)):
+        columns = np.column_stack([t_us, t_us - 100, zero, values])
+        np.savetxt(tmp_path / f"sensor_{sensor}_0.csv", columns, header=",".join(names), delimiter=",", comments="")
+    (sequence,) = table.sequences(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(sequence)
+    log = table.read_sequence(sequence, mapping=answered(refused.value, tmp_path / "map.toml", gyro_unit="rad/s"))
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, GYRO)
+
+
 def test_of_several_sensors_the_map_names_the_first_and_the_refusal_all(tmp_path):
     groups = "left_acc", "left_gyr", "coarse_acc", "right_gyr"  # which of them belong together is not said
     names = [f"{group}_{a}" for group in groups for a in "xyz"]
@@ -143,6 +187,23 @@ def test_motion_without_gravity_is_asked_about(tmp_path):
         (tmp_path / "log.csv").write_text(",".join(names) + "\n" + rows(T_S, GYRO, accel))
         with pytest.raises(ConfigError, match="gravity was taken out"):
             table.read_sequence(table.sequences(tmp_path / "log.csv")[0])
+
+
+@pytest.mark.parametrize("has_gravity", [True, False])
+def test_a_body_that_turns_over_and_over_has_gravity_in_its_accelerations(tmp_path, has_gravity):
+    t_s = 0.01 * np.arange(6000)
+    rates = np.stack([3.0 + 2.5 * np.sin(0.7 * t_s), 2.0 * np.cos(0.5 * t_s), 1.5 * np.sin(0.3 * t_s)], axis=1)
+    turns = list(accumulate(Rotation.from_rotvec(0.01 * rates), lambda turned, step: turned * step))
+    forces = np.stack([4.0 * np.sin(t_s), 4.0 * np.cos(1.3 * t_s), 9.0 * np.sin(1.7 * t_s) + 9.8 * has_gravity], axis=1)
+    accel = Rotation.concatenate(turns).inv().apply(forces) / 9.80665
+    names = ["time_s", *(f"gyro_{a} (deg/s)" for a in "xyz"), *(f"acc_{a} (g)" for a in "xyz")]
+    (tmp_path / "log.csv").write_text(",".join(names) + "\n" + rows(t_s, np.rad2deg(rates), accel))
+    (sequence,) = table.sequences(tmp_path / "log.csv")
+    if has_gravity:
+        np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].accel, 9.80665 * accel, rtol=1e-12)
+    else:
+        with pytest.raises(ConfigError, match="gravity was taken out, or the body turned upside down and back"):
+            table.read_sequence(sequence)
 
 
 def test_a_packets_number_is_no_clock_and_counts_samples_whatever_its_step(tmp_path):

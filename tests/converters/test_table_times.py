@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import table
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 
 RATE_HZ = 250.0
 COUNT = 5000
@@ -44,6 +45,58 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
         f'gyro = {names[1:4]}\ngyro_unit = "rad/s"\naccel = {names[4:]}\naccel_unit = "m/s^2"\n'
     )
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
+def test_gps_weeks_and_the_time_in_them_are_utc_across_the_end_of_a_week(tmp_path):
+    names = ["GPS Week", "TOW (s)", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    since_ms = (2394 * 604_800 + 604_800 - 10) * 1000 + 4 * np.arange(COUNT)
+    week, ms = np.divmod(since_ms, 604_800_000)
+    log = read(write_csv(tmp_path / "log.csv", names, [week, ms / 1000, *GYRO.T, *ACCEL.T]))
+    t_ns = log.imus["/imu0"].t_ns
+    assert np.array_equal(np.diff(t_ns), np.full(COUNT - 1, NEXT_NS))
+    assert np.datetime64(int(t_ns[0]), "ns") == np.datetime64("2025-11-29T23:59:32")  # 18 leap seconds before that of GPS
+
+
+@pytest.mark.parametrize(
+    ("date", "clock"), [("29.11.2025", "%H:%M:%S,%f"), ("2025-11-29", "%H:%M:%S.%f"), ("11/29/2025", "%I:%M:%S.%f %p")]
+)
+def test_a_date_and_a_clock_in_two_columns_are_one_time(tmp_path, date, clock):
+    start = datetime(2025, 11, 29, 23, 59, 50)
+    dated = {"29.11.2025": "%d.%m.%Y", "2025-11-29": "%Y-%m-%d", "11/29/2025": "%m/%d/%Y"}[date]
+    times = [start + timedelta(milliseconds=4 * n) for n in range(COUNT)]
+    lines = ["Date;Time;wx [rad/s];wy [rad/s];wz [rad/s];ax [m/s^2];ay [m/s^2];az [m/s^2]"]
+    for t, row in zip(times, np.column_stack([GYRO, ACCEL]).tolist(), strict=True):
+        lines.append(";".join([t.strftime(dated), t.strftime(clock), *map(repr, row)]))
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    t_ns = read(tmp_path / "log.csv").imus["/imu0"].t_ns
+    assert np.array_equal(t_ns, np.datetime64(start, "ns").astype(np.int64) + NEXT_NS * np.arange(COUNT))
+
+
+def test_rows_that_hold_one_sensor_each_are_one_imu_whose_unit_the_motion_shows(tmp_path):
+    lines = ["timestamp_ns,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z"]
+    for n, (gyro, accel) in enumerate(zip(GYRO.tolist(), ACCEL.tolist(), strict=True)):
+        lines.append(f"{NEXT_NS * n},{','.join(map(repr, gyro))},,,")
+        lines += [f"{NEXT_NS * n + 700_000},,,,{','.join(map(repr, accel))}"] if n % 2 == 0 else []
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    imu = read(tmp_path / "log.csv").imus["/imu0"]
+    assert np.array_equal(imu.t_ns, NEXT_NS * np.arange(1, COUNT - 1))
+    np.testing.assert_array_equal(imu.gyro, GYRO[1:-1])
+
+
+def test_decimal_commas_in_quotes_are_read_and_what_is_no_number_is_said(tmp_path):
+    names = ["time [s]", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    rows = [",".join(f'"{value:.6f}"'.replace(".", ",") for value in row) for row in np.column_stack([T_S, GYRO, ACCEL])]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+    np.testing.assert_allclose(read(tmp_path / "log.csv").imus["/imu0"].gyro, GYRO, atol=1e-6)
+    lines = [
+        ",".join([*names, "n"]),
+        *(",".join([*[f'"{n},{100 + k}"' for k in range(7)], "a b"[:: n % 2 + 1]]) for n in range(1, 99)),
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")  # thousands, or decimals
+    with pytest.raises(
+        DataError, match=r"no columns of numbers; time \[s\] is left out: its fields, as '1,100', are no numbers"
+    ):
+        read(tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize("stated", ["fs", "sampling_rate", "dt", "sample_period_ms", "Fs_imu", "gyro_rate_hz"])

@@ -280,7 +280,7 @@ def test_a_log_that_is_no_ros2_log_cannot_be_copied_into_a_bag(log: Path, tmp_pa
         channel = writer.register_channel("/imu0", "json", writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"{}"))
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    with pytest.raises(LogError, match="profile is ''"):
+    with pytest.raises(LogError, match=r"profile is ''.*Use `format=euroc`"):
         export(tmp_path / "json.mcap", tmp_path / "bag", format="rosbag2")
     assert not (tmp_path / "bag").exists()
     with pytest.raises(ConfigError, match="whole log"):

@@ -18,7 +18,7 @@ from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError
-from imutool.fleet.one_log import target_name, work
+from imutool.fleet.one_log import page_name, target_name, work
 from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
@@ -230,3 +230,8 @@ def test_a_robot_is_its_folder_or_what_the_pattern_says(logs: Path, tmp_path: Pa
     for wrong in ("(", "metadata:serial"):
         with pytest.raises(ConfigError, match="robot_from"):
             robot_pattern(wrong)
+
+
+def test_names_are_made_of_a_log_whose_suffix_is_in_capital_letters_as_of_others():
+    assert target_name("a/x.MCAP", "info") == target_name("a/x.mcap", "info") == "a/x.json"
+    assert page_name("x.MCAP") == page_name("x.mcap") == "x.html"

@@ -217,6 +217,14 @@ def test_a_saturated_gyro_in_rad_s_is_no_gyro_in_degrees(tmp_path):
     assert sum(finding.count for finding in findings) == at_limit
 
 
+def test_a_clock_that_is_set_is_no_jitter(tmp_path):
+    imu = resting()
+    set_later = imu.t_ns - 50 * 365 * 86_400 * 10**9 * (np.arange(len(imu)) < len(imu) // 2)
+    found = logged(tmp_path, Imu(set_later, imu.gyro, imu.accel))
+    assert found["topics"][0]["jitter_s"] == found["imu"][0]["jitter_s"] == 0.0
+    assert any("the clock jumps by +1.5768e+09 s (50.0 years)" in warning for warning in found["warnings"])
+
+
 @pytest.mark.parametrize("hostile", ["zero", "huge", "nan", "a clock that jumps by fifty years", "constant"])
 def test_hostile_values_cost_no_more_than_others_and_give_no_nan(tmp_path, monkeypatch, hostile):
     imu = resting(2000)

@@ -70,10 +70,16 @@ def whole_of(parts: tuple[str, str]) -> str:
 
 
 def pairs_by_name(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Gyro and accelerometer topics whose names differ by the sensor alone, by their IMU."""
-    gyro, accel = ({re.sub(rf"(?i)(?<=/){word}(?=(_\w+)?(/|$))", "{}", t): t for t in topics} for word in SENSOR_WORDS)
-    both = [(gyro[pattern], accel[pattern]) for pattern in gyro if "{}" in pattern and pattern in accel]
-    return {whole: parts for parts in both if (whole := whole_of(parts)) not in topics}
+    """Gyro and accelerometer topics whose names differ by the sensor alone, by their IMU.
+
+    Several in one folder are told apart by what else is in their names: `/d/imu_0`, `/d/imu_1`.
+    """
+    gyro, accel = ({re.sub(rf"(?i)(?<=[/_]){word}(?=(_\w+)?(/|$))", "{}", t): t for t in topics} for word in SENSOR_WORDS)
+    both = {pattern: (gyro[pattern], accel[pattern]) for pattern in gyro if "{}" in pattern and pattern in accel}
+    wholes = {pattern: whole_of(parts) for pattern, parts in both.items()}
+    if len({*wholes.values()}) < len(wholes):
+        wholes = {pattern: pattern.replace("{}", "imu", 1) for pattern in both}
+    return {whole: both[pattern] for pattern, whole in wholes.items() if whole not in topics}
 
 
 def choice_of(topics: Iterable[str]) -> str:
@@ -87,4 +93,6 @@ def no_imu_fix(topics: Iterable[tuple[str, str]]) -> str:
     types, encodings = zip(*topics, strict=True) if (topics := list(topics)) else ((), ())
     if types.count(VECTOR3) > 1:
         return "`imu` gyro=TOPIC,accel=TOPIC joins the vectors of a gyroscope (rad/s) and of an accelerometer (m/s²)"
+    if {"px4_msgs/msg/SensorGyro", "px4_msgs/msg/VehicleImu"} & {*types}:
+        return "imutool convert makes an IMU of PX4's topics"
     return "An IMU in protobuf is read with: pip install 'imutool[protobuf]'" if "protobuf" in encodings else ""

@@ -22,7 +22,7 @@ from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import DERIVED_KEY, UNSET_FIX
 from imutool.recording import Imu, Recording
-from imutool.recording.columns import clock_jumps, jump_warnings
+from imutool.recording.columns import clock_jumps, jump_warnings, longest_run
 from imutool.viewing.model.run_data import LogTimes, Run
 
 MIN_SAMPLES = 2  # samples that make a log
@@ -61,8 +61,9 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
     """Read a log for viewing.
 
     An IMU that no `Imu` can hold (stamps that repeat or go back, values that are not finite) is cleaned as `debias --clean`
-    does, also where that would not trust it. Of a damaged log the verified records are read. True poses that no `Poses` can
-    hold are left out unless `truth` names them. The notes list each of these.
+    does, also where that would not trust it. Of one whose clock is set the longest stretch is shown. Of a damaged log the
+    verified records are read. True poses that no `Poses` can hold are left out unless `truth` names them. The notes list each
+    of these.
 
     Raises:
         ConfigError: the file cannot be opened.
@@ -94,7 +95,13 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
             notes.append(f"{name} is left out: its samples are not those of {topic}.")
         else:
             debiased.append(replace(run, start=start))
-    return LogContents(replace(rest, imu=samples), logged, tuple(debiased), survey, metadata, tuple(notes), opened)
+    rows = longest_run(samples.t_ns)
+    shown = samples.rows(rows)
+    if len(shown) < len(samples):
+        shares = f"{len(shown)} of {len(samples)} samples, from {shown.t_ns[0]} to {shown.t_ns[-1]} ns"
+        notes.append(f"Only the longest stretch of {topic} on one setting of its clock is shown: {shares}.")
+        debiased = [run.between(int(shown.t_ns[0]), int(shown.t_ns[-1])) for run in debiased]
+    return LogContents(replace(rest, imu=shown), logged, tuple(debiased), survey, metadata, tuple(notes), opened)
 
 
 def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> _Read:

@@ -64,6 +64,15 @@ class Run:
         """Whether the path is smoothed with aids; the samples are those of another run."""
         return self.path_from is not dead_reckon
 
+    def between(self, first_ns: int, last_ns: int) -> Run:
+        """Run of the samples from one stamp to another."""
+        first, last = np.searchsorted(self.imu.t_ns, [first_ns, last_ns + 1])
+        rows = slice(int(first), int(last))
+        std = None if self.bias_std is None else self.bias_std[rows]
+        return replace(
+            self, imu=self.imu.rows(rows), gyro_bias=self.gyro_bias[rows], accel_bias=self.accel_bias[rows], bias_std=std
+        )
+
     def aided(self, aids: Aids, prior: BiasPrior) -> Run:
         """The same samples, with a smoothed path by the aids of the log; `prior` is that of the bias that is left."""
         return replace(self, name=f"{self.name} aided", path_from=partial(_aided_path, prior=prior, aids=aids))

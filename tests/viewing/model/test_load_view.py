@@ -52,6 +52,23 @@ def debiased(log: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("is_debiased", [False, True])
+def test_of_a_clock_that_is_set_the_longest_stretch_is_shown(made: Recording, tmp_path: Path, is_debiased: bool) -> None:
+    first = len(made.imu) // 3
+    set_later = made.imu.t_ns - 50 * 365 * 86_400 * 10**9 * (np.arange(len(made.imu)) < first)
+    path = tmp_path / "log.mcap"
+    write(replace(made, imu=Imu(set_later, made.imu.gyro, made.imu.accel)), path)
+    if is_debiased:
+        debias(path, tmp_path / "debiased.mcap", model="static")
+        path = tmp_path / "debiased.mcap"
+    data = load(path)
+    assert len(data.traces) == 1 + is_debiased
+    for trace in data.traces:
+        assert np.array_equal(trace.run.imu.t_ns, made.imu.t_ns[first:])
+        assert trace.figures is not None
+    assert any("Only the longest stretch of /imu0 on one setting of its clock is shown" in note for note in data.notes)
+
+
 def test_a_log_is_shown_with_where_it_comes_from(made: Recording, log: Path) -> None:
     data = load(log)
     assert data.source == log

@@ -1,0 +1,81 @@
+"""Unit of a table's gyro by motion, and gravity in its accelerations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+import numpy as np
+
+from imutool.array_types import Float64, Int64
+from imutool.errors import DataError
+from imutool.recording.joined_imu import joined, steady_force, unit_by_gravity
+
+from ._table_map import Proposal
+from ._table_names import spaced_name
+from ._table_text import Columns
+from ._table_units import ACCEL_SI, GYRO_SI, STANDARD_GRAVITY, TIME_NS, gravity_units, is_motion_alone
+
+LEAST_GRAVITY = 0.5  # m/s^2; a median below it is that of motion alone
+STEADY_BAND = 0.3  # share by which the steady part of the acceleration may differ from gravity
+NO_GRAVITY = r"(user|free)_?acc"  # in names of accelerations without gravity
+
+
+def doubt_gravity(proposal: Proposal, columns: Columns) -> None:
+    """Ask about an acceleration that by its name, size or directions lacks gravity."""
+    if "accel" not in proposal.entries or not (unit := str(proposal.entries.get("accel_unit", ""))):
+        return
+    chosen = [*proposal.entries["accel"]]
+    name, (level, _) = spaced_name(chosen[0]), gravity_units(columns, chosen)
+    said = f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}"
+    if re.search(NO_GRAVITY, name):
+        proposal.reasons.append(f"{said}, and by its name gravity was taken out")
+    elif level * ACCEL_SI[unit] < LEAST_GRAVITY:
+        proposal.reasons.append(f"{said}, much less than gravity: it was taken out, or the unit is another")
+    elif is_motion_alone(columns, chosen) and not re.search(r"(^|_)raw(_|$)", name) and not _keeps_gravity(proposal, columns):
+        why = "it often is much smaller, and all cancel out"
+        proposal.reasons.append(f"{said}, {why}: gravity was taken out, or the body turned upside down and back")
+    else:
+        return
+    proposal.open.append("accel")
+
+
+def _keeps_gravity(proposal: Proposal, columns: Columns) -> bool:
+    """Whether the accelerations have a steady part of gravity's size, after the gyro's turns are taken out."""
+    needed = {"time", "time_unit", "gyro", "gyro_unit", "accel", "accel_unit"}
+    if not needed <= proposal.entries.keys() or needed & {*proposal.open}:
+        return False
+    rows = _rows(proposal, columns)
+    if rows is None:
+        return False
+    t_ns, gyro, accel = rows
+    sizes = GYRO_SI[str(proposal.entries["gyro_unit"])], ACCEL_SI[str(proposal.entries["accel_unit"])]
+    steady = steady_force(t_ns, gyro * sizes[0], accel * sizes[1])
+    return steady is not None and abs(steady / STANDARD_GRAVITY - 1.0) < STEADY_BAND
+
+
+def unit_by_motion(proposal: Proposal, columns: Columns) -> tuple[str, str] | None:
+    """Unit with which gravity turns as the gyro says, and the reason."""
+    rows = _rows(proposal, columns)
+    found = unit_by_gravity(*rows, GYRO_SI) if rows is not None else None
+    return found and (found[0], f"gravity turns in the accelerometer as a gyro in {found[0]} says (t = {found[1]:.1f})")
+
+
+def _rows(
+    proposal: Proposal, columns: Columns
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]] | None:
+    """Times since the first sample, rates and accelerations as recorded, in order; None where they are not side by side."""
+    t, gyro, accel = (side_by_side(columns, np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
+    if len(gyro) != len(accel):
+        return None
+    t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
+    try:
+        imu, _ = joined(t_ns, gyro, t_ns, accel, "")  # rows may hold one of the two
+    except DataError:
+        return None
+    return (imu.t_ns, imu.gyro, imu.accel) if len(imu) else None
+
+
+def side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
+    """Columns as one array."""
+    return np.stack([columns.values[name].astype(float) for name in names], axis=1)
