@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 
 STARTS = ("auto", "smooth", "truth")
 LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by which a candidate is better than a simpler one
+CHANCE = 0.3  # of a logarithm of an error, by which candidates without a true effect may differ in one log
 LEAST_ERROR = 1e-6  # ° or m/s
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
@@ -184,12 +185,17 @@ def _log_errors(
 
 
 def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
-    """Whether errors are smaller by `LEAST_GAIN` and by `surely` standard errors over the logs."""
+    """Whether errors are smaller by `LEAST_GAIN` and by `surely` standard errors over the logs.
+
+    A gain that only some motions show scatters, too. So what counts is the scatter, or if less what chance would give: chance
+    gains as often as it loses, so the losses show its variance.
+    """
     gain = (errors - others)[np.isfinite(errors - others)]
     if not len(gain):
         return False
-    scatter = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
-    return bool(gain.mean() > max(LEAST_GAIN, surely * scatter))
+    scatter = gain.std(ddof=1) * np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    chance = np.sqrt(2.0 * np.square(np.minimum(gain, 0.0)).sum() + CHANCE**2)
+    return bool(gain.mean() > max(LEAST_GAIN, surely * min(scatter, chance) / len(gain)))
 
 
 def _error(score: Score, sensor: Sensor) -> float | None:

@@ -97,6 +97,14 @@ def test_a_gain_counts_beyond_its_scatter_from_log_to_log() -> None:
     )
 
 
+def test_what_only_fast_motion_shows_is_believed_where_nothing_else_is_lost() -> None:
+    shown_by_two = np.array([0.06, -0.01, 0.02, -0.05, 1.18, 1.10])
+    with_losses = np.array([0.30, 0.82, -0.39, 0.06, 0.08, -0.23])
+    assert beaten(shown_by_two, np.zeros(6), surely=2.0)
+    assert not beaten(with_losses, np.zeros(6), surely=2.0), "what it gains it may lose on the next log"
+    assert not beaten(np.full(3, 0.2), np.array([0.0, 0.0, 0.3]), surely=2.0), "three logs, and no large gain"
+
+
 def contradictions(recordings: list[Recording]) -> list[Contradiction]:
     pool = Pool.of(recordings)
     return list(contradicting(pool, {"gyro": calibrate(pool, "gyro", pool.gyro, LINEAR["gyro"])}))
