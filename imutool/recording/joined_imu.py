@@ -230,6 +230,8 @@ def joined(
     notes = rates.notes + forces.notes
     t_ns, first, second = np.intersect1d(rates.t_ns, forces.t_ns, assume_unique=True, return_indices=True)
     if len(t_ns) > LEAST_COMMON * max(len(rates.t_ns), len(forces.t_ns)):  # one clock: a sample that one of them lacks is none
+        alone = len(rates.t_ns) + len(forces.t_ns) - 2 * len(t_ns)
+        notes += [f"{name}: {alone} samples that gyro or accel alone has are left out"] if alone else []
         return Imu(t_ns, rates.values[first], forces.values[second]), notes
     if len(rates.t_ns) < 2 or len(forces.t_ns) < 2 or rates.t_ns[0] >= forces.t_ns[-1] or rates.t_ns[-1] <= forces.t_ns[0]:
         raise DataError("gyro and accelerometer share no time", where=name, expected="two sensors that run together")
