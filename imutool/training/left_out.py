@@ -187,15 +187,18 @@ def _log_errors(
 def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
     """Whether errors are smaller by `LEAST_GAIN` and by `surely` standard errors over the logs.
 
-    A gain that only some motions show scatters, too. So what counts is the scatter, or if less what chance would give: chance
-    gains as often as it loses, so the losses show its variance.
+    A gain that only some motions show scatters, too. So without the log that gains most, chance counts: it gains as often as it
+    loses, so the losses show its variance.
     """
-    gain = (errors - others)[np.isfinite(errors - others)]
+    gain = np.sort((errors - others)[np.isfinite(errors - others)])
     if not len(gain):
         return False
-    scatter = gain.std(ddof=1) * np.sqrt(len(gain)) if len(gain) > 1 else 0.0
-    chance = np.sqrt(2.0 * np.square(np.minimum(gain, 0.0)).sum() + CHANCE**2)
-    return bool(gain.mean() > max(LEAST_GAIN, surely * min(scatter, chance) / len(gain)))
+    scatter = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    if gain.mean() > max(LEAST_GAIN, surely * scatter):
+        return True
+    rest = gain[:-1]
+    chance = np.sqrt(2.0 * np.square(np.minimum(rest, 0.0)).sum() + CHANCE**2)
+    return len(rest) > 0 and bool(rest.mean() > max(LEAST_GAIN, surely * chance / len(rest)))
 
 
 def _error(score: Score, sensor: Sensor) -> float | None:
