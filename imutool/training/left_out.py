@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 
 STARTS = ("auto", "smooth", "truth")
 LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by which a candidate is better than a simpler one
-CHANCE = 0.3  # of a logarithm of an error, by which candidates without a true effect may differ in one log
+CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
 LEAST_ERROR = 1e-6  # ° or m/s
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
@@ -187,8 +187,8 @@ def _log_errors(
 def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " logs"], surely: float = 1.0) -> bool:
     """Whether errors are smaller by `LEAST_GAIN` and by `surely` standard errors over the logs.
 
-    A gain that only some motions show scatters, too. So without the log that gains most, chance counts: it gains as often as it
-    loses, so the losses show its variance.
+    A true gain scatters from log to log, too, if only some motions show it. So a gain also counts that is beyond chance without
+    the log that gains most. Chance loses as often as it gains, so the losses show its variance.
     """
     gain = np.sort((errors - others)[np.isfinite(errors - others)])
     if not len(gain):
