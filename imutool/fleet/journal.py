@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Annotated
 from zlib import crc32
 
 import msgspec
@@ -41,7 +41,7 @@ class Run(msgspec.Struct, frozen=True, tag_field="line", tag="run"):
     """Line of a run: its settings, the version of the tool, and whether all logs start anew."""
 
     settings: Settings
-    digest: str
+    digest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
     anew: bool = False
     version: str = __version__
     process: str = ""  # that writes from here on

@@ -143,6 +143,15 @@ def test_a_line_that_has_lost_its_crc_does_not_count(tmp_path: Path) -> None:
         assert (read.done("a"), read.done("b")) == (None, result("b", messages=7))
 
 
+def test_a_run_that_has_lost_its_crc_and_the_end_of_its_digest_does_not_count(tmp_path: Path) -> None:
+    fill(tmp_path, "a", "b")
+    journal, whole = tmp_path / NAME, (tmp_path / NAME).read_bytes()
+    begun, end = whole.index(b'"digest":"') + 30, whole.index(b'"}\n', whole.index(b'"key":"a"'))
+    journal.write_bytes(whole[:begun] + "\u0080".encode() * 20 + whole[end:])
+    with Journal(tmp_path, SETTINGS, resume=True) as read:
+        assert read.done("b") == result("b", messages=7)
+
+
 def test_lines_of_an_earlier_version_count(tmp_path: Path) -> None:
     fill(tmp_path, "a")
     (tmp_path / NAME).write_bytes(re.sub(rb',"crc":"[0-9a-f]{8}"', b"", (tmp_path / NAME).read_bytes()))
