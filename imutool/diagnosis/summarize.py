@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -14,11 +14,11 @@ from imutool.array_types import Float64
 from imutool.diagnosis.compare_findings import contradictions, is_of_digits, remarks, shared
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.aligned_log import AlignedLog, Pair
-from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
-from imutool.diagnosis.estimation.gauss_newton import Fit, fit, without_effects
+from imutool.diagnosis.estimation.gauss_newton import Fit, without_effects
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.timestamps import late_stamps
+from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection, without
 from imutool.diagnosis.estimation.whitening import WhitenedImu, WhitenedLog, level
 from imutool.diagnosis.held_out import (
     gains,
@@ -98,7 +98,10 @@ def summarize(
         bias=_biases(selection.whole),
         not_identifiable=_not_identifiable(selection, idle, hidden),
         unexplained=unexplained,
-        remarks=(*contradictions(logs, selection), *dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *both_have),
+        remarks=(
+            *(*selection.remarks, *contradictions(logs, selection)),
+            *(*dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *both_have),
+        ),
         closer=gains(logs, before, after),
         traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
         start_ns=pairs[0].log_start_ns + round(1e9 * pairs[0].aligned_s),
@@ -173,17 +176,6 @@ def _worthwhile(
         selection = without(selection, {name})
         named = [finding_of(logs, selection, selected, noise) for selected in selection.selected]
     return selection, named, idle
-
-
-def without(found: Selection, keys: Collection[str]) -> Selection:
-    """Selection without some effects, by key; the others are fitted again."""
-    fitted, whole = (
-        fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key not in keys), part=before.part, near=before)
-        for before in (found.fitted, found.whole)
-    )
-    theta = {effect.key: value for effect, value in whole.chosen}
-    kept = (replace(one, theta=theta[one.effect.key]) for one in found.selected if one.effect.key not in keys)
-    return replace(found, selected=tuple(kept), fitted=fitted, whole=whole)
 
 
 def _not_identifiable(selection: Selection, idle: Sequence[str], hidden: Sequence[str]) -> tuple[str, ...]:

@@ -35,6 +35,13 @@ class WienerSettings(Settings, frozen=True):
     short_time_parts: Annotated[int, Meta(ge=1)] = 7  # frequencies, and times a quarter of that apart, whose mean is one
 
 
+class Shared(NamedTuple):
+    """Frequencies that signals share with recorded ones, and the share of their power that the recorded ones do not explain."""
+
+    shared: Bool[np.ndarray, "f k"]
+    own: Float64[np.ndarray, "f k"]
+
+
 class NoiseLeft(NamedTuple):
     """One-sided density of the noise that a filter leaves, by frequency: a motion hides it."""
 
@@ -74,9 +81,12 @@ def denoised(
     y = x - line
     mirrored = np.concatenate([-y[size:0:-1], y, -y[-2 : -size - 2 : -1]])
     parts = np.moveaxis(stft.stft(mirrored, axis=0), 1, 2)  # frequency, time, signal
-    shared = None if recorded is None else _shared(x, recorded, stft, settings)
+    with_recorded = None if recorded is None else _shared(x, recorded, stft, settings)
+    shared = None if with_recorded is None else with_recorded.shared
     if of_poses and shared is None:
         return x, NoiseLeft(stft.f, np.zeros((len(stft.f), x.shape[1])))
+    density = 2.0 / (rate_hz * float((stft.win**2).sum()))  # one-sided, of a square of the parts
+    all_of_it = density * (np.abs(parts) ** 2).mean(axis=1)
     std, untold = _noise_std(parts, shared, settings, white=not of_poses)
     std = std[:, None]
     parts /= std
@@ -93,8 +103,11 @@ def denoised(
     if of_poses and shared is not None:
         gain *= ~_apart(shared, settings)[:, None]
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
-    left = 2.0 * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0] / (rate_hz * float((stft.win**2).sum()))
+    left = density * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0]
     left = np.where(untold, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
+    if with_recorded is not None:  # noise is not shared: a vibration looks like white noise, and a recording shares it
+        most = uniform_filter1d(all_of_it, settings.short_time_parts, axis=0, mode="nearest")
+        left = np.minimum(left, with_recorded.own * most)
     return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
 
 
@@ -144,8 +157,8 @@ def _apart(shared: Bool[np.ndarray, "f ..."], settings: WienerSettings) -> Bool[
 
 def _shared(
     x: Float64[np.ndarray, "n k"], recorded: Float64[np.ndarray, "n r"], stft: ShortTimeFFT, settings: WienerSettings
-) -> Bool[np.ndarray, "f k"] | None:
-    """Frequencies at which signals share more than chance with recorded ones (multiple coherence); None in too short a time."""
+) -> Shared | None:
+    """Multiple coherence with recorded signals: where it is more than chance, and what it leaves; None in too short a time."""
     rows, around = np.flatnonzero(np.isfinite(recorded).all(axis=1)), settings.short_time_parts
     if not len(rows) or rows[-1] + 1 - rows[0] < stft.m_num:
         return None
@@ -162,4 +175,5 @@ def _shared(
     power /= size[:, :, None] * size[:, None, :]
     of_recorded, cross = power[:, :r, :r] + 1e-9 * np.eye(r), power[:, :r, r:]
     coherence = np.einsum("frk,frk->fk", cross.conj(), np.linalg.solve(of_recorded, cross)).real
-    return np.asarray(coherence > beta.isf(CHANCE, r, independent - r))
+    own = np.clip((1.0 - coherence) * independent / (independent - r), 0.0, 1.0)  # r signals explain r parts of noise, too
+    return Shared(np.asarray(coherence > beta.isf(CHANCE, r, independent - r)), own)

@@ -74,6 +74,13 @@ def test_white_noise_gets_no_colour_from_what_it_shares_by_chance(seed: int) -> 
     assert np.array_equal(denoised(x, 100.0, recorded=recorded)[0], wiener_filter(x, 100.0))
 
 
+def test_a_fast_vibration_that_a_recording_shares_is_no_noise_that_is_left() -> None:
+    x = motion(0) + np.random.default_rng(7).normal(size=(24_000, 3))
+    recorded = x + 0.01 * np.random.default_rng(8).normal(size=x.shape)
+    _, left = denoised(x, RATE_HZ, recorded=recorded)
+    assert left.density.max() < 0.01 * 2.0 / RATE_HZ
+
+
 def test_impacts_that_a_recording_shares_are_no_noise() -> None:
     """A sample of 40 in every second: the top of the spectrum is full of them, and they are motion."""
     x, rng = motion(0), np.random.default_rng(5)

@@ -1,11 +1,11 @@
-"""Candidate effects: their score by the gain of one linear step, and the selected ones."""
+"""Candidate effects: their score by the gain of one linear step."""
 
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -26,35 +26,6 @@ UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wr
 UNLIKELY = -3.0  # log p-value above which they need not be right
 CLOCK = "clock_skew", "clock_jump"
 KEPT = 2  # sets of derivatives: with an effect, and without it
-
-
-@dataclass(frozen=True, eq=False)
-class SelectedEffect:
-    """Selected effect with its parameters and the cost of leaving it out.
-
-    `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
-    that no motion showed.
-    """
-
-    effect: Effect
-    theta: Theta
-    std: Theta
-    unidentified: tuple[str, ...]
-    p_value: float
-    false_discovery_rate: float
-    gain: float
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Selected effects, strongest first, with fits, trials, and what finds those like each."""
-
-    selected: tuple[SelectedEffect, ...]
-    fitted: Fit
-    whole: Fit
-    tried: int
-    always: int = 0
-    similar: Callable[[], Mapping[str, tuple[str, ...]]] = dict
 
 
 class _Axis(NamedTuple):

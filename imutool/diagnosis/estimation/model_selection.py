@@ -13,40 +13,30 @@ from itertools import chain
 
 import numpy as np
 
-from imutool.diagnosis.estimation.candidate_score import Candidates, SelectedEffect, Selection, portable, restored
+from imutool.diagnosis.estimation.candidate_score import Candidates, portable, restored
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
-from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
-from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise
+from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.noise_estimate import axis_squares
 from imutool.diagnosis.estimation.observability import (
-    FOLLOWING,
     WANDER,
-    below_model_error,
     beyond_the_band,
-    unidentified,
     values_of,
     with_common_arm,
     with_plainer_effects,
     with_steady_clock,
     without_implausible,
-    without_unseen_low_pass,
 )
 from imutool.diagnosis.estimation.significance import (
-    Scatter,
     bic,
-    estimate_onsets,
     gain_for,
-    gain_of,
-    leaves_as_little,
-    scatter,
     unnamed_count,
-    with_onsets_of,
-    with_onsets_of_all_rows,
 )
-from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
-from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
-from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, smoothing, takes_noise, with_finer_curve
+from imutool.diagnosis.estimation.trial.lag_start import beside_offset, without_unseen_low_pass
+from imutool.diagnosis.estimation.trial.model_error import LowPassError
+from imutool.diagnosis.estimation.trial.selection import Selection
+from imutool.diagnosis.estimation.trial.verdicts import Trial
+from imutool.diagnosis.estimation.unnamed_effects import smoothing, with_finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
-from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
 from imutool.sensor.effect import Effect, Theta
 
@@ -67,15 +57,14 @@ def select_effects(
     """
     unnamed, settings = tuple(effect for group in later for effect in group), logs[0].pair.settings.search
     start, known, report = fit(logs, always), Candidates(logs, (*candidates, *unnamed)), progress or (lambda text: None)
-    first = _Search(logs, tuple(candidates), unnamed, always, start.objective, settings, report, known)
+    first = _Search(logs, tuple(candidates), unnamed, always, settings, report, known, before=start.objective)
     best_named, best_unnamed = (max((s.aic_gain for s in known.ranked(start, c)), default=0.0) for c in (candidates, unnamed))
     orders = ((), later), (unnamed, ())  # effects without a name after the others, or beside them
     order, other_order = reversed(orders) if best_unnamed > best_named + settings.clearly_better else orders
     begun = first.pruned(fit(logs, (*always, *begin))) if begin else start
     second = replace(first, candidates=known.copy(), progress=lambda text: None)
     other = Forked(lambda: portable(*_grown(second, begun, *other_order))) if unnamed else None
-    answers = [_grown(first, begun, *order)]
-    now = answers[0][1]
+    now = (answers := [_grown(first, begun, *order)])[0][1]
     doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
     if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
@@ -116,39 +105,23 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
 
 
 @dataclass(eq=False)
-class _Search:
-    logs: Sequence[WhitenedLog]
-    named: tuple[Effect, ...]
-    unnamed: tuple[Effect, ...]
-    always: Chosen
+class _Search(Trial):
     before: float  # squares of white residuals with nothing but a constant bias
-    settings: SearchSettings
-    progress: Callable[[str], None]
-    candidates: Candidates
     trials: dict[str, Fit] = field(default_factory=dict)  # with one more candidate than `trials_of`
     trials_of: Fit | None = None
-    onset_std: dict[tuple[str, int], float] = field(default_factory=dict)
-
-    @property
-    def tried(self) -> int:
-        """Number of hypotheses of the Bonferroni correction; one where the motion shows no candidate."""
-        return max(1, self.candidates.count((*self.named, *self.unnamed)))
-
-    @property
-    def threshold(self) -> float:
-        """Log p-value that a finding needs after the correction."""
-        return float(np.log(self.settings.false_discovery_rate / self.tried))
 
     def removable(self, now: Fit) -> range:
         """Indices of effects but for those of every fit and the last, which has just come in."""
         return range(len(self.always), len(now.chosen) - 1)
 
-    def added(self, now: Fit) -> Fit | None:
-        """The best fit with one more effect; none if chance explains its gain."""
-        share, count, settings = self.settings.rival_share, self.settings.fitted_each_round, self.settings
+    def added(self, now: Fit, but_for: frozenset[str] = frozenset()) -> Fit | None:
+        """The best fit with one more effect; none if chance explains its gain, or the error of a low-pass may do so."""
+        settings, share, count = self.settings, self.settings.rival_share, self.settings.fitted_each_round
         self.trials_of, self.trials = now, self.trials if self.trials_of is now else {}
         allowed = self.named + (self.unnamed if unnamed_count(now) < settings.most_unnamed else ())
+        allowed, error = tuple(effect for effect in allowed if effect.key not in but_for), LowPassError.of(now)
         best: tuple[float, Fit] | None = None
+        unsure = set[str]()
         for promised, effect, start, gain in self.candidates.ranked(now, allowed, count)[:count]:
             if best is not None and promised > best[0] * (1.0 if effect.linear else share):
                 continue  # the score of a linear effect is its gain
@@ -160,8 +133,18 @@ class _Search:
             added_effect, theta = (trial := self.trials[effect.key]).chosen[-1]
             if not added_effect.parameters or beyond_the_band(added_effect, theta, self.logs, self.settings):
                 continue
-            log_p = self.candidates.log_p(added_effect, now.objective - trial.objective)
-            best = (log_p, trial) if best is None or log_p < best[0] else best
+            log_p = partial(self.candidates.log_p, added_effect)
+            own_log_p = log_p(now.objective - trial.objective)
+            if (
+                error is not None
+                and own_log_p < self.threshold
+                and error.may_be(added_effect, now, trial, log_p, self.threshold)
+            ):
+                unsure.add(effect.key)
+                continue
+            best = (own_log_p, trial) if best is None or own_log_p < best[0] else best
+        if best is None and unsure:
+            return self.added(now, but_for | unsure)
         if best is None or best[0] > self.threshold:
             return None
         if unnamed_count(best[1]) and now.objective - best[1].objective < settings.unnamed_share * (self.before - now.numbers):
@@ -170,7 +153,9 @@ class _Search:
 
     def tried_with(self, others: Chosen, effect: Effect, start: Theta, near: Fit, limit: float) -> Fit:
         """Fit with one more effect, without its implausibly large parameters."""
-        trial = fit(self.logs, (*others, (effect, start)), near=near, give_up_above=limit)
+        begun = beside_offset(self.logs, others, effect, [start, *self.candidates.starts[effect.key]])
+        trials = (fit(self.logs, chosen, near=near, give_up_above=limit) for chosen in begun)
+        trial = min(trials, key=lambda found: found.objective)
         reduced = without_implausible(effect, theta := trial.chosen[-1][1], self.settings.implausible_factor)
         start = values_of(effect, reduced, theta)
         return trial if reduced is effect else fit(self.logs, (*others, (reduced, start)), near=near, give_up_above=limit)
@@ -196,7 +181,7 @@ class _Search:
     def simplified(self, now: Fit) -> Fit:
         """Fit with the simpler of two effects that the logs hardly tell apart."""
         for effect in [effect for effect, _ in now.chosen if effect.kind != "catalogue"]:
-            rivals = self._rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
+            rivals = self.rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
         now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
@@ -219,82 +204,3 @@ class _Search:
             if self.candidates.log_p(now.chosen[k][0], objective - now.objective) > self.threshold:
                 return self.pruned(fits[k] if k in fits else without(k))
         return now
-
-    def tested(self, now: Fit) -> Selection:
-        """Selection of the effects that pass on all rows and on held-out blocks."""
-        while len(now.chosen) > (first := len(self.always)):
-            _ = (now := with_bias_walk(with_onsets_of_all_rows(now))).jacobians  # which both processes need
-            self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
-            unseen = Forked(partial(first_refuted, now, first))
-            whole = fit(now.logs, now.chosen, part="all", near=now)
-            if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
-                now = fit(now.logs, reduced)
-                unseen.end()
-                continue
-            whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
-            verdicts = self._verdicts(whole, first, unseen)
-            unseen.end()
-            rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
-            worst = max(range(len(rates)), key=lambda k: rates[k])
-            if rates[worst] <= self.settings.false_discovery_rate:
-                fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
-                selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
-                return Selection(selected, fitted, whole, self.tried, first, partial(self._similar, now))
-            now = fit(now.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
-        return Selection((), now, fit(now.logs, now.chosen, part="all"), self.tried, first)
-
-    def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
-        now = tested if all(log.whiten.walk is None for log in tested.logs) else fit(self.logs, tested.chosen)
-        return {now.keys[k]: tuple(self._rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
-
-    def _rivals(self, k: int, now: Fit) -> dict[str, Fit]:
-        """Fits with another effect on the same sensor in the place of one, that leave about as little (Akaike's criterion)."""
-        found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
-        without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
-        least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
-        for _, effect, start, promised in self.candidates.ranked(without, self.named, most)[:most]:
-            if effect.name != mine.name and effect.meets(mine) and promised > least:
-                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
-                if leaves_as_little(trial, effect.key, aic):
-                    found.setdefault(effect.name, trial)
-        return found
-
-    def _verdicts(self, whole: Fit, first: int, unseen: Forked[int]) -> list[SelectedEffect]:
-        """Verdicts on effects that pass on unseen time too, up to the first that goes, with no trust in model errors."""
-        exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
-        white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
-        scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
-        if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
-            return verdicts
-        passed = range(first, unseen.result())
-        for k, gain in zip(passed, of_each(partial(gain_of, whole), passed), strict=True):
-            verdict = self._verdict(k, gain, whole, scattered)
-            if verdict is None:
-                break
-            verdicts.append(verdict)
-        gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
-        left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
-
-        def hidden(iterations: int | None) -> frozenset[str]:
-            more = {key: gain_of(whole, k, iterations)[0] for key, k in left.items()} if FOLLOWING & gains.keys() else {}
-            denoised = any(log.pair.denoised for log in self.logs)
-            return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
-
-        below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
-        return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
-
-    def _verdict(self, k: int, gain: tuple[float, float], whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
-        """Verdict on one effect by all rows; none if chance explains it or it is no answer."""
-        effect, theta = whole.chosen[k]
-        stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
-        std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
-        no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
-        no_answer = no_answer or is_coloured_noise(effect, theta, whole)
-        if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
-            return None
-        log_p = self.candidates.log_p(effect, gain[1])
-        if scattered is not None:
-            log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
-        rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        vague = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
-        return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None

@@ -1,4 +1,4 @@
-"""Observability: parameters that the motion can show, fixed ones, and model error."""
+"""Observability: parameters that the motion can show, fixed ones, and effects that are no answer."""
 
 from __future__ import annotations
 
@@ -34,11 +34,8 @@ PLAINER = {  # of one that is no better: another effect, and its parameters, by 
     "gyro_hysteresis": ("gyro_delay", range(1)),
 }
 SITES_M_S2 = 0.04  # 9.764 to 9.834 m/s² on Earth
-CLOCKS = (*STEADY, WANDER)
-FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
 REPLACES = {WANDER: ("clock_offset", "clock_skew"), "reference_smoothing": LOW_PASSES, LOW_PASSES[1]: LOW_PASSES[:1]}
 """What would cancel together."""
-FOLLOWING = frozenset({*CLOCKS, *FILTERS})
 Starts = Mapping[str, Sequence[Theta]]
 
 
@@ -111,16 +108,6 @@ def without_implausible(effect: Effect, theta: Theta, factor: float) -> Effect:
     if not effect.linear or effect.kind != "catalogue":
         return effect
     return with_free(effect, [k for k, n in enumerate(effect.parameters) if abs(theta[k]) <= factor * n.plausible])
-
-
-def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], settings: SearchSettings) -> Fit:
-    """Fit with a clock offset for a low pass beyond the poses' band, which its delay shows."""
-    offset = next((e for e in named if e.name == "clock_offset" and e.key not in now.keys), None)
-    for k, (effect, theta) in enumerate(now.chosen):
-        if offset is not None and effect.name in LOW_PASSES and beyond_the_band(effect, theta, logs, settings):
-            delayed = offset, np.array([-low_pass.lag_s(theta)])  # far below its cut-off
-            return fit(logs, (*now.chosen[:k], *now.chosen[k + 1 :], delayed), near=now)
-    return now
 
 
 def with_steady_clock(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], starts: Starts) -> Fit:
@@ -216,31 +203,7 @@ def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -
         yield from (f"{name}.{n.name}" for n in effect.forward.effect.parameters if n.name not in free)
 
 
-# ── the error of models ──
-
-
-def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, denoised: bool, poses: bool) -> frozenset[str]:
-    """Effects below the model error of a far larger effect that follow the same motion.
-
-    A filter and a clock say how a sensor follows its motion, and so does the error of any other model: a mass on springs moves,
-    and its lever arm with it; a simulator that holds its forces for a step reads accelerations half a step early; noise that
-    was filtered out of a simulation took a little of its motion along. Such an error is a share of the large effect, however
-    certain against the noise. The clock of `poses` drifts and jumps against the sensor's in more ways than one, and a filter
-    takes what the clock leaves. `gains` are squares that leaving an effect out costs, by key; `denoised` says whether noise
-    was filtered out of a simulation.
-    """
-    allowed = settings.model_error_denoised if denoised else settings.model_error
-    simplified = {"mount_resonance": settings.model_error_resonance}  # models that are simpler than what they stand for
-    clocks = dict.fromkeys(CLOCKS, settings.model_error_clock) if poses else {}
-
-    def share(key: str, other: str) -> float:
-        return max(allowed, simplified.get(other, 0.0), clocks.get(other, 0.0) if key in FILTERS else 0.0)
-
-    return frozenset(
-        key
-        for key, gain in gains.items()
-        if key in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
-    )
+# ── effects that are no answer ──
 
 
 def without_second_orders(effects: Sequence[Effect]) -> list[Effect]:

@@ -15,15 +15,16 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.diagnosis.compare_findings import ALIKE_SHARE
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
-from imutool.diagnosis.estimation.observability import FOLLOWING, exclude_each_other
+from imutool.diagnosis.estimation.observability import exclude_each_other
 from imutool.diagnosis.estimation.significance import scatter
+from imutool.diagnosis.estimation.trial.model_error import FOLLOWING
+from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection, without
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import noise_floor
 from imutool.diagnosis.result import Finding
-from imutool.diagnosis.summarize import finding_of, without
+from imutool.diagnosis.summarize import finding_of
 from imutool.sensor.effect import Effect, Stage, Theta
 from imutool.sensor.effects import vibration
 

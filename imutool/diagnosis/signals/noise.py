@@ -12,11 +12,11 @@ from scipy.ndimage import median_filter
 from scipy.signal import welch
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.estimation.candidate_score import SelectedEffect, Selection
 from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import SplineBasis
 from imutool.diagnosis.estimation.noise_estimate import ridge_fit
 from imutool.diagnosis.estimation.timestamps import grid
+from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
 from imutool.diagnosis.estimation.whitening import Band, WhitenedLog, Whitener, autoregression
 from imutool.diagnosis.held_out import held_out_rms, with_effects
 from imutool.diagnosis.result import Finding

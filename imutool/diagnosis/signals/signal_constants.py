@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.significance import bic, scatter
+from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.held_out import held_out_rms
 from imutool.diagnosis.result import Estimate, Finding, HeldOut

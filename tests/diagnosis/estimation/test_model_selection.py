@@ -16,12 +16,14 @@ from support.seeds import seeds
 from imutool.diagnosis.estimation import model_selection
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
 from imutool.diagnosis.estimation.aligned_log import Pair
-from imutool.diagnosis.estimation.candidate_score import Candidates, Selection
+from imutool.diagnosis.estimation.candidate_score import Candidates
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
+from imutool.diagnosis.estimation.trial import verdicts
+from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
@@ -254,9 +256,11 @@ def test_the_first_effect_that_goes_in_any_case_is_the_one_that_all_verdicts_nam
     )
     now = fit(logs, planted.acting({"gyro_scale": [0.02, 0.0, 0.01], "accel_scale": [0.0] * 3, "clock_offset": [0.0]}))
     known, settings = Candidates(logs, candidates), logs[0].pair.settings.search
-    search = model_selection._Search(logs, candidates, (), (), fit(logs, ()).objective, settings, lambda word: None, known)
+    search = model_selection._Search(
+        logs, candidates, (), (), settings, lambda word: None, known, before=fit(logs, ()).objective
+    )
     short = search.tested(now)
-    monkeypatch.setattr(model_selection, "FOLLOWING", frozenset(now.keys))  # whatever it is, the others may matter to it
+    monkeypatch.setattr(verdicts, "FOLLOWING", frozenset(now.keys))  # whatever it is, the others may matter to it
     whole = search.tested(now)
     assert names(short) == names(whole) == ["gyro_scale"]
     np.testing.assert_array_equal(short.selected[0].theta, whole.selected[0].theta)
@@ -272,7 +276,7 @@ def test_the_first_effect_is_tried_alone_where_unseen_time_refutes_all_that_came
         tested.append(now.keys)
         return first if len(tested) < 3 else len(now.chosen)
 
-    monkeypatch.setattr(model_selection, "first_refuted", refuted)
+    monkeypatch.setattr(verdicts, "first_refuted", refuted)
     found = select_effects([log], planted.catalogue())
     both, last, alone = tested
     assert sorted(both) == sorted(truth)
@@ -296,10 +300,10 @@ def test_of_what_comes_after_a_refuted_effect_only_a_bound_is_asked_unless_it_co
         asked_of.append((k, iterations))
         return gain_of(whole, k, iterations)
 
-    monkeypatch.setattr(model_selection, "gain_of", recorded)
+    monkeypatch.setattr(verdicts, "gain_of", recorded)
     known = Candidates([log], candidates)
-    search = model_selection._Search([log], candidates, (), (), 0.0, settings, lambda word: None, known)
-    offset, *_ = search._verdicts(now, 0, Forked(lambda: 1))
+    search = model_selection._Search([log], candidates, (), (), settings, lambda word: None, known, before=0.0)
+    offset, *_ = search.verdicts(now, 0, Forked(lambda: 1))
     assert (offset.false_discovery_rate == 1.0) == (model_error == 0.5)
     assert asked_of == [(0, 1), (0, None), (1, 0), (2, 0), *([(1, None), (2, None)] if model_error == 0.5 else [])]
     assert all(gain_of(now, k)[0] <= gain_of(now, k, 0)[0] for k in range(3))
@@ -310,15 +314,15 @@ def test_unseen_time_is_not_waited_for_where_chance_explains_the_first_effect() 
     log = planted.weighed(planted.pair(planted.rich(4, DURATION_S), truth, 4))
     candidates, settings = planted.catalogue(), log.pair.settings.search
     known = Candidates([log], candidates)
-    search = model_selection._Search([log], candidates, (), (), 0.0, settings, lambda word: None, known)
+    search = model_selection._Search([log], candidates, (), (), settings, lambda word: None, known, before=0.0)
 
     def unseen() -> int:
         raise AssertionError("nobody needs it")
 
     chance = fit([log], planted.acting({"accel_scale": [0.0] * 3, **truth}), part="all")
-    assert search._verdicts(chance, 0, Forked(unseen)) == []
+    assert search.verdicts(chance, 0, Forked(unseen)) == []
     with pytest.raises(AssertionError, match="nobody needs it"):
-        search._verdicts(fit([log], planted.acting(truth), part="all"), 0, Forked(unseen))
+        search.verdicts(fit([log], planted.acting(truth), part="all"), 0, Forked(unseen))
 
 
 # ── one, two ──
@@ -572,5 +576,7 @@ def test_a_name_that_leaves_no_more_takes_the_place_of_a_term() -> None:
     log, named = planted.weighed(pair), planted.catalogue()
     term = next(effect for effect in unnamed.terms(unnamed.like([pair])) if effect.equation == "accel.y += c f_x")
     known, settings = Candidates([log], (*named, term)), pair.settings.search
-    search = model_selection._Search([log], named, (term,), (), fit([log], ()).objective, settings, lambda text: None, known)
+    search = model_selection._Search(
+        [log], named, (term,), (), settings, lambda text: None, known, before=fit([log], ()).objective
+    )
     assert list(search.simplified(fit([log], ((term, np.zeros(1)),))).keys) == ["accel_misalignment"]

@@ -12,8 +12,6 @@ from support import planted
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
-    FOLLOWING,
-    below_model_error,
     beyond_the_band,
     unobservable,
     with_plainer_effects,
@@ -74,46 +72,6 @@ def test_an_axis_of_which_nothing_is_known_shows_nothing() -> None:
     known = np.ones((len(felt.t_s), 6), bool)
     known[:, 1] = False
     assert shown(felt, ["gyro_scale", "accel_scale"], known=known) == {"gyro_scale.y"}
-
-
-def test_every_effect_with_a_model_error_floor_is_in_the_catalogue() -> None:
-    assert {one.name for one in catalogue.diagnosed(sorted(FOLLOWING))} == FOLLOWING
-
-
-@pytest.mark.parametrize(("denoised", "allowed"), [(False, SETTINGS.model_error), (True, SETTINGS.model_error_denoised)])
-def test_a_filter_or_a_clock_must_explain_more_than_a_larger_models_error(denoised: bool, allowed: float) -> None:
-    for name in FOLLOWING:
-        assert below_model_error({"lever_arm": 1e8, name: 0.9e8 * allowed}, SETTINGS, denoised=denoised, poses=False) == {name}
-        assert not below_model_error({"lever_arm": 1e8, name: 1.1e8 * allowed}, SETTINGS, denoised=denoised, poses=False)
-
-
-def test_a_mass_on_springs_does_more_than_its_model_says() -> None:
-    between = 0.5 * SETTINGS.model_error_resonance
-    assert below_model_error({"mount_resonance": 1.0, "clock_offset": between}, SETTINGS, denoised=False, poses=False) == {
-        "clock_offset"
-    }
-    assert not below_model_error({"lever_arm": 1.0, "clock_offset": between}, SETTINGS, denoised=False, poses=False)
-
-
-@pytest.mark.parametrize(
-    ("name", "poses", "hidden"), [("mount_resonance", True, True), ("clock_skew", True, False), ("low_pass", False, False)]
-)
-def test_a_filter_beside_a_clock_of_poses_is_what_the_clock_leaves(name: str, poses: bool, hidden: bool) -> None:
-    """The clock of poses drifts to and fro, and a filter fits what one jump of it leaves."""
-    assert below_model_error({"clock_jump": 71.0, name: 2.0}, SETTINGS, denoised=False, poses=poses) == (
-        {name} if hidden else set()
-    )
-
-
-def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
-    assert not below_model_error(
-        {"timestamp_jitter": 1e9, "temperature": 300.0, "gyro_scale": 30.0}, SETTINGS, denoised=True, poses=False
-    )
-
-
-def test_an_effect_alone_is_told() -> None:
-    assert not below_model_error({"clock_offset": 25.0}, SETTINGS, denoised=True, poses=False)
-    assert not below_model_error({}, SETTINGS, denoised=False, poses=False)
 
 
 @pytest.mark.parametrize(("shares", "beyond"), [([0.5, 0.4, -0.02], False), ([-0.022, -0.035, -0.01], True)])

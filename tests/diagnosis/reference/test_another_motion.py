@@ -8,8 +8,8 @@ import pytest
 from support import planted
 
 from imutool.diagnosis.compare_findings import shared
-from imutool.diagnosis.estimation.candidate_score import Selection
 from imutool.diagnosis.estimation.model_selection import select_effects
+from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.held_out import noise_floor
 from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.result import Finding

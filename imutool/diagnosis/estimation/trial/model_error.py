@@ -1,0 +1,116 @@
+"""Errors of models: how small an effect beside a far larger one may be its model's error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.estimation.gauss_newton import Fit
+from imutool.diagnosis.estimation.jacobians import expected
+from imutool.diagnosis.estimation.observability import LOW_PASSES, STEADY, WANDER
+from imutool.diagnosis.estimation.trial.selection import Selection
+from imutool.diagnosis.settings import SearchSettings
+from imutool.sensor.effect import Effect, Theta
+
+CLOCKS = (*STEADY, WANDER)
+FILTERS = (*LOW_PASSES, "mount_resonance", "gyro_delay", "gyro_hysteresis", "accel_hysteresis")
+FOLLOWING = frozenset({*CLOCKS, *FILTERS})
+OF_MOTION = FOLLOWING | {
+    *(f"{sensor}_{kind}" for sensor in ("gyro", "accel") for kind in ("scale", "misalignment", "scale_asymmetry", "quadratic")),
+    *("lever_arm", "size_effect", "mount_rotation", "gyro_g_sensitivity"),
+}
+
+SLOW = 0.25  # of a cut-off frequency: below, a low-pass takes 0.2 % (second order) to 3 % (first)
+SEEN_ERROR = 2.0  # times what other effects show of a low-pass's error (made-up flights whose vibrations fold: 1.4 to 3.6)
+
+
+def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, denoised: bool, poses: bool) -> frozenset[str]:
+    """Effects below the model error of a far larger effect that follow the same motion.
+
+    A filter and a clock say how a sensor follows its motion, and so does the error of any other model: a mass on springs moves,
+    and its lever arm with it; a simulator that holds its forces for a step reads accelerations half a step early; noise that
+    was filtered out of a simulation took a little of its motion along. Such an error is a share of the large effect, however
+    certain against the noise. The clock of `poses` drifts and jumps against the sensor's in more ways than one, and a filter
+    takes what the clock leaves. `gains` are squares that leaving an effect out costs, by key; `denoised` says whether noise
+    was filtered out of a simulation.
+    """
+    allowed = settings.model_error_denoised if denoised else settings.model_error
+    simplified = {"mount_resonance": settings.model_error_resonance}  # models that are simpler than what they stand for
+    clocks = dict.fromkeys(CLOCKS, settings.model_error_clock) if poses else {}
+
+    def share(key: str, other: str) -> float:
+        return max(allowed, simplified.get(other, 0.0), clocks.get(other, 0.0) if key in FILTERS else 0.0)
+
+    return frozenset(
+        key
+        for key, gain in gains.items()
+        if key in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
+    )
+
+
+def of_motion(effect: Effect) -> bool:
+    """Whether what an effect adds follows the motion, as the error of a low-pass does, but is none."""
+    return effect.name in OF_MOTION - {*LOW_PASSES} or (effect.kind == "unknown" and not effect.of_time)
+
+
+class LowPassError(NamedTuple):
+    """Error of the largest low-pass of a fit: white squares of what it takes from the motion and may err by, and its cut-off.
+
+    A simulation whose noise was filtered out may have vibrations that its samples fold, and a sensor filters before it samples.
+    What is left looks like a scale, an arm or a mount. The lag does not count: a clock's offset may take it.
+    """
+
+    size: float
+    squares: float
+    cutoff_hz: float
+
+    @staticmethod
+    def of(found: Fit) -> LowPassError | None:
+        """The error beside a simulation whose noise was filtered out; none without a low-pass."""
+        filters = [(effect, theta) for effect, theta in found.chosen if effect.name in LOW_PASSES]
+        if not filters or not any(isinstance(log.pair, Pair) and log.pair.denoised for log in found.logs):
+            return None
+        size, cutoff_hz = max((_taken(effect, theta, found), float(theta[0])) for effect, theta in filters)
+        return LowPassError(size, found.logs[0].pair.settings.search.model_error_denoised * size, cutoff_hz)
+
+    def may_be(self, effect: Effect, without: Fit, found: Fit, log_p: Callable[[float], float], most: float) -> bool:
+        """Whether an effect of a fit may be this error: small, and no more than chance where the low-pass takes nothing."""
+        if not of_motion(effect) or without.objective - found.objective >= self.squares:
+            return False
+        return log_p(_slow_squares(without, SLOW * self.cutoff_hz) - _slow_squares(found, SLOW * self.cutoff_hz)) > most
+
+
+def _taken(effect: Effect, theta: Theta, found: Fit) -> float:
+    """White squares of what a low-pass takes from the motion, without its lag."""
+    lagless = (effect.without_lag(theta), theta)
+    each = ((log, expected(log.pair, (lagless,)) - expected(log.pair, ())) for log in found.logs)
+    return float(sum((log.whiten(taken)[log.rows(found.part)] ** 2).sum() for log, taken in each))
+
+
+def _slow_squares(found: Fit, most_hz: float) -> float:
+    """Squares of white residuals up to a frequency."""
+    total = 0.0
+    for log, residual in zip(found.logs, found.residuals, strict=True):
+        rows = residual[log.rows(found.part)]
+        f_hz = np.fft.rfftfreq(len(rows), log.pair.period_s * log.whiten.every)
+        total += 2.0 * float((np.abs(np.fft.rfft(rows, axis=0)[(f_hz > 0.0) & (f_hz < most_hz)]) ** 2).sum()) / len(rows)
+    return total
+
+
+def with_low_pass_error(selection: Selection, error: LowPassError, left: Mapping[str, float]) -> Selection:
+    """Selection with the deviations of a low-pass that errs, and the effects that show it, by their gains."""
+    if not left:
+        return selection
+    share = SEEN_ERROR * float(np.sqrt(max(left.values()) / error.size))
+    return replace(
+        selection,
+        selected=tuple(
+            replace(one, std=np.hypot(one.std, share * one.theta)) if one.effect.name in LOW_PASSES else one
+            for one in selection.selected
+        ),
+        within_error=tuple(left),
+    )

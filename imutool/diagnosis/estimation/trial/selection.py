@@ -1,0 +1,63 @@
+"""Selected effects of the logs, with the fits that show them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.sensor.effect import Effect, Theta
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedEffect:
+    """Selected effect with its parameters and the cost of leaving it out.
+
+    `p_value` is by chi-square over all rows, `gain` the squares that leaving it out adds there, `unidentified` its parameters
+    that no motion showed.
+    """
+
+    effect: Effect
+    theta: Theta
+    std: Theta
+    unidentified: tuple[str, ...]
+    p_value: float
+    false_discovery_rate: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Selected effects, strongest first, with fits, trials, and what finds those like each.
+
+    `within_error` are names of effects that may be the error of a low-pass.
+    """
+
+    selected: tuple[SelectedEffect, ...]
+    fitted: Fit
+    whole: Fit
+    tried: int
+    always: int = 0
+    similar: Callable[[], Mapping[str, tuple[str, ...]]] = dict
+    within_error: tuple[str, ...] = ()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What is no finding because it may be the error of a low-pass."""
+        if not self.within_error:
+            return ()
+        share = self.whole.logs[0].pair.settings.search.model_error_denoised ** 0.5
+        names = ", ".join(name.replace("_", " ") for name in self.within_error)
+        why = f"a low-pass may err by {share:.0%} of what it does, because a simulation's samples fold its vibrations"
+        return (f"{names}: too small to tell beside the low-pass; {why}",)
+
+
+def without(found: Selection, keys: Collection[str]) -> Selection:
+    """Selection without some effects, by key; the others are fitted again."""
+    fitted, whole = (
+        fit(before.logs, tuple(entry for entry in before.chosen if entry[0].key not in keys), part=before.part, near=before)
+        for before in (found.fitted, found.whole)
+    )
+    theta = {effect.key: value for effect, value in whole.chosen}
+    kept = (replace(one, theta=theta[one.effect.key]) for one in found.selected if one.effect.key not in keys)
+    return replace(found, selected=tuple(kept), fitted=fitted, whole=whole)

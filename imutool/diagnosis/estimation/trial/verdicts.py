@@ -1,0 +1,164 @@
+"""Verdicts on the chosen effects: on all rows, on unseen time, and beside the errors of models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from imutool.diagnosis.estimation.candidate_score import Candidates
+from imutool.diagnosis.estimation.gauss_newton import Fit, fit
+from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
+from imutool.diagnosis.estimation.noise_estimate import is_coloured_noise
+from imutool.diagnosis.estimation.observability import beyond_the_band, unidentified
+from imutool.diagnosis.estimation.significance import (
+    Scatter,
+    estimate_onsets,
+    gain_of,
+    leaves_as_little,
+    scatter,
+    with_onsets_of,
+    with_onsets_of_all_rows,
+)
+from imutool.diagnosis.estimation.trial.model_error import (
+    FOLLOWING,
+    LowPassError,
+    below_model_error,
+    of_motion,
+    with_low_pass_error,
+)
+from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
+from imutool.diagnosis.estimation.trial.unseen_time import first_refuted
+from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
+from imutool.diagnosis.estimation.unnamed_effects import has_no_size, plausible_part, takes_noise
+from imutool.diagnosis.estimation.whitening import WhitenedLog
+from imutool.diagnosis.settings import SearchSettings
+from imutool.processes.forked import Forked, of_each
+from imutool.sensor.effect import Effect
+
+
+@dataclass(eq=False)
+class Trial:
+    """Trial of chosen effects among all candidates that a search knows; those of `always` are in every fit."""
+
+    logs: Sequence[WhitenedLog]
+    named: tuple[Effect, ...]
+    unnamed: tuple[Effect, ...]
+    always: Chosen
+    settings: SearchSettings
+    progress: Callable[[str], None]
+    candidates: Candidates
+    onset_std: dict[tuple[str, int], float] = field(default_factory=dict, init=False)
+
+    @property
+    def tried(self) -> int:
+        """Number of hypotheses of the Bonferroni correction; one where the motion shows no candidate."""
+        return max(1, self.candidates.count((*self.named, *self.unnamed)))
+
+    @property
+    def threshold(self) -> float:
+        """Log p-value that a finding needs after the correction."""
+        return float(np.log(self.settings.false_discovery_rate / self.tried))
+
+    def tested(self, now: Fit) -> Selection:
+        """Selection of the effects that pass on all rows and on held-out blocks."""
+        while len(now.chosen) > (first := len(self.always)):
+            _ = (now := with_bias_walk(with_onsets_of_all_rows(now))).jacobians  # which both processes need
+            self.progress(f"on unseen time: {', '.join(now.keys[first:])}")
+            unseen = Forked(partial(first_refuted, now, first))
+            whole = fit(now.logs, now.chosen, part="all", near=now)
+            if (reduced := plausible_part(whole.chosen, self.settings.implausible_factor)) is not None:
+                now = fit(now.logs, reduced)
+                unseen.end()
+                continue
+            whole, self.onset_std = estimate_onsets(now.logs, whole, "all", max(1.0, whole.reduced_chi_square))
+            verdicts = self.verdicts(whole, first, unseen)
+            unseen.end()
+            rates = [*(verdict.false_discovery_rate for verdict in verdicts), 1.0][: len(now.chosen) - first]
+            worst = max(range(len(rates)), key=lambda k: rates[k])
+            if rates[worst] <= self.settings.false_discovery_rate:
+                fitted = replace(now, chosen=with_onsets_of(now.chosen, whole.chosen))
+                selected = tuple(sorted(verdicts, key=lambda verdict: -verdict.gain))
+                best = Selection(selected, fitted, whole, self.tried, first, partial(self._similar, now))
+                return self._with_error(best, now)
+            now = fit(now.logs, (*now.chosen[: first + worst], *now.chosen[first + worst + 1 :]), near=now)
+        return Selection((), now, fit(now.logs, now.chosen, part="all"), self.tried, first)
+
+    def _similar(self, tested: Fit) -> dict[str, tuple[str, ...]]:
+        now = self._with_own_noise(tested)
+        return {now.keys[k]: tuple(self.rivals(k, now)) for k in range(len(self.always), len(now.chosen))}
+
+    def _with_own_noise(self, tested: Fit) -> Fit:
+        """The fit beside a constant bias."""
+        return tested if all(log.whiten.walk is None for log in tested.logs) else fit(self.logs, tested.chosen)
+
+    def _with_error(self, selection: Selection, tested: Fit) -> Selection:
+        """The selection with what may be the error of its low-pass: effects that explain more than chance."""
+        if (error := LowPassError.of(tested)) is None:
+            return selection
+        now, count = self._with_own_noise(tested), self.settings.fitted_each_round
+        clear = (one for one in self.candidates.ranked(now, self.named, count)[:count] if one.log_p < self.threshold)
+        return with_low_pass_error(selection, error, {one.effect.name: one.gain for one in clear if of_motion(one.effect)})
+
+    def rivals(self, k: int, now: Fit) -> dict[str, Fit]:
+        """Fits with another effect on the same sensor in the place of one, that leave about as little (Akaike's criterion)."""
+        found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
+        without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
+        least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
+        for _, effect, start, promised in self.candidates.ranked(without, self.named, most)[:most]:
+            if effect.name != mine.name and effect.meets(mine) and promised > least:
+                trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
+                if leaves_as_little(trial, effect.key, aic):
+                    found.setdefault(effect.name, trial)
+        return found
+
+    def verdicts(self, whole: Fit, first: int, unseen: Forked[int]) -> list[SelectedEffect]:
+        """Verdicts on effects that pass on unseen time too, up to the first that goes, with no trust in model errors."""
+        exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
+        white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
+        scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
+        if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
+            return verdicts
+        passed = range(first, unseen.result())
+        for k, gain in zip(passed, of_each(partial(gain_of, whole), passed), strict=True):
+            verdict = self._verdict(k, gain, whole, scattered)
+            if verdict is None:
+                break
+            verdicts.append(verdict)
+        gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
+        left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
+
+        def hidden(iterations: int | None) -> frozenset[str]:
+            more = {key: gain_of(whole, k, iterations)[0] for key, k in left.items()} if FOLLOWING & gains.keys() else {}
+            denoised = any(log.pair.denoised for log in self.logs)
+            return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
+
+        below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
+        below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
+        return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
+
+    def _may_be_error(self, effect: Effect, whole: Fit) -> bool:
+        """Whether an effect of a fit may be the error of its low-pass."""
+        if (error := LowPassError.of(whole)) is None or not of_motion(effect):
+            return False
+        others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
+        without, log_p = fit(whole.logs, others, part=whole.part, near=whole), partial(self.candidates.log_p, effect)
+        return error.may_be(effect, without, whole, log_p, self.threshold)
+
+    def _verdict(self, k: int, gain: tuple[float, float], whole: Fit, scattered: Scatter | None) -> SelectedEffect | None:
+        """Verdict on one effect by all rows; none if chance explains it or it is no answer."""
+        effect, theta = whole.chosen[k]
+        stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
+        std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
+        no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
+        no_answer = no_answer or is_coloured_noise(effect, theta, whole)
+        if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
+            return None
+        log_p = self.candidates.log_p(effect, gain[1])
+        if scattered is not None:
+            log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
+        rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
+        vague = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
+        return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None

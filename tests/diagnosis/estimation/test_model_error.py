@@ -1,0 +1,127 @@
+"""What may be the error of a model is no finding: a clock beside a far larger effect, a scale or an arm beside a low-pass."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfilt, sosfilt_zi
+from support import planted
+
+from imutool.diagnosis.diagnose import candidates_for
+from imutool.diagnosis.estimation.model_selection import select_effects
+from imutool.diagnosis.estimation.noise_estimate import whitened
+from imutool.diagnosis.estimation.observability import without_second_orders
+from imutool.diagnosis.estimation.time_alignment import with_simulation
+from imutool.diagnosis.estimation.trial.model_error import FOLLOWING, OF_MOTION, below_model_error
+from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
+from imutool.diagnosis.reference.coverage import without_unseen_offset
+from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
+from imutool.sensor import catalogue
+
+SETTINGS = SearchSettings()
+FAST_HZ, RATE_HZ, DURATION_S = 2000, 250, 40.0
+CUTOFF_HZ, DAMPING = 12.0, 0.5**0.5
+SURE = 4.0
+
+
+def test_every_effect_with_a_model_error_floor_is_in_the_catalogue() -> None:
+    assert {one.name for one in catalogue.diagnosed(sorted(OF_MOTION))} == OF_MOTION
+
+
+@pytest.mark.parametrize(("denoised", "allowed"), [(False, SETTINGS.model_error), (True, SETTINGS.model_error_denoised)])
+def test_a_filter_or_a_clock_must_explain_more_than_a_larger_models_error(denoised: bool, allowed: float) -> None:
+    for name in FOLLOWING:
+        assert below_model_error({"lever_arm": 1e8, name: 0.9e8 * allowed}, SETTINGS, denoised=denoised, poses=False) == {name}
+        assert not below_model_error({"lever_arm": 1e8, name: 1.1e8 * allowed}, SETTINGS, denoised=denoised, poses=False)
+
+
+def test_a_mass_on_springs_does_more_than_its_model_says() -> None:
+    between = 0.5 * SETTINGS.model_error_resonance
+    assert below_model_error({"mount_resonance": 1.0, "clock_offset": between}, SETTINGS, denoised=False, poses=False) == {
+        "clock_offset"
+    }
+    assert not below_model_error({"lever_arm": 1.0, "clock_offset": between}, SETTINGS, denoised=False, poses=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "poses", "hidden"), [("mount_resonance", True, True), ("clock_skew", True, False), ("low_pass", False, False)]
+)
+def test_a_filter_beside_a_clock_of_poses_is_what_the_clock_leaves(name: str, poses: bool, hidden: bool) -> None:
+    """The clock of poses drifts to and fro, and a filter fits what one jump of it leaves."""
+    assert below_model_error({"clock_jump": 71.0, name: 2.0}, SETTINGS, denoised=False, poses=poses) == (
+        {name} if hidden else set()
+    )
+
+
+def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
+    assert not below_model_error(
+        {"timestamp_jitter": 1e9, "temperature": 300.0, "gyro_scale": 30.0}, SETTINGS, denoised=True, poses=False
+    )
+
+
+def test_an_effect_alone_is_told() -> None:
+    assert not below_model_error({"clock_offset": 25.0}, SETTINGS, denoised=True, poses=False)
+    assert not below_model_error({}, SETTINGS, denoised=False, poses=False)
+
+
+# ── beside a low-pass ──
+
+
+def low_passed(seed: int, vibrates_hz: tuple[float, float], scale: float = 1.0) -> Selection:
+    """A body that vibrates, on a clock without an epoch: a simulation folds the vibration, and the sensor filters first."""
+    rng, t = np.random.default_rng(seed), np.arange(int(DURATION_S * FAST_HZ)) / FAST_HZ
+    slow, wanders = (butter(2, hz, output="sos", fs=FAST_HZ) for hz in (3.0, 0.5))
+    motion = np.stack([sosfilt(slow, rng.normal(size=len(t))) * s for s in (8.0, 8.0, 6.0, 15.0, 15.0, 15.0)], axis=1)
+    turns = (
+        2.0
+        * np.pi
+        * np.cumsum(np.mean(vibrates_hz) + 2000.0 * np.ptp(vibrates_hz) * 1e-2 * sosfilt(wanders, rng.normal(size=len(t))))
+        / FAST_HZ
+    )
+    vibration = np.cos(turns[:, None] + rng.uniform(0.0, 6.0, 6)) * np.array([0.1] * 3 + [2.0] * 3)
+    felt = motion + vibration + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
+    sos = butter(2, CUTOFF_HZ, output="sos", fs=FAST_HZ)
+    read = scale * np.stack([sosfilt(sos, x, zi=sosfilt_zi(sos) * x[0])[0] for x in felt.T], axis=1)
+    every = slice(None, None, FAST_HZ // RATE_HZ)
+    noise = np.array([1e-3] * 3 + [1e-2] * 3)
+    white = rng.normal(size=(2, len(t[every]), 6))
+    real = planted.recording("real", t[every], read[every] + planted.BIAS + noise * white[0])
+    sim = planted.recording("sim", t[every], felt[every] + 0.3 * noise * white[1], start_ns=5_000_000_000)
+    settings = DiagnoseSettings()
+    pairs = list(with_simulation(real, sim, settings))
+    candidates = candidates_for(pairs)
+    logs = [whitened(pair, without_second_orders(candidates), settings.band) for pair in pairs]
+    named, always = without_unseen_offset(candidates, pairs)
+    return select_effects(logs, named, always=always)
+
+
+def low_pass(found: Selection) -> SelectedEffect:
+    """The low-pass, which is right within its deviations."""
+    one = next(one for one in found.selected if one.effect.name == "second_order_low_pass")
+    assert (np.abs(one.theta - [CUTOFF_HZ, DAMPING]) < SURE * one.std).all()
+    return one
+
+
+def test_a_low_pass_is_found_although_the_clocks_offset_has_taken_its_lag() -> None:
+    found = low_passed(1, (60.0, 90.0))
+    assert low_pass(found).std[0] < 0.01 * CUTOFF_HZ
+    assert len(found.selected) == 1
+    assert found.remarks == ()
+
+
+def test_a_small_scale_is_told_beside_a_low_pass_by_slow_motion() -> None:
+    found = low_passed(0, (60.0, 90.0), scale=1.01)
+    assert low_pass(found).std[0] < 0.01 * CUTOFF_HZ
+    scales = {one.effect.name: one for one in found.selected[1:]}
+    assert scales.keys() == {"gyro_scale", "accel_scale"}
+    for one in scales.values():
+        np.testing.assert_array_less(np.abs(one.theta - 0.01), SURE * one.std)
+
+
+def test_what_a_simulation_folds_is_no_effect_but_makes_the_low_pass_less_sure() -> None:
+    """A vibration near the sample rate looks like slow motion, which the sensor does not read."""
+    found = low_passed(0, (230.0, 270.0))
+    assert low_pass(found).std[0] > 0.1 * CUTOFF_HZ
+    assert len(found.selected) == 1
+    (remark,) = found.remarks
+    assert "accel scale" in remark
