@@ -8,7 +8,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 from scipy.linalg import hankel
-from scipy.signal import welch
+from scipy.signal import butter, sosfiltfilt, welch
 from scipy.stats import chi2, ttest_1samp
 from scipy.stats import f as fisher
 
@@ -30,6 +30,7 @@ from imutool.sensor.trajectory import smooth_motion
 LEAST_NOISE = {"gyro": 1e-4, "accel": 1e-3}  # rad/s, m/s²: of a sensor without a usable axis
 AS_GOOD = 0.3  # of the noise: how far a simulation along the poses may be from the one that was given, and still stand for it
 MODES = 6  # order of the subspace model: the mode, and two that take up what is left
+RINGING_BAND = 1.5  # times the frequency of a mount, on both sides
 MOST_OF_IT = 0.8  # of the held-out samples that the poses have to cover
 
 
@@ -181,6 +182,10 @@ def ringing(logs: Sequence[WhitenedImu], after: Sequence[np.ndarray], settings: 
     std = np.sqrt((len(others) - 1) * ((others - others.mean(axis=0)) ** 2).mean(axis=0))
     clear = np.isfinite(poles).all() and std[0] < 0.05 * f0 and 3.0 * std[1] < zeta
     if not clear or not settings.least_damping < zeta < settings.most_damping:
+        return []
+    edges_hz = f0 / RINGING_BAND, min(f0 * RINGING_BAND, 0.49 * rate_hz)
+    alone = sosfiltfilt(butter(2, edges_hz, "bandpass", fs=rate_hz, output="sos"), residual, axis=0)[rows]
+    if (alone**4).mean() < settings.least_kurtosis * (alone**2).mean() ** 2:  # a rotor's speed wanders, and nothing decays
         return []
     ratio = float(total[peak]) / floor
     p_value = float(chi2.sf(2.0 * ratio * settings.blocks, 2 * settings.blocks))

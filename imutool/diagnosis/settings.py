@@ -261,6 +261,7 @@ class RingingSettings(Settings, frozen=True):
     blocks: Annotated[int, msgspec.Meta(ge=4)] = 8  # of the jackknife
     least_damping: Positive = 0.005  # less is a line: a vibration
     most_damping: Share = 0.35  # more is no peak
+    least_kurtosis: Positive = 6.0  # of the residual near the peak: between shocks hardly anything rings (noise has 3)
 
 
 class DiagnoseSettings(Settings, frozen=True):

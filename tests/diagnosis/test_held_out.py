@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 from support import planted
 
 from imutool.diagnosis.estimation.jacobians import expected
@@ -51,6 +52,18 @@ def test_a_mount_that_rings_after_shocks_is_named_with_frequency_and_damping(f0:
 @pytest.mark.parametrize("seed", range(20))
 def test_noise_does_not_ring(seed: int) -> None:
     assert found(np.zeros((len(planted.clock()), 3)), seed) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rotors_whose_speeds_wander_do_not_ring(seed: int) -> None:
+    """Their spectrum has a peak as wide as that of a damped mount."""
+    rng, t_s, added = np.random.default_rng(seed), planted.clock(), np.zeros((len(planted.clock()), 3))
+    slow = butter(1, 1.0, fs=planted.RATE_HZ, output="sos")
+    for hz in (16.7, 17.6, 18.5, 19.4):
+        wander_hz = sosfilt(slow, rng.normal(size=len(t_s) + 500))[500:]
+        turns = 2.0 * np.pi * np.cumsum(hz + wander_hz / wander_hz.std()) / planted.RATE_HZ
+        added += 0.5 * np.cos(turns[:, None] + rng.uniform(0.0, 6.0, 3))
+    assert found(added) == []
 
 
 def test_a_line_a_drift_and_motion_that_is_left_do_not_ring() -> None:

@@ -1,4 +1,4 @@
-"""Observability: parameters that the motion can show, fixed ones, and effects that are no answer."""
+"""What a motion shows: observable parameters, fixed ones, and effects that are no answer."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from imutool.sensor.effects import low_pass
 
 
 def beside_offset(logs: Sequence[WhitenedLog], others: Chosen, effect: Effect, starts: Sequence[Theta]) -> list[Chosen]:
-    """Where fits of one more effect begin: at the first start, and for a low-pass with its lag taken back from a clock.
+    """Starts of fits with one more effect; a low-pass also takes its lag back from a clock.
 
     An offset that was fitted first (clocks without a common epoch are aligned by the motion) has taken the filter's lag. Steps
     from there end early where a lag is a period of a vibration: the filter is too fast, and other effects take the rest. The

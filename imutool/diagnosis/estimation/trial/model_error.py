@@ -53,14 +53,14 @@ def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, d
 
 
 def of_motion(effect: Effect) -> bool:
-    """Whether what an effect adds follows the motion, as the error of a low-pass does, but is none."""
+    """Whether an effect but a low-pass follows the motion, as the error of one does."""
     return effect.name in OF_MOTION - {*LOW_PASSES} or (effect.kind == "unknown" and not effect.of_time)
 
 
 class LowPassError(NamedTuple):
-    """Error of the largest low-pass of a fit: white squares of what it takes from the motion and may err by, and its cut-off.
+    """Error of the largest low-pass of a fit.
 
-    A simulation whose noise was filtered out may have vibrations that its samples fold, and a sensor filters before it samples.
+    `size` are the white squares of what it takes from the motion, `squares` those by which it may err. A simulation whose noise was filtered out may have vibrations that its samples fold, and a sensor filters before it samples.
     What is left looks like a scale, an arm or a mount. The lag does not count: a clock's offset may take it.
     """
 
@@ -78,7 +78,7 @@ class LowPassError(NamedTuple):
         return LowPassError(size, found.logs[0].pair.settings.search.model_error_denoised * size, cutoff_hz)
 
     def may_be(self, effect: Effect, without: Fit, found: Fit, log_p: Callable[[float], float], most: float) -> bool:
-        """Whether an effect of a fit may be this error: small, and no more than chance where the low-pass takes nothing."""
+        """Whether an effect of a fit may be this error: it is small, and slow motion does not show it."""
         if not of_motion(effect) or without.objective - found.objective >= self.squares:
             return False
         return log_p(_slow_squares(without, SLOW * self.cutoff_hz) - _slow_squares(found, SLOW * self.cutoff_hz)) > most
@@ -102,7 +102,7 @@ def _slow_squares(found: Fit, most_hz: float) -> float:
 
 
 def with_low_pass_error(selection: Selection, error: LowPassError, left: Mapping[str, float]) -> Selection:
-    """Selection with the deviations of a low-pass that errs, and the effects that show it, by their gains."""
+    """Selection with wider deviations of a low-pass, by the gains of effects that show its error."""
     if not left:
         return selection
     share = SEEN_ERROR * float(np.sqrt(max(left.values()) / error.size))

@@ -1,4 +1,4 @@
-"""Verdicts on the chosen effects: on all rows, on unseen time, and beside the errors of models."""
+"""Verdicts on chosen effects: on all rows, on unseen time, beside errors of models."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from imutool.sensor.effect import Effect
 
 @dataclass(eq=False)
 class Trial:
-    """Trial of chosen effects among all candidates that a search knows; those of `always` are in every fit."""
+    """Trial of chosen effects among all candidates; those of `always` are in every fit."""
 
     logs: Sequence[WhitenedLog]
     named: tuple[Effect, ...]
@@ -54,7 +54,7 @@ class Trial:
 
     @property
     def tried(self) -> int:
-        """Number of hypotheses of the Bonferroni correction; one where the motion shows no candidate."""
+        """Number of hypotheses of the Bonferroni correction; at least one."""
         return max(1, self.candidates.count((*self.named, *self.unnamed)))
 
     @property
@@ -95,7 +95,7 @@ class Trial:
         return tested if all(log.whiten.walk is None for log in tested.logs) else fit(self.logs, tested.chosen)
 
     def _with_error(self, selection: Selection, tested: Fit) -> Selection:
-        """The selection with what may be the error of its low-pass: effects that explain more than chance."""
+        """The selection with effects that explain more than chance and may be the error of its low-pass."""
         if (error := LowPassError.of(tested)) is None:
             return selection
         now, count = self._with_own_noise(tested), self.settings.fitted_each_round
@@ -103,7 +103,7 @@ class Trial:
         return with_low_pass_error(selection, error, {one.effect.name: one.gain for one in clear if of_motion(one.effect)})
 
     def rivals(self, k: int, now: Fit) -> dict[str, Fit]:
-        """Fits with another effect on the same sensor in the place of one, that leave about as little (Akaike's criterion)."""
+        """Fits with another effect on the same sensor in the place of one that leave as little (AIC)."""
         found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
         without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
         least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
@@ -115,7 +115,10 @@ class Trial:
         return found
 
     def verdicts(self, whole: Fit, first: int, unseen: Forked[int]) -> list[SelectedEffect]:
-        """Verdicts on effects that pass on unseen time too, up to the first that goes, with no trust in model errors."""
+        """Verdicts on effects that pass on unseen time too, up to the first that goes.
+
+        An effect that may be a model's error has a rate of one.
+        """
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
         scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
