@@ -35,8 +35,8 @@ class WienerSettings(Settings, frozen=True):
     short_time_parts: Annotated[int, Meta(ge=1)] = 7  # frequencies, and times a quarter of that apart, whose mean is one
 
 
-class Shared(NamedTuple):
-    """Frequencies that signals share with recorded ones, and the share of their power that the recorded ones do not explain."""
+class _Shared(NamedTuple):
+    """Frequencies that signals share with recorded ones, and the power that these leave."""
 
     shared: Bool[np.ndarray, "f k"]
     own: Float64[np.ndarray, "f k"]
@@ -157,7 +157,7 @@ def _apart(shared: Bool[np.ndarray, "f ..."], settings: WienerSettings) -> Bool[
 
 def _shared(
     x: Float64[np.ndarray, "n k"], recorded: Float64[np.ndarray, "n r"], stft: ShortTimeFFT, settings: WienerSettings
-) -> Shared | None:
+) -> _Shared | None:
     """Multiple coherence with recorded signals: where it is more than chance, and what it leaves; None in too short a time."""
     rows, around = np.flatnonzero(np.isfinite(recorded).all(axis=1)), settings.short_time_parts
     if not len(rows) or rows[-1] + 1 - rows[0] < stft.m_num:
@@ -176,4 +176,4 @@ def _shared(
     of_recorded, cross = power[:, :r, :r] + 1e-9 * np.eye(r), power[:, :r, r:]
     coherence = np.einsum("frk,frk->fk", cross.conj(), np.linalg.solve(of_recorded, cross)).real
     own = np.clip((1.0 - coherence) * independent / (independent - r), 0.0, 1.0)  # r signals explain r parts of noise, too
-    return Shared(np.asarray(coherence > beta.isf(CHANCE, r, independent - r)), own)
+    return _Shared(np.asarray(coherence > beta.isf(CHANCE, r, independent - r)), own)

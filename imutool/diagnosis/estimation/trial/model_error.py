@@ -60,8 +60,9 @@ def of_motion(effect: Effect) -> bool:
 class LowPassError(NamedTuple):
     """Error of the largest low-pass of a fit.
 
-    `size` are the white squares of what it takes from the motion, `squares` those by which it may err. A simulation whose noise was filtered out may have vibrations that its samples fold, and a sensor filters before it samples.
-    What is left looks like a scale, an arm or a mount. The lag does not count: a clock's offset may take it.
+    `size` are the white squares of what it takes from the motion, `squares` those by which it may err. A simulation whose noise
+    was filtered out may have vibrations that its samples fold, and a sensor filters before it samples. What is left looks like
+    a scale, an arm or a mount. The lag does not count: a clock's offset may take it.
     """
 
     size: float
@@ -102,7 +103,7 @@ def _slow_squares(found: Fit, most_hz: float) -> float:
 
 
 def with_low_pass_error(selection: Selection, error: LowPassError, left: Mapping[str, float]) -> Selection:
-    """Selection with wider deviations of a low-pass, by the gains of effects that show its error."""
+    """Selection with a low-pass less sure, by the gains of effects that show its error."""
     if not left:
         return selection
     share = SEEN_ERROR * float(np.sqrt(max(left.values()) / error.size))
