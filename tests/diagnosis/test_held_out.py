@@ -10,9 +10,10 @@ from scipy.signal import butter, sosfilt
 from support import planted
 
 from imutool.diagnosis.estimation.jacobians import expected
-from imutool.diagnosis.held_out import ringing
+from imutool.diagnosis.estimation.whitening import WhitenedImu, Whitener
+from imutool.diagnosis.held_out import noise_floor, ringing, unexplained_residuals, with_effects
 from imutool.diagnosis.result import Finding
-from imutool.diagnosis.settings import RingingSettings
+from imutool.diagnosis.settings import HeldOutSettings, RingingSettings
 
 SURE = 4.0
 
@@ -64,6 +65,16 @@ def test_rotors_whose_speeds_wander_do_not_ring(seed: int) -> None:
         turns = 2.0 * np.pi * np.cumsum(hz + wander_hz / wander_hz.std()) / planted.RATE_HZ
         added += 0.5 * np.cos(turns[:, None] + rng.uniform(0.0, 6.0, 3))
     assert found(added) == []
+
+
+def test_no_noise_is_larger_than_what_is_left() -> None:
+    """It is measured before the effects are known, and what a filter takes at high frequencies counted."""
+    pair = planted.pair(planted.rich())
+    log = WhitenedImu(pair, Whitener(np.ones((6, 1)), 5.0 * planted.NOISE))
+    left = unexplained_residuals([log], [with_effects(pair, ())], noise_floor([log]), HeldOutSettings())
+    for signal, true in zip(("gyro", "accel"), planted.NOISE[[0, 3]], strict=True):
+        assert left[signal].white
+        assert left[signal].noise_floor == left[signal].rms < 1.2 * true
 
 
 def test_a_line_a_drift_and_motion_that_is_left_do_not_ring() -> None:
