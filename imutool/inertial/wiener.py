@@ -87,7 +87,7 @@ def denoised(
         return x, NoiseLeft(stft.f, np.zeros((len(stft.f), x.shape[1])))
     density = 2.0 / (rate_hz * float((stft.win**2).sum()))  # one-sided, of a square of the parts
     all_of_it = density * (np.abs(parts) ** 2).mean(axis=1)
-    std, untold = _noise_std(parts, shared, settings, white=not of_poses)
+    std, untold = _noise_std(parts, with_recorded, settings, white=not of_poses)
     std = std[:, None]
     parts /= std
     power = np.einsum("fti,ftj->fij", parts, parts.conj()) / parts.shape[1]
@@ -128,22 +128,25 @@ def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Floa
 
 
 def _noise_std(
-    parts: Parts, shared: Bool[np.ndarray, "f k"] | None, settings: WienerSettings, *, white: bool
+    parts: Parts, shared: _Shared | None, settings: WienerSettings, *, white: bool
 ) -> tuple[Float64[np.ndarray, "f k"], Bool[np.ndarray, " k"]]:
     """Noise of the parts by frequency, and the signals in which it cannot be told from the motion.
 
-    It is that of the frequencies that are not shared, and, if `white`, of the top where nothing is compared. Where almost all
-    are shared it cannot be told, and is next to nothing here: a filter takes none of it.
+    It is that of the frequencies that are not shared, and no more than the recorded signals leave of the others; if `white`,
+    that of the top where nothing is compared. Where almost all are shared it cannot be told, and is next to nothing here: a
+    filter takes none of it.
     """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
     top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
     out, untold = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1)), np.zeros(top.shape[2], bool)
-    for k, column in enumerate(shared.T if shared is not None else ()):
+    for k, (column, unexplained) in enumerate(zip(shared.shared.T, shared.own.T, strict=True) if shared is not None else ()):
         own = np.flatnonzero(_apart(column, settings))
         by_chance = settings.short_time_parts  # of frequencies whose means overlap
         if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
+            most = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
+            out[column, k] = np.minimum(out[column, k], most[column])  # beside such a vibration it would be too much
         elif column.mean() > ALMOST_ALL or not white:
             out[:, k], untold[k] = NO_NOISE * power[:, k].max(), white
     return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold

@@ -74,6 +74,16 @@ def test_white_noise_gets_no_colour_from_what_it_shares_by_chance(seed: int) -> 
     assert np.array_equal(denoised(x, 100.0, recorded=recorded)[0], wiener_filter(x, 100.0))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_beside_a_vibration_that_a_recording_lacks_a_motion_that_it_shares_is_kept(seed: int) -> None:
+    """Interpolated between frequencies that are not shared, the noise was more than all of such a motion."""
+    slow, rng = 0.02 * motion(seed), np.random.default_rng(seed)
+    fast = sosfilt(butter(4, 20.0, "high", fs=RATE_HZ, output="sos"), rng.normal(size=slow.shape), axis=0)
+    clean = denoised(slow + fast, RATE_HZ, recorded=slow + 1e-3 * rng.normal(size=slow.shape))[0]
+    gains = (clean * slow).sum(axis=0) / (slow**2).sum(axis=0)
+    np.testing.assert_array_less(0.8, gains)
+
+
 def test_a_fast_vibration_that_a_recording_shares_is_no_noise_that_is_left() -> None:
     x = motion(0) + np.random.default_rng(7).normal(size=(24_000, 3))
     recorded = x + 0.01 * np.random.default_rng(8).normal(size=x.shape)
