@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -150,7 +150,7 @@ def _computed(operation: Any, args: tuple[Any, ...], named: dict[str, Any]) -> A
     here_named = {name: _with_numbers(value, given) for name, value in named.items()}
     tensors = [one for one in given if isinstance(one, Tensor)]
     cpu = [one for one in tensors if type(one) is not OnGpu]
-    assert not any([one.is_meta for one in cpu]), f"{operation} on a tensor without numbers"
+    assert not any(one.is_meta for one in cpu), f"{operation} on a tensor without numbers"
     if 0 < len(cpu) < len(tensors):
         _refuse_two_devices(operation, args, cpu)
     there = len(cpu) < len(tensors)
