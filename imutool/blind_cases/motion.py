@@ -23,6 +23,7 @@ ROUNDS, OUTLIER = 5, 4.0  # of reweighting; a pose this many robust standard dev
 SLOWEST_HZ, FASTEST_HZ = 2.0, 8.0  # between these the smoothing is cut off, according to the poses' noise
 SPURIOUS = (0.1, 0.1)  # m/s² and rad/s²: how much of the second derivative may be the poses' noise
 SHORTEST_S = 20.0
+KEPT = 3  # vectors of times: those of a misfit, and the finer ones before a filter
 
 Vectors = Float64[np.ndarray, "n 3"]
 Times = Float64[np.ndarray, " n"]
@@ -54,12 +55,21 @@ class Motion:
     quaternion: BSpline
     first_s: float
     last_s: float
+    known: dict[bytes, Kinematics] = field(default_factory=dict, init=False, repr=False)
 
     def kinematics(self, t_s: Times) -> Kinematics:
         """Kinematics of the tracked point; times beyond the ends are held there.
 
-        R(Q) does not change with the length of Q: omega = 2 Im(Q* Q') / |Q|², and alpha is its derivative.
+        Those at the last few vectors of times are kept: hundreds of effects are tried at the same ones.
         """
+        asked = np.asarray(t_s, dtype=np.float64).tobytes()
+        found = self.known[asked] = self.known.pop(asked) if asked in self.known else self._kinematics(t_s)
+        while len(self.known) > KEPT:
+            self.known.pop(next(iter(self.known)))
+        return found
+
+    def _kinematics(self, t_s: Times) -> Kinematics:
+        """R(Q) does not change with the length of Q: omega = 2 Im(Q* Q') / |Q|², and alpha is its derivative."""
         t = np.clip(t_s, self.first_s, self.last_s)
         q, dq, ddq = (self.quaternion(t, order) for order in range(3))
         length2 = np.sum(q * q, axis=1)[:, None]

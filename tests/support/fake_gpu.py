@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -33,6 +33,7 @@ ATEN = torch.ops.aten
 INDEXED = (ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_, ATEN._unsafe_index)  # tensor, indices, values
 FILLED = (ATEN.fill, ATEN.fill_, ATEN.masked_fill, ATEN.masked_fill_)
 NAMES_DEVICE = (str, torch.device)
+PLAIN = frozenset((int, float, bool, str, type(None), torch.dtype, torch.device))  # most of what is no tensor
 OPTIMISERS = importlib.import_module("torch.optim.optimizer")  # torch.optim hides it
 
 
@@ -120,6 +121,10 @@ class _Names(TorchFunctionMode):
 class _Operations(TorchDispatchMode):
     """Every operation passes here, also one that makes a tensor from none."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # nothing is compiled here, and telling the compiler so takes a sixth of the time
+
     def __torch_dispatch__(
         self, operation: Any, types: Sequence[type], args: tuple[Any, ...] = (), named: dict[str, Any] | None = None
     ) -> Any:
@@ -140,13 +145,9 @@ def _indices(index: Any) -> Any:
 
 def _computed(operation: Any, args: tuple[Any, ...], named: dict[str, Any]) -> Any:
     """An operation done on the CPU; its results are where its tensors are, or where they are asked for."""
-    given: list[Any] = []
-
-    def numbers(value: Any) -> Any:
-        given.append(value)
-        return _numbers(value)
-
-    here, here_named = _mapped(numbers, args), {name: _mapped(numbers, value) for name, value in named.items()}
+    given: list[Tensor | torch.Generator] = []
+    here = [_with_numbers(value, given) for value in args]
+    here_named = {name: _with_numbers(value, given) for name, value in named.items()}
     tensors = [one for one in given if isinstance(one, Tensor)]
     cpu = [one for one in tensors if type(one) is not OnGpu]
     assert not any(one.is_meta for one in cpu), f"{operation} on a tensor without numbers"
@@ -155,14 +156,13 @@ def _computed(operation: Any, args: tuple[Any, ...], named: dict[str, Any]) -> A
     there = len(cpu) < len(tensors)
     if named.get("device") is not None:
         there, here_named["device"] = named["device"] == STANDS_FOR_IT, "cpu"
-    if there:
+    if there and len(tensors) < len(given):
         _refuse_foreign_generator(given)
     done = operation(*here, **here_named)
     if _changes_shape(operation):  # such as squeeze_: the shape that torch sees changes as well
         with no_dispatch():
             operation(*args, **named)
-    same = {id(_numbers(one)): one for one in tensors}  # what an operation changes in place stays the same tensor
-    return _mapped(lambda one: same.get(id(one), OnGpu(one) if there else one) if isinstance(one, Tensor) else one, done)
+    return _in_place(done, {id(_numbers(one)): one for one in tensors}, there)
 
 
 @functools.cache
@@ -203,12 +203,27 @@ def _refuse_foreign_generator(given: Sequence[Any]) -> None:
         raise RuntimeError("Expected a 'cuda' device type for generator but found 'cpu'")
 
 
-def _numbers(value: Any) -> Any:
+def _numbers(value: Tensor) -> Tensor:
     return value.numbers if type(value) is OnGpu else value
 
 
-def _mapped(change: Callable[[Any], Any], value: Any) -> Any:
-    """A value, or every one in lists and tuples of values, changed."""
-    if type(value) is tuple or type(value) is list:
-        return type(value)([_mapped(change, one) for one in value])
-    return change(value)
+def _with_numbers(value: Any, given: list[Tensor | torch.Generator]) -> Any:
+    """A value, or all in lists and tuples of values, with the numbers of tensors; tensors and generators go to `given`."""
+    kind = type(value)
+    if kind is OnGpu:
+        given.append(value)
+        return value.numbers
+    if kind is tuple or kind is list:
+        return kind([_with_numbers(one, given) for one in value])
+    if kind not in PLAIN and isinstance(value, (Tensor, torch.Generator)):
+        given.append(value)
+    return value
+
+
+def _in_place(done: Any, given: dict[int, Tensor], there: bool) -> Any:
+    """Results of an operation where they are; what it changed in place stays the same tensor."""
+    if isinstance(done, Tensor):
+        same = given.get(id(done))
+        return same if same is not None else OnGpu(done) if there else done
+    kind = type(done)
+    return kind([_in_place(one, given, there) for one in done]) if kind is tuple or kind is list else done
