@@ -146,7 +146,8 @@ def _noise_std(
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
             most = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
-            out[column, k] = np.minimum(out[column, k], most[column])  # beside such a vibration it would be too much
+            if white:  # beside a vibration that is not shared it would be too much
+                out[column, k] = np.clip(most[column], NO_NOISE * power[:, k].max(), out[column, k])
         elif column.mean() > ALMOST_ALL or not white:
             out[:, k], untold[k] = NO_NOISE * power[:, k].max(), white
     return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold
