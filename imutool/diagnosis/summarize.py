@@ -293,7 +293,7 @@ def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
         if not pair.exact and pair.truth is not None and not pair.truth.has_positions:
             yield f"{pair.name}: the true poses have no positions, so the accelerometer was not compared with them"
         if pair.aligned_s:
-            unseen = "so that a constant offset between them cannot be seen"
-            yield f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), {unseen}"
+            unseen = "so that a constant delay of the sensor cannot be told from it"
+            yield f"{pair.name}: the two clocks differ by {pair.aligned_s:+.3f} s; aligned by the motion, {unseen}"
         if pair.ideal.R_wb is None:
             yield f"{pair.name}: no attitude is known, so gravity and the earth's rotation were not tried"
