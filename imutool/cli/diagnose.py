@@ -112,7 +112,8 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
         say(f"Simulated again with physics.toml and diagnosed again: {answer}{rounds}.")
         table(closed_table(diagnosis.closed), keys=1)
     if folder is not None:
-        say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")
+        closed = () if diagnosis.closed is None else diagnosis_output.OF_CLOSE
+        say(f"{folder}: {', '.join(name for name in (*diagnosis_output.FILES, *closed) if (folder / name).exists())}")
 
 
 @app.command(epilog="Example: [bold]imutool audit sim.mcap --real real.mcap --noise adis16448[/]")

@@ -170,7 +170,10 @@ def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
     lines = said.stdout.splitlines()
     assert lines[0].startswith("The accel differs")
     assert "(lever_arm)" in lines[0]
-    assert lines[-1] == f"{place}: findings.json, physics.toml, noise.toml, report.html, log.html, view.rrd"
+    assert (
+        lines[-1]
+        == f"{place}: findings.json, physics.toml, noise.toml, report.html, log.html, view.rrd, closed.html, closed.mcap"
+    )
     (closer,) = [line for line in lines if "imulated again with everything that was found" in line]
     assert "accel rms" in closer
     assert "% of the misfit removed" in closer

@@ -1,0 +1,77 @@
+"""A second simulation keeps what the first has beyond its poses, and adds the physics that was found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imutool.diagnosis.second_simulation import simulate_again
+from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
+from imutool.noise.datasheet import Noise
+from imutool.recording import Imu, Recording, Scalars
+from imutool.sensor import catalogue, physics_file
+from imutool.sensor.effect import Acting
+from imutool.sensor.made_up_flight import flight
+from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
+from imutool.sensor.simulate import simulate, simulated
+
+RATE_HZ, DURATION_S = 100.0, 30.0
+SCALE = PhysicsFile(effect=(Entry(name="gyro_scale", parameters={"x": Value(value=0.03, unit="-")}),))
+WARMTH = PhysicsFile(
+    effect=(Entry(name="temperature", parameters={"gyro_x": Value(value=1e-3, unit="rad/s per K")}),),
+    bias=Bias(gyro=(0.01, 0.0, 0.0), accel=(0.0, 0.0, 0.0)),
+)
+READ = 0.01  # of the change that the physics makes: a spline at 100 Hz reads so far beside it
+
+
+def sensor(acting: Acting = (), scalars: dict[str, Scalars] | None = None) -> Recording:
+    path = replace(flight(3, duration_s=DURATION_S, rate_hz=RATE_HZ), scalars=scalars or {})
+    return simulated(path, acting, Noise(), RATE_HZ, 1).recording
+
+
+def again(tmp_path: Path, real: Recording, sim: Recording, physics: PhysicsFile) -> Imu:
+    """Samples of the second simulation."""
+    places = [tmp_path / name for name in ("real.mcap", "sim.mcap", "closed.mcap", "physics.toml")]
+    recorded, given, closed, file = places
+    write(real, recorded)
+    write(sim, given)
+    physics_file.write(physics, file)
+    simulate_again(recorded, given, closed, physics=file, imu=None, settings=DiagnoseSettings(), overwrite=False)
+    assert read(closed).name == "closed"
+    return read(closed).imu
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_simulated_imu_that_sits_beside_its_poses_stays_there(tmp_path: Path, poses: bool) -> None:
+    """As in Gazebo or Isaac Lab, which log the poses of the base; an ideal sensor along them would lose the arm."""
+    arm = [(effect, np.array([0.2, -0.1, 0.3])) for effect in catalogue.effects(["lever_arm"])]
+    sim, wanted = sensor(arm), sensor([*arm, *SCALE.acting()])
+    found = again(tmp_path, wanted, sim if poses else replace(sim, truths={}), SCALE)
+    assert len(found) == len(sim.imu)
+    change = (wanted.imu.gyro - sim.imu.gyro).std(axis=0).max()
+    assert np.abs(found.gyro - wanted.imu.gyro).max() < READ * change
+    assert np.abs(found.accel - sim.imu.accel).max() < READ * (sim.imu.accel - sensor().imu.accel).std()
+
+
+def test_an_effect_of_the_temperature_follows_that_of_the_recording(tmp_path: Path) -> None:
+    """A simulator logs none."""
+    sim = sensor()
+    t_ns = sim.imu.t_ns[::100]
+    celsius = 20.0 + 10.0 * np.arange(len(t_ns)) / len(t_ns)
+    real = sensor(WARMTH.acting(), {"/imu/temperature": Scalars(t_ns, celsius[:, None])})
+    found = again(tmp_path, real, sim, WARMTH)
+    change = np.ptp(real.imu.gyro[:, 0] - sim.imu.gyro[:, 0])
+    assert change > 0.009  # ten degrees
+    np.testing.assert_allclose(found.gyro, real.imu.gyro, atol=READ * change)
+
+
+def test_a_simulation_that_is_ideal_is_simulated_along_its_poses(tmp_path: Path) -> None:
+    sim = sensor()
+    found = again(tmp_path, sim, sim, SCALE)
+    simulate(tmp_path / "sim.mcap", tmp_path / "same.mcap", physics=tmp_path / "physics.toml")
+    assert found == read(tmp_path / "same.mcap").imu
