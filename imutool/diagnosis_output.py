@@ -129,6 +129,8 @@ def diagnose(
 
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
+    if metric is not None and not (close and sim is not None):
+        raise ConfigError("`metric` compares two simulations", fix="Give `close` and `sim`, or leave `metric` out")
     if close:
         _check_close(reals, sim, folder, overwrite=overwrite)
     against = partial(diagnose_logs, reals, imu=imu, truth=truth, settings=settings, tell=tell)

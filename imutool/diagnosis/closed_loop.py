@@ -70,8 +70,10 @@ def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
     """Metric of a user's script: `python SCRIPT REAL SIM` prints a number on its last line.
 
     Raises:
-        ConfigError (when called): the script fails, or prints no number.
+        ConfigError: no such script; when called: the script fails, or prints no number.
     """
+    if not script.is_file():
+        raise ConfigError("no such script", where=script, expected="a Python script that prints a number")
 
     def metric(sim: Path) -> float:
         words = [sys.executable, str(script), str(real), str(sim)]

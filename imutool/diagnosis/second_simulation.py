@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.audit.simulation import AT_BODY, read_simulation
+from imutool.diagnosis.audit.simulation import AT_BODY, imu_in, read_simulation
 from imutool.diagnosis.diagnose import read_log
 from imutool.diagnosis.estimation.time_alignment import LEAST_NOISE, same_motion, with_simulation
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -47,7 +47,7 @@ def simulate_again(
         DataError: an effect lacks a channel.
     """
     file = physics_file.read(physics)
-    simulation, mount = read_simulation(sim, imu=imu)
+    simulation, mount = read_simulation(sim, imu=imu_in(sim, imu))
     if mount is AT_BODY and not needs_channels(file.acting(where=physics)) and _is_ideal(simulation):
         simulate(sim, out, physics=physics, overwrite=overwrite)
         return

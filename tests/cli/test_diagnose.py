@@ -206,6 +206,8 @@ def test_a_diagnosis_stays_where_one_is(diagnosed: tuple[Path, Done]) -> None:
         (["untrue.mcap"], 4, "no simulation and no true poses"),
         (["nosuch.mcap"], 3, "nosuch.mcap"),
         (["arm.mcap", "-o", "white.toml"], 3, "is a file"),
+        (["arm.mcap", "--metric", "white.toml"], 3, "--metric compares two simulations"),
+        (["arm.mcap", "--sim", "ideal.mcap", "--close", "-o", "out", "--metric", "nosuch.py"], 3, "nosuch.py: no such script"),
     ],
 )
 def test_what_cannot_be_diagnosed_is_refused(

@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
+from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
+from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Recording, Scalars
 from imutool.sensor import catalogue, physics_file
@@ -19,6 +22,8 @@ from imutool.sensor.effect import Acting
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.sensor.simulate import simulate, simulated
+from imutool.units import SENSORS
+from imutool.viewing.html.diagnosis_paths import held_out_stretches, rms_drift
 
 RATE_HZ, DURATION_S = 100.0, 30.0
 SCALE = PhysicsFile(effect=(Entry(name="gyro_scale", parameters={"x": Value(value=0.03, unit="-")}),))
@@ -75,3 +80,28 @@ def test_a_simulation_that_is_ideal_is_simulated_along_its_poses(tmp_path: Path)
     found = again(tmp_path, sim, sim, SCALE)
     simulate(tmp_path / "sim.mcap", tmp_path / "same.mcap", physics=tmp_path / "physics.toml")
     assert found == read(tmp_path / "same.mcap").imu
+
+
+def test_a_lag_is_not_counted_twice_where_the_clocks_share_no_epoch(tmp_path: Path) -> None:
+    """Alignment by the motion takes the lag of a low-pass; the clock's offset in the fit gives it back."""
+    (low_pass,) = catalogue.effects(["low_pass"])
+    white = msgspec.structs.replace(datasheet.read("bmi160"), gyro_walk=(0.0,) * 3, accel_walk=(0.0,) * 3)
+    path = flight(3, duration_s=60.0, rate_hz=RATE_HZ)
+    real = simulated(path, [(low_pass, np.array([4.0]))], white, RATE_HZ, 1).recording
+    sim = simulated(path, (), Noise(), RATE_HZ, 1).recording
+    away_ns = 10**18  # of the simulation's clock
+    imu = replace(sim.imu, t_ns=sim.imu.t_ns - away_ns)
+    truths = {topic: replace(poses, t_ns=poses.t_ns - away_ns) for topic, poses in sim.truths.items()}
+    write(replace(real, imu_topic="/robot/imu"), tmp_path / "real.mcap")
+    write(replace(sim, imu=imu, truths=truths), tmp_path / "sim.mcap")
+    found = diagnose([tmp_path / "real.mcap"], tmp_path / "sim.mcap", imu="/robot/imu")  # a simulator calls its own otherwise
+    assert [one.effect for one in found.findings] == ["low_pass"]
+    for sensor in SENSORS:
+        closer = found.closer[sensor]
+        assert closer.by == "second simulation"
+        assert closer.share is not None
+        assert closer.share > 0.95
+    (trace,) = found.traces
+    assert trace.ideal is not None
+    turned = {side: rms_drift(list(held_out_stretches(trace)), side)[1][-1, 0] for side in (1, 2)}
+    assert turned[2] < 0.3 * turned[1]  # the drift of the report, with the findings and without
