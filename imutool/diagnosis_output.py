@@ -27,6 +27,7 @@ from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import Location, local
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.storage.target import writing
@@ -158,6 +159,10 @@ def _check_close(reals: Sequence[Location], sim: Location | None, folder: Path |
         raise ConfigError("`close` needs one recording and a folder", fix="Give one recording, and a folder")
     inputs = [local(place, "close") for place in (reals[0], sim) if place is not None]
     check_outputs([OutputFile("close", folder, files=(*FILES, *OF_CLOSE))], inputs, overwrite=overwrite)
+    for place in inputs:
+        with Log(place) as log:
+            if not log.imu_topics:
+                raise ConfigError("`close` simulates an IMU, and the log has none", where=place, fix="Leave `close` out")
 
 
 def _closed(

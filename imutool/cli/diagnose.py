@@ -96,6 +96,7 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
     from imutool import diagnosis_output
     from imutool.diagnosis.wording.conclusion import below, headline, notes
     from imutool.diagnosis.wording.conclusion import table as findings_table
+    from imutool.units import SENSORS
 
     say(headline(diagnosis))
     if diagnosis.findings:
@@ -108,6 +109,8 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
 
         left = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
         answer = f"still missing: {left}" if diagnosis.closed.mismatch else "nothing is missing"
+        if any(finding.signal not in (*SENSORS, "both") for finding in diagnosis.findings):
+            answer += " in the IMU; effects of other signals are not simulated"
         rounds = f", after {diagnosis.closed.rounds} rounds" if diagnosis.closed.rounds > 1 else ""
         say(f"Simulated again with physics.toml and diagnosed again: {answer}{rounds}.")
         table(closed_table(diagnosis.closed), keys=1)

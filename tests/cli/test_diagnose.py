@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from support import diagnoses
 from support.diagnoses import replace
 from support.report_schema import assert_valid
@@ -222,6 +223,17 @@ def test_what_cannot_be_diagnosed_is_refused(
     assert says in said.stderr
     assert said.stdout == ""
     assert sorted(folder.iterdir()) == before
+
+
+def test_a_loop_without_an_imu_is_refused_before_the_search(folder: Path, tmp_path: Path) -> None:
+    with (tmp_path / "wheel.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "another tool")
+        writer.finish()
+    said = run("diagnose", folder / "arm.mcap", "--sim", tmp_path / "wheel.mcap", "--close", "-o", tmp_path / "out")
+    assert said.exit_code == ConfigError.exit_code
+    assert "--close simulates an IMU, and the log has none" in said.stderr
+    assert not (tmp_path / "out").exists()
 
 
 # ── the folder, of made-up diagnoses ──
