@@ -113,7 +113,8 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
             answer += " in the IMU; effects of other signals are not simulated"
         rounds = f", after {diagnosis.closed.rounds} rounds" if diagnosis.closed.rounds > 1 else ""
         say(f"Simulated again with physics.toml and diagnosed again: {answer}{rounds}.")
-        table(closed_table(diagnosis.closed), keys=1)
+        if diagnosis.closed.compared:
+            table(closed_table(diagnosis.closed), keys=1)
     if folder is not None:
         closed = () if diagnosis.closed is None else diagnosis_output.OF_CLOSE
         say(f"{folder}: {', '.join(name for name in (*diagnosis_output.FILES, *closed) if (folder / name).exists())}")
