@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from imutool.array_types import Bool, Float64
-from imutool.diagnosis.audit.simulation import AT_BODY, imu_in, read_simulation
+from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.diagnose import read_log
 from imutool.diagnosis.estimation.time_alignment import LEAST_NOISE, same_motion, with_simulation
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -22,6 +22,7 @@ from imutool.errors import ImutoolError
 from imutool.file_location import Location
 from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Recording, nanoseconds, seconds
@@ -47,10 +48,11 @@ def simulate_again(
         DataError: an effect lacks a channel.
     """
     file = physics_file.read(physics)
-    simulation, mount = read_simulation(sim, imu=imu_in(sim, imu))
-    if mount is AT_BODY and not needs_channels(file.acting(where=physics)) and _is_ideal(simulation):
+    topic = imu_in(sim, imu)
+    if not needs_channels(file.acting(where=physics)) and _is_ideal(read(sim, imu=topic)):  # poses as `simulate` takes them
         simulate(sim, out, physics=physics, overwrite=overwrite)
         return
+    simulation, _ = read_simulation(sim, imu=topic)  # of the sensor, in a world whose z is up
     with Log(real) as log:
         recording = read_log(real, imu=imu or log.imu_topics[0])
     if same_motion(recording.imu, simulation.imu, settings.alignment):

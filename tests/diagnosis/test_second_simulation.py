@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.settings import DiagnoseSettings
+from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import encode_imu, encode_pose
+from imutool.mcap_io.file_writer import LogWriter
 from imutool.mcap_io.read import read
-from imutool.mcap_io.write import write
+from imutool.mcap_io.write import Series, chunks, write
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
-from imutool.recording import Imu, Recording, Scalars
+from imutool.recording import Imu, Poses, Recording, Scalars
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.effect import Acting
 from imutool.sensor.made_up_flight import flight
@@ -39,12 +44,15 @@ def sensor(acting: Acting = (), scalars: dict[str, Scalars] | None = None) -> Re
     return simulated(path, acting, Noise(), RATE_HZ, 1).recording
 
 
-def again(tmp_path: Path, real: Recording, sim: Recording, physics: PhysicsFile) -> Imu:
+def again(tmp_path: Path, real: Recording, sim: Recording | Path, physics: PhysicsFile) -> Imu:
     """Samples of the second simulation."""
     places = [tmp_path / name for name in ("real.mcap", "sim.mcap", "closed.mcap", "physics.toml")]
     recorded, given, closed, file = places
     write(real, recorded)
-    write(sim, given)
+    if isinstance(sim, Path):
+        sim.rename(given)
+    else:
+        write(sim, given)
     physics_file.write(physics, file)
     simulate_again(recorded, given, closed, physics=file, imu=None, settings=DiagnoseSettings(), overwrite=False)
     assert read(closed).name == "closed"
@@ -61,6 +69,27 @@ def test_a_simulated_imu_that_sits_beside_its_poses_stays_there(tmp_path: Path, 
     change = (wanted.imu.gyro - sim.imu.gyro).std(axis=0).max()
     assert np.abs(found.gyro - wanted.imu.gyro).max() < READ * change
     assert np.abs(found.accel - sim.imu.accel).max() < READ * (sim.imu.accel - sensor().imu.accel).std()
+
+
+def test_poses_in_a_world_whose_z_is_down_are_no_obstacle(tmp_path: Path) -> None:
+    """`diagnose` turns them by the name of their world; `simulate` takes them as they are."""
+    sim, wanted = sensor(), sensor(SCALE.acting())
+    down = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    q_wb = (down * Rotation.from_quat(sim.truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
+    poses = Poses(sim.truth.t_ns, down.apply(sim.truth.p_wb.copy()), q_wb)
+    with LogWriter(tmp_path / "robot.mcap") as log:
+        imu, body = (sim.imu.t_ns, sim.imu.gyro, sim.imu.accel), (poses.t_ns, poses.p_wb, poses.q_wb_wxyz)
+        encode = partial(encode_imu, frame_id="base"), partial(encode_pose, frame_id="odom_ned")
+        kinds = ("/imu", schemas.IMU), ("/ground_truth/pose", schemas.POSE)
+        series = [
+            Series(log.channel(*kind), part[0], part, encoded)
+            for kind, part, encoded in zip(kinds, (imu, body), encode, strict=True)
+        ]
+        for chunk in chunks(series):
+            log.chunk(chunk)
+    found = again(tmp_path, wanted, tmp_path / "robot.mcap", SCALE)
+    assert np.abs(found.gyro - wanted.imu.gyro).max() < READ * (wanted.imu.gyro - sim.imu.gyro).std(axis=0).max()
+    assert np.abs(found.accel - sim.imu.accel).max() < READ
 
 
 def test_an_effect_of_the_temperature_follows_that_of_the_recording(tmp_path: Path) -> None:
