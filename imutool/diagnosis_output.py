@@ -22,10 +22,12 @@ from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, closed_loop, is_wo
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
 from imutool.diagnosis.result import Diagnosis
+from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_noise_file, to_physics_file
 from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import Location, local
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.mcap_io.storage.target import writing
@@ -42,6 +44,7 @@ FINDINGS, EFFECT, NOISE = "findings.json", "physics.toml", "noise.toml"
 REPORT, LOG, VIEW = "report.html", "log.html", "view.rrd"
 CLOSED = "closed.html"
 FILES = (FINDINGS, EFFECT, NOISE, REPORT, LOG, VIEW)
+OF_CLOSE = (CLOSED, CLOSED_LOG)
 DRAWN = ("matplotlib", "report")  # the library that draws a file, and its extra
 NEEDS = {LOG: DRAWN, REPORT: DRAWN, VIEW: ("rerun", "view")}
 
@@ -127,6 +130,8 @@ def diagnose(
 
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
+    if metric is not None and not (close and sim is not None):
+        raise ConfigError("`metric` compares two simulations", fix="Give `close` and `sim`, or leave `metric` out")
     if close:
         _check_close(reals, sim, folder, overwrite=overwrite)
     against = partial(diagnose_logs, reals, imu=imu, truth=truth, settings=settings, tell=tell)
@@ -141,8 +146,11 @@ def diagnose(
     remarks = write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite)
     if close:
         rewrite = partial(write, folder=folder, logs=look, overwrite=True)
-        truth = None if sim else truth
-        diagnosis = _closed(diagnosis, against, search, rewrite, folder, sim, truth=truth, metric=metric, overwrite=overwrite)
+        given = None if sim is None else local(sim, "close")
+        simulated: Callable[..., object] = partial(simulate, local(reals[0], "close"), truth=truth)
+        if given is not None:
+            simulated = partial(simulate_again, reals[0], given, imu=imu, settings=settings)
+        diagnosis = _closed(diagnosis, against, search, rewrite, simulated, folder, given, metric=metric, overwrite=overwrite)
     return diagnosis, remarks
 
 
@@ -150,7 +158,11 @@ def _check_close(reals: Sequence[Location], sim: Location | None, folder: Path |
     if folder is None or len(reals) != 1:
         raise ConfigError("`close` needs one recording and a folder", fix="Give one recording, and a folder")
     inputs = [local(place, "close") for place in (reals[0], sim) if place is not None]
-    check_outputs([OutputFile("close", folder, files=(*FILES, CLOSED, CLOSED_LOG))], inputs, overwrite=overwrite)
+    check_outputs([OutputFile("close", folder, files=(*FILES, *OF_CLOSE))], inputs, overwrite=overwrite)
+    for place in inputs:
+        with Log(place) as log:
+            if not log.imu_topics:
+                raise ConfigError("`close` simulates an IMU, and the log has none", where=place, fix="Leave `close` out")
 
 
 def _closed(
@@ -158,17 +170,16 @@ def _closed(
     against: Callable[[Path], Diagnosis],
     search: Callable[..., Diagnosis],
     rewrite: Callable[[Diagnosis], object],
+    simulated: Callable[..., object],
     folder: Path,
-    sim: Location | None,
+    sim: Path | None,
     *,
-    truth: str | None,
     metric: Callable[[Path], float] | None,
     overwrite: bool,
 ) -> Diagnosis:
-    log, given = folder / CLOSED_LOG, None if sim is None else local(sim, "close")
+    log = folder / CLOSED_LOG
     for number in range(1, ROUNDS + 1):
-        physics, replaces = folder / EFFECT, overwrite or number > 1
-        simulate(given or Path(first.real[0]), log, physics=physics, truth=truth, overwrite=replaces)
+        simulated(log, physics=folder / EFFECT, overwrite=overwrite or number > 1)
         again = against(log)
         if number == ROUNDS or not is_worth_a_round(first, again):
             break
@@ -177,7 +188,7 @@ def _closed(
             break
         first = better
         rewrite(first)
-    done = replace(first, closed=closed_loop(first, again, log, metric=metric, before=given, rounds=number))
+    done = replace(first, closed=closed_loop(first, again, log, metric=metric, before=sim, rounds=number))
     (folder / FINDINGS).write_text(json_text(done.report), encoding="utf-8")
     if find_spec("matplotlib") is not None:
         from imutool.viewing.html.diagnosis_page import write as write_page

@@ -256,7 +256,7 @@ ZEROS = np.zeros((2, len(STILL.imu), 3))
         ),
         (lambda: imutool.train("a.mcap", "m.safetensors", method="lineer", settings={}), "method: .*Did you mean 'linear'"),
         (lambda: imutool.diagnose([]), "reals: no log is given"),
-        (lambda: imutool.diagnose("a.mcap", metric=lambda log: 1.0), "`metric` is a function, for `close` and `sim`"),
+        (lambda: imutool.diagnose("a.mcap", metric=lambda log: 1.0), "`metric` compares two simulations"),
         (
             lambda: imutool.debias("a.mcap", "b.mcap", model="static", smooth="no"),
             "smooth: of type str; expected True or False",

@@ -140,8 +140,8 @@ def diagnose(
         ['lever_arm']
     """
     logs, folder = given_logs(reals, "reals"), None if output is None else local(output, "output")
-    if metric is not None and not (callable(metric) and close and sim is not None):
-        raise ConfigError("`metric` is a function, for `close` and `sim`", fix="Give both, or leave `metric` out")
+    if metric is not None and not callable(metric):
+        raise ConfigError("`metric` is no function", expected="a function of the path of a simulated log")
     check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sim], overwrite=overwrite)
     diagnosis, _ = diagnosis_output.diagnose(
         logs,

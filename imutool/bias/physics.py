@@ -144,6 +144,9 @@ def load(path: Path, rate_hz: float) -> Model:
         raise ModelError(f"no effect can be corrected ({listed})", where=path, expected="a bias, or an effect in closed form")
     if kept:
         logger.warning("%s: no model corrects these effects, they stay in the samples: %s", path, ", ".join(kept))
+    if file.conventions:
+        found = ", ".join(file.conventions)
+        logger.warning("%s holds for a log in the units and axes of its simulation; the recording had others: %s", path, found)
     if any(entry.name == MOUNT for entry in file.effect):
         logger.warning("%s: mount_rotation is inverted: corrected samples are in the body's axes, not the sensor's", path)
     model = Model(parts, file.bias, rate_hz)

@@ -96,6 +96,7 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
     from imutool import diagnosis_output
     from imutool.diagnosis.wording.conclusion import below, headline, notes
     from imutool.diagnosis.wording.conclusion import table as findings_table
+    from imutool.units import SENSORS
 
     say(headline(diagnosis))
     if diagnosis.findings:
@@ -108,11 +109,15 @@ def _say(diagnosis: Diagnosis, folder: Path | None) -> None:
 
         left = ", ".join(diagnosis.closed.findings) or "a misfit without a name"
         answer = f"still missing: {left}" if diagnosis.closed.mismatch else "nothing is missing"
+        if any(finding.signal not in (*SENSORS, "both") for finding in diagnosis.findings):
+            answer += " in the IMU; effects of other signals are not simulated"
         rounds = f", after {diagnosis.closed.rounds} rounds" if diagnosis.closed.rounds > 1 else ""
         say(f"Simulated again with physics.toml and diagnosed again: {answer}{rounds}.")
-        table(closed_table(diagnosis.closed), keys=1)
+        if diagnosis.closed.compared:
+            table(closed_table(diagnosis.closed), keys=1)
     if folder is not None:
-        say(f"{folder}: {', '.join(name for name in diagnosis_output.FILES if (folder / name).exists())}")
+        closed = () if diagnosis.closed is None else diagnosis_output.OF_CLOSE
+        say(f"{folder}: {', '.join(name for name in (*diagnosis_output.FILES, *closed) if (folder / name).exists())}")
 
 
 @app.command(epilog="Example: [bold]imutool audit sim.mcap --real real.mcap --noise adis16448[/]")

@@ -19,6 +19,7 @@ from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
+from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.diagnosis.wording.quantity import symbol
@@ -50,14 +51,15 @@ def closed_loop(
 
     `metric` maps a simulation's log to the user's figure.
     """
-    compared = [*_compared(_shared(first, again))]
+    other = ANOTHER_MOTION in again.remarks and ANOTHER_MOTION not in first.remarks  # then its figures are of other poses
+    compared = [] if other else [*_compared(_shared(first, again))]
     if metric is not None and before is not None:
-        compared.append(Compared("metric", metric(before), metric(log), "-"))
+        compared.append(Compared("metric", _figure(metric, before), _figure(metric, log), "-"))
     given = {finding.effect for finding in first.findings} & STAYS
     missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
     white = all(again.unexplained[sensor].white for sensor in SENSORS if sensor in again.unexplained)  # what was simulated
     nameless = not white or (bool(again.located) and not again.findings)  # the misfit of what stays is located, too
-    return ClosedLoop(str(log), bool(missing) or nameless, missing, tuple(compared), rounds)
+    return ClosedLoop(str(log), bool(missing) or nameless or other, missing, tuple(compared), rounds)
 
 
 def is_worth_a_round(first: Diagnosis, again: Diagnosis) -> bool:
@@ -70,8 +72,10 @@ def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
     """Metric of a user's script: `python SCRIPT REAL SIM` prints a number on its last line.
 
     Raises:
-        ConfigError (when called): the script fails, or prints no number.
+        ConfigError: no such script; when called: the script fails, or prints no number.
     """
+    if not script.is_file():
+        raise ConfigError("no such script", where=script, expected="a Python script that prints a number")
 
     def metric(sim: Path) -> float:
         words = [sys.executable, str(script), str(real), str(sim)]
@@ -88,6 +92,14 @@ def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
             raise ConfigError(what, where=script, expected="a number on its last line") from error
 
     return metric
+
+
+def _figure(metric: Callable[[Path], float], log: Path) -> float:
+    value: object = metric(log)
+    try:
+        return float(value)  # type: ignore[arg-type]  # whatever a user's function gives
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"`metric` gives {value!r} for {log.name}", expected="a number") from error
 
 
 def table(loop: ClosedLoop) -> list[list[str]]:

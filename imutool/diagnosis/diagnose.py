@@ -15,7 +15,7 @@ from imutool.array_types import Float64
 from imutool.bias_start.stretches import longest_stretch, measured_recording
 from imutool.diagnosis import summarize
 from imutool.diagnosis.audit import simulator_remarks
-from imutool.diagnosis.audit.simulation import read_simulation
+from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation import unnamed_effects as unnamed
@@ -126,12 +126,12 @@ def _beside_reference(
 
     The selection of effects comes with it; none without a reference.
     """
-    simulated = None if sim is None else read_simulation(sim, imu=imu)[0]
+    simulated = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0]
     of_sim, sim_selection, another = tuple[Finding, ...](), None, list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
         another = [ANOTHER_MOTION, *simulator_remarks(simulated)]
-        of_sim, sim_selection = _by_itself(sim, imu, next(iter(simulated.truths)), settings)
+        of_sim, sim_selection = _by_itself(sim, imu_in(sim, imu), next(iter(simulated.truths)), settings)
         simulated = None
     pairs, left_out = align_all(recordings, simulated, truth, settings)
     if not pairs:
@@ -203,7 +203,8 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
     if any(finding.effect == summarize.JITTER for finding in diagnosis.findings):  # jitter of stamps is not simulated
         return diagnosis
     try:
-        closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis))
+        clock = selection.fitted.chosen[: selection.always]
+        closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis), clock)
     except ImutoolError as error:
         why = f"How much closer it comes is computed, not simulated again: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
@@ -278,7 +279,7 @@ def effect_sizes(
     Raises:
         ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
     """
-    simulated, settings = None if sim is None else read_simulation(sim, imu=imu)[0], DiagnoseSettings()
+    simulated, settings = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0], DiagnoseSettings()
     aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)

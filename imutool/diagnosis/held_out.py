@@ -219,8 +219,10 @@ def _pole(c: Float64[np.ndarray, " l"], rate_hz: float, near_hz: float) -> tuple
 # ── a second simulation ──
 
 
-def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile) -> Mapping[str, Closer]:
+def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile, clock: Chosen = ()) -> Mapping[str, Closer]:
     """Gain of a second simulation with some physics by signal, on held-out time.
+
+    `clock` is the offset that is in every fit where the clocks share no epoch.
 
     Raises:
         DataError: the simulation has no poses that stand for its samples, or they cover too little of a log.
@@ -235,9 +237,9 @@ def resimulate(logs: Sequence[WhitenedImu], sim: Recording, physics: PhysicsFile
     covered, before, after = [], [], []
     for log in logs:
         on_its_clock = [_on_clock_of(one, motion.start_ns, log.pair) for one in ideals]
-        plain, simulated = (_read(log.pair, on_its_clock, effects) for effects in ((), acting))
+        plain, simulated = (_read(log.pair, on_its_clock, [*effects, *clock]) for effects in ((), acting))
         finite = np.isfinite(plain).all(axis=1) & np.isfinite(simulated).all(axis=1)
-        given = expected(log.pair, ())
+        given = expected(log.pair, clock)
         plain, simulated = (np.where(finite[:, None], read, given) for read in (plain, simulated))  # a filter spreads NaN
         pair = replace(log.pair, fitted=log.pair.fitted & finite, held_out=log.pair.held_out & finite)
         if pair.held_out.sum() < MOST_OF_IT * log.pair.held_out.sum():

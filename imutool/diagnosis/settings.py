@@ -114,6 +114,7 @@ class AlignmentSettings(WienerSettings, frozen=True):
     hole_s: Positive = 0.1  # without samples of a simulation, from which on it is not interpolated
     align_hz: Positive = 100.0  # of the clock on which angular rates are correlated
     farthest_s: Positive = 5.0  # by which clocks of one epoch may differ
+    offset_s: Positive = 0.3  # up to which the search finds a clock offset from 0; from 0.5 s on it ended in other effects
     least_correlation: Share = 0.6  # of the angular rates, below which two motions differ
     alike_sigma: tuple[float, float] = (3.0, 6.0)  # over chance, with a shared epoch and at any lag; 210 unrelated pairs: 5.3
     poses_share: Share = 0.9  # of the simulation that its poses must cover to stand for it

@@ -73,10 +73,10 @@ def summarize(
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
     findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
-    both = zip(selection.selected, named, strict=True)
+    both, chosen = zip(selection.selected, named, strict=True), selection.fitted.chosen
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
-    chosen = selection.fitted.chosen
-    expected_too |= {effect.key for effect, _ in chosen[: selection.always]}
+    clock = chosen[: selection.always]  # where logs share no epoch
+    expected_too |= {effect.key for effect, _ in clock}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {
         signal: min((f.p_value for f in findings if f.effect != JITTER and f.signal in (signal, "both")), default=1.0)
@@ -103,7 +103,10 @@ def summarize(
             *(*dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *both_have),
         ),
         closer=gains(logs, before, after),
-        traces=tuple(_traces(pair, b, a, reals[pair.name]) for pair, b, a in zip(pairs, before, after, strict=True)),
+        traces=tuple(
+            Traces(p.name, p.stamp_s, p.real, b, a, p.held_out, p.truth, expected(p, clock), p.band_hz, reals[p.name])
+            for p, b, a in zip(pairs, before, after, strict=True)
+        ),
         start_ns=pairs[0].log_start_ns + round(1e9 * pairs[0].aligned_s),
     )
 
@@ -130,11 +133,6 @@ def vibration_above_band(logs: Sequence[WhitenedImu], chosen: Chosen) -> list[Fi
     clear = [one for one in own if all(p_value(one.theta[0]) < chance for p_value in tests)]
     alone = [one for one in clear if not is_in_raw_poses(pair, residual, one.theta[0])]
     return [finding_of([log], found, one, noise_floor([log])) for one in alone]
-
-
-def _traces(pair: Pair, before: Float64[np.ndarray, "n 6"], after: Float64[np.ndarray, "n 6"], path: str) -> Traces:
-    ideal, held_out = expected(pair, ()), pair.held_out
-    return Traces(pair.name, pair.stamp_s, pair.real, before, after, held_out, pair.truth, ideal, pair.band_hz, path)
 
 
 def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d: Diagnosis) -> PhysicsFile:
@@ -285,7 +283,7 @@ def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
         if not pair.exact and pair.truth is not None and not pair.truth.has_positions:
             yield f"{pair.name}: the true poses have no positions, so the accelerometer was not compared with them"
         if pair.aligned_s:
-            unseen = "so that a constant offset between them cannot be seen"
-            yield f"{pair.name}: the two clocks share no epoch; aligned by the motion ({pair.aligned_s:+.3f} s), {unseen}"
+            unseen = "so that a constant delay of the sensor cannot be told from it"
+            yield f"{pair.name}: the two clocks differ by {pair.aligned_s:+.3f} s; aligned by the motion, {unseen}"
         if pair.ideal.R_wb is None:
             yield f"{pair.name}: no attitude is known, so gravity and the earth's rotation were not tried"

@@ -69,6 +69,7 @@ def to_physics_file(d: Diagnosis) -> PhysicsFile:
             )
     return PhysicsFile(
         start_ns=d.start_ns,
+        conventions=tuple(dict.fromkeys(finding.effect for finding in d.findings if finding.effect in CONVENTIONS)),
         effect=tuple(entries),
         bias=Bias(gyro=three(bias[:3]), accel=three(bias[3:])) if np.isfinite(bias).all() else None,
         unknown=tuple(curves),

@@ -84,7 +84,7 @@ class ProcessEngine:
 
 def _work_quietly(task: Task, model: bytes | None) -> Result:
     """Run `work`; what a library would print does not reach the terminal, where the progress is."""
-    logging.lastResort = None
+    logging.lastResort = logging.NullHandler()  # None prints "No handlers could be found"
     warnings.simplefilter("ignore")
     return work(task, model)
 

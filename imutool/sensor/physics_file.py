@@ -114,11 +114,13 @@ class Term(Settings, frozen=True, kw_only=True):
 class PhysicsFile(Settings, frozen=True, kw_only=True):
     """Contents of a physics.toml.
 
-    `start_ns` is the stamp from which its times count, on the clock of the log to simulate along.
+    `start_ns` is the stamp from which its times count, on the clock of the log to simulate along. `conventions` names what the
+    recording had otherwise than the simulation: the physics is in the units and axes of the simulation.
     """
 
     schema: Literal["imutool.physics/1"] = "imutool.physics/1"
     start_ns: int | None = None
+    conventions: tuple[str, ...] = ()
     effect: tuple[Entry, ...] = ()
     bias: Bias | None = None
     unknown: tuple[Curve, ...] = ()
@@ -161,9 +163,8 @@ def read(path: Path) -> PhysicsFile:
             raise ConfigError(f"unknown[{k}].x does not rise", where=path, expected="two and more values, each above the last")
         for key, rows in (("y", curve.y), ("band", curve.band)):
             if len(rows) != len(x) and (rows or key == "y"):
-                raise ConfigError(
-                    f"unknown[{k}].{key} has {len(rows)} rows", where=path, expected=f"{len(x)}, one for each of x"
-                )
+                what = f"unknown[{k}].{key} has {len(rows)} rows"
+                raise ConfigError(what, where=path, expected=f"{len(x)}, one for each of x")
     return file
 
 
@@ -181,6 +182,7 @@ def to_toml(file: PhysicsFile) -> str:
     """Text of the file."""
     lines = ["# Physics of an IMU, as `imutool simulate --physics FILE` takes it", f"schema = {_text(file.schema)}"]
     lines += [] if file.start_ns is None else [f"start_ns = {file.start_ns}"]
+    lines += [f"conventions = [{', '.join(map(_text, file.conventions))}]"] if file.conventions else []
     for entry in file.effect:
         lines += ["", *([OTHER] if entry.column else []), "[[effect]]", f"name = {_text(entry.name)}"]
         keys = ("signal", "driver", "column", "equation")
@@ -195,10 +197,8 @@ def to_toml(file: PhysicsFile) -> str:
         lines += ["", "[bias]", f"gyro = {_row(file.bias.gyro)}", f"accel = {_row(file.bias.accel)}"]
     for curve in file.unknown:
         lines += ["", "[[unknown]]", *(f"{key} = {_text(getattr(curve, key))}" for key in ("signal", "variable", "unit"))]
-        lines.append(f"x = {_row(curve.x)}")
-        lines += [
-            f"{key} = [{', '.join(map(_row, rows))}]" for key in ("y", "band") if (rows := getattr(curve, key)) or key == "y"
-        ]
+        columns = {"y": curve.y, **({"band": curve.band} if curve.band else {})}
+        lines += [f"x = {_row(curve.x)}", *(f"{key} = [{', '.join(map(_row, rows))}]" for key, rows in columns.items())]
     for term in file.term:
         lines += ["", "[[term]]", f"signal = {_text(term.signal)}", f"term = {_text(term.term)}", f"value = {_row(term.value)}"]
         lines += [] if term.std is None else [f"std = {_row(term.std)}"]

@@ -105,7 +105,7 @@ def simulate(
     if out.exists() and out.samefile(trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
     report(0, 4, "reading")
-    source = _source(trajectory, truth, channels=_needs_channels(acting))
+    source = _source(trajectory, truth, channels=needs_channels(acting))
     own_rate = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
     report(1, 4, "smoothing")
     try:
@@ -160,7 +160,7 @@ def simulated(
         )
     remarks = _remarks(motion, source.truth, noise, rate_hz)
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
-    needed = _needs_channels(acting)
+    needed = needs_channels(acting)
     if needed:
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
     stamps = [_stamps(ideal, rate_hz) for ideal in ideals]
@@ -186,7 +186,8 @@ def simulated(
     )
 
 
-def _needs_channels(acting: Acting) -> bool:
+def needs_channels(acting: Acting) -> bool:
+    """Whether an effect follows another number of the log, such as a temperature."""
     return any(effect.needs or effect.name == DRIVEN for effect, _ in acting)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from support import diagnoses
 from support.diagnoses import replace
 from support.report_schema import assert_valid
@@ -170,7 +171,10 @@ def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
     lines = said.stdout.splitlines()
     assert lines[0].startswith("The accel differs")
     assert "(lever_arm)" in lines[0]
-    assert lines[-1] == f"{place}: findings.json, physics.toml, noise.toml, report.html, log.html, view.rrd"
+    assert (
+        lines[-1]
+        == f"{place}: findings.json, physics.toml, noise.toml, report.html, log.html, view.rrd, closed.html, closed.mcap"
+    )
     (closer,) = [line for line in lines if "imulated again with everything that was found" in line]
     assert "accel rms" in closer
     assert "% of the misfit removed" in closer
@@ -203,6 +207,8 @@ def test_a_diagnosis_stays_where_one_is(diagnosed: tuple[Path, Done]) -> None:
         (["untrue.mcap"], 4, "no simulation and no true poses"),
         (["nosuch.mcap"], 3, "nosuch.mcap"),
         (["arm.mcap", "-o", "white.toml"], 3, "is a file"),
+        (["arm.mcap", "--metric", "white.toml"], 3, "--metric compares two simulations"),
+        (["arm.mcap", "--sim", "ideal.mcap", "--close", "-o", "out", "--metric", "nosuch.py"], 3, "nosuch.py: no such script"),
     ],
 )
 def test_what_cannot_be_diagnosed_is_refused(
@@ -217,6 +223,17 @@ def test_what_cannot_be_diagnosed_is_refused(
     assert says in said.stderr
     assert said.stdout == ""
     assert sorted(folder.iterdir()) == before
+
+
+def test_a_loop_without_an_imu_is_refused_before_the_search(folder: Path, tmp_path: Path) -> None:
+    with (tmp_path / "wheel.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "another tool")
+        writer.finish()
+    said = run("diagnose", folder / "arm.mcap", "--sim", tmp_path / "wheel.mcap", "--close", "-o", tmp_path / "out")
+    assert said.exit_code == ConfigError.exit_code
+    assert "--close simulates an IMU, and the log has none" in said.stderr
+    assert not (tmp_path / "out").exists()
 
 
 # ── the folder, of made-up diagnoses ──

@@ -11,13 +11,16 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from imutool.diagnosis.closed_loop import CLOSED_LOG, closed_loop, is_worth_a_round
+from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis, Finding, HeldOut, Located, Traces, Unexplained
 from imutool.diagnosis.to_sensor_files import to_physics_file
+from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
 from imutool.recording import Recording, seconds
+from imutool.report import json_values
 from imutool.sensor import catalogue, physics_file
 from imutool.sensor.made_up_flight import flight
 from imutool.sensor.simulate import simulate, simulated
@@ -61,6 +64,25 @@ def test_figures_are_of_all_time_that_both_know() -> None:
         0.5 * misfit for misfit in (1.0,) * 2 + (2.0,) * 5 + (0.0,) * 2
     ]  # windows of five seconds, each within one stretch
     assert figures["rotation over 5 s"][1] == pytest.approx(np.sqrt(np.mean(np.square(turns))))
+
+
+def test_a_second_simulation_that_no_longer_moves_alike_is_no_closer() -> None:
+    """It is compared by its own poses then, and the recording by its own: what that leaves says nothing of the simulation."""
+    first, again = diagnosis([(0.0, 20.0, 3.0)]), diagnosis([(0.0, 20.0, 0.0)])
+    loop = closed_loop(first, replace(again, remarks=(ANOTHER_MOTION,)), Path(CLOSED_LOG))
+    assert loop.mismatch
+    assert loop.compared == ()
+    both = [replace(one, remarks=(ANOTHER_MOTION,)) for one in (first, again)]
+    assert not closed_loop(both[0], both[1], Path(CLOSED_LOG)).mismatch
+
+
+def test_a_metric_gives_a_number() -> None:
+    first, log = diagnosis([(0.0, 20.0, 1.0)]), Path(CLOSED_LOG)
+    loop = closed_loop(first, first, log, metric=lambda _: np.float32(0.5), before=log)  # type: ignore[arg-type,return-value]
+    assert loop.compared[-1].before == loop.compared[-1].after == 0.5
+    assert json_values(loop)["compared"][-1]["after"] == 0.5
+    with pytest.raises(ConfigError, match=r"'abc' for closed\.mcap; expected a number"):
+        closed_loop(first, first, log, metric=lambda _: "abc", before=log)  # type: ignore[arg-type,return-value]
 
 
 def test_what_no_simulation_changes_is_not_missing() -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.signal import lfilter
 from support import diagnoses
 from support.diagnoses import replace as replace_struct
 
+from imutool.bias.physics import load
 from imutool.diagnosis.result import Estimate, Traces
-from imutool.diagnosis.to_sensor_files import start_values, to_noise_file
-from imutool.sensor import catalogue
+from imutool.diagnosis.to_sensor_files import start_values, to_noise_file, to_physics_file
+from imutool.sensor import catalogue, physics_file
 
 RATE_HZ, SECONDS = 200.0, 60
 
@@ -40,3 +44,15 @@ def test_a_search_begins_with_the_first_values_of_what_was_found_and_nothing_for
 
 def test_without_samples_there_is_no_noise() -> None:
     assert to_noise_file(replace(diagnoses.NOTHING, traces=())) is None
+
+
+def test_physics_found_in_other_axes_says_so_where_debias_reads_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The effects are in the axes of the simulation; the recording's samples have another order."""
+    order = replace_struct(diagnoses.LEVER_ARM, effect="permuted_axes", parameters={})
+    file = to_physics_file(replace(diagnoses.NOTHING, findings=(order, diagnoses.LEVER_ARM)))
+    assert [entry.name for entry in file.effect] == ["lever_arm"]
+    physics_file.write(file, tmp_path / "physics.toml")
+    assert physics_file.read(tmp_path / "physics.toml").conventions == ("permuted_axes",)
+    with caplog.at_level(logging.WARNING):
+        load(tmp_path / "physics.toml", RATE_HZ)
+    assert "permuted_axes" in caplog.text

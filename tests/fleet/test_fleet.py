@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import re
 import shutil
@@ -12,6 +13,7 @@ import socket
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -459,3 +461,16 @@ def test_an_exit_code_tells_the_worst() -> None:
     assert ended(("quarantined", 5, None), ("ok", 0, None)) == 3
     assert ended(("lost", 0, None), ("failed", 5, None), ("failed", 4, None)) == 5
     assert ended(("failed", 7, None), ("failed", 1, None)) == 1
+
+
+def test_a_warning_of_a_task_does_not_reach_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Without any handler `logging` says that there is none."""
+    alone = logging.getLogger("alone")
+    monkeypatch.setattr(alone, "propagate", False)
+    monkeypatch.setattr(logging, "lastResort", logging.lastResort)
+    monkeypatch.setattr(engines, "work", lambda task, model: alone.warning("accel reads 11.5"))
+    with warnings.catch_warnings():
+        engines._work_quietly(None, None)  # type: ignore[arg-type]  # the task is not looked at
+    assert capfd.readouterr().err == ""

@@ -43,6 +43,7 @@ def curves(draw: st.DrawFn) -> Curve:
 
 FILES = st.builds(
     PhysicsFile,
+    conventions=st.lists(st.text(), max_size=2).map(tuple),
     effect=st.lists(ENTRIES, max_size=3).map(tuple),
     bias=st.none() | st.builds(Bias, gyro=THREE, accel=THREE),
     unknown=st.lists(curves(), max_size=2).map(tuple),

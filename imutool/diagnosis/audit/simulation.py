@@ -65,6 +65,12 @@ def read_simulation(
     return replace(recording, truths={**recording.truths, topic: moved}), mount
 
 
+def imu_in(sim: Location, imu: str | None) -> str | None:
+    """IMU topic of a simulation: that of the recording, or its only one, whatever its name."""
+    with Log(sim) as log:
+        return log.imu_topics[0] if imu is not None and imu not in log.topics and len(log.imu_topics) == 1 else imu
+
+
 def _of_sensor(poses: Poses, mount: Mount, *, down: bool) -> Poses:
     """Poses of the sensor in a world whose z is up; the same object where nothing changes."""
     R_wb, turned = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True), Z_UP if down else Rotation.identity()

@@ -254,17 +254,17 @@ def _attitude(recording: Recording, t_ns: np.ndarray) -> Float64[np.ndarray, "n 
 
 
 def _shift(real: Imu, sim: Imu, settings: AlignmentSettings) -> float | None:
-    """Clock shift (s) to add to the recording's times; 0 on a shared epoch, None for two motions."""
+    """Clock shift (s) to add to the recording's times; 0 where a clock offset explains it, None for two motions."""
     overlap = (min(real.t_ns[-1], sim.t_ns[-1]) - max(real.t_ns[0], sim.t_ns[0])) * 1e-9
     shared = overlap > min(settings.least_s, 0.5 * min(real.duration_s, sim.duration_s))
     if _rests(real) and _rests(sim):
         return 0.0 if shared else None
     turns, hz = [_turning(imu, settings.align_hz) for imu in (real, sim)], settings.align_hz
-    shortest = min(len(turn) for turn in turns)
-    found = cross_correlation(turns[0], turns[1], round(min(settings.least_s * hz, 0.8 * shortest)))
+    found = cross_correlation(turns[0], turns[1], round(min(settings.least_s * hz, 0.8 * min(map(len, turns)))))
     lag_s = (int(sim.t_ns[0]) - int(real.t_ns[0])) * 1e-9 + found.lag / hz
-    (_, _, near), (lag, alike, sigma) = found.best(np.abs(lag_s) < settings.farthest_s), found.best(np.full(len(lag_s), True))
-    if shared and near > settings.alike_sigma[0]:
+    within = (found.best(np.abs(lag_s) < most_s) for most_s in (settings.farthest_s, settings.offset_s, np.inf))
+    (_, _, near), (_, _, at_0), (lag, alike, sigma) = within
+    if shared and near > settings.alike_sigma[0] and sigma < at_0 + settings.alike_sigma[1]:
         return 0.0
     if sigma < settings.alike_sigma[1] or alike < settings.least_correlation:
         return None

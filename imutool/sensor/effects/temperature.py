@@ -8,17 +8,21 @@ from imutool.errors import DataError
 from imutool.sensor.effect import Effect, Stage, Theta, each_axis
 from imutool.sensor.samples import SensorSamples
 
+OF_IMU = ("imu", "gyro", "accel")  # in the name of a channel: a battery or a motor has a temperature, too
+
 
 def _forward(samples: SensorSamples, k: Theta) -> SensorSamples:
-    """k of the gyro, then of the accelerometer; T0 is the mean of the first channel by name.
+    """k of the gyro, then of the accelerometer; T0 is the mean of the channel.
+
+    Of several temperatures that of an IMU counts, by its name, else the first by name.
 
     Raises:
         DataError: no channel with a temperature in its name.
     """
-    names = sorted(name for name in samples.channels if "temperature" in name.lower())
+    names = [name for name in samples.channels if "temperature" in name.lower()]
     if not names:
         raise DataError("no temperature channel", where="temperature", expected="a channel with temperature in its name")
-    T = samples.channels[names[0]]
+    T = samples.channels[min(names, key=lambda name: (not any(word in name.lower() for word in OF_IMU), name))]
     gyro, accel = (np.outer(own, T - T.mean()).T for own in (k[:3], k[3:]))
     return samples.with_readings(samples.gyro + gyro, samples.accel + accel)
 

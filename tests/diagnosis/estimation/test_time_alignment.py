@@ -193,9 +193,11 @@ def test_clocks_of_one_epoch_are_left_alone_so_that_an_offset_between_them_shows
     there = pair.ideal.sample(pair.stamp_s, pair.stamp_s)
     rate = there.alpha[:, 0]
     assert float(rate @ left(pair)[:, 0] / (rate @ rate)) == pytest.approx(0.02, rel=0.1)  # first order of 20 ms
+    (later,) = with_simulation(*logs(late_s=0.2))  # the search finds this, too
+    assert later.aligned_s == 0.0
 
 
-@pytest.mark.parametrize("away_ns", [YEAR_NS, -YEAR_NS, 3_600_000_000_000])
+@pytest.mark.parametrize("away_ns", [YEAR_NS, -YEAR_NS, 3_600_000_000_000, 700_000_000, -1_500_000_000, 4_900_000_000])
 def test_clocks_without_a_common_epoch_are_aligned_by_the_motion(away_ns: int) -> None:
     (pair,) = with_simulation(*logs(sim_start_ns=planted.START_NS + away_ns))
     assert pair.aligned_s - away_ns * 1e-9 == pytest.approx(0.0, abs=GRID_S)
