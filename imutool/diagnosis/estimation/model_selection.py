@@ -26,11 +26,7 @@ from imutool.diagnosis.estimation.observability import (
     with_steady_clock,
     without_implausible,
 )
-from imutool.diagnosis.estimation.significance import (
-    bic,
-    gain_for,
-    unnamed_count,
-)
+from imutool.diagnosis.estimation.significance import bic, gain_for, unnamed_count
 from imutool.diagnosis.estimation.trial.lag_start import beside_offset, without_unseen_low_pass
 from imutool.diagnosis.estimation.trial.model_error import LowPassError
 from imutool.diagnosis.estimation.trial.selection import Selection
@@ -64,7 +60,8 @@ def select_effects(
     begun = first.pruned(fit(logs, (*always, *begin))) if begin else start
     second = replace(first, candidates=known.copy(), progress=lambda text: None)
     other = Forked(lambda: portable(*_grown(second, begun, *other_order))) if unnamed else None
-    now = (answers := [_grown(first, begun, *order)])[0][1]
+    answers = [_grown(first, begun, *order)]
+    now = answers[0][1]
     doubtful = len(now.chosen) - len(always) >= settings.suspicious_effects or unnamed_count(now) > 0
     if other is not None and doubtful and now.objective > settings.explained_chi_square * now.numbers:
         # many small parts that do not add up, or an unnamed one: perhaps one effect alone is the better answer
