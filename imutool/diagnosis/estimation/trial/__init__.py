@@ -1,1 +1,1 @@
-"""Trial of the chosen effects: on time that no fit has seen, and against a bias that walks."""
+"""Trial of the chosen effects: on unseen time, against a bias that walks and the errors of models."""
