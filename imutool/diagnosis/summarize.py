@@ -99,8 +99,10 @@ def summarize(
         not_identifiable=_not_identifiable(selection, idle, hidden),
         unexplained=unexplained,
         remarks=(
-            *(*selection.remarks, *contradictions(logs, selection)),
-            *(*dict.fromkeys(_remarks(pairs)), *_resting(pairs, hidden), *both_have),
+            *contradictions(logs, selection),
+            *dict.fromkeys(_remarks(pairs, selection)),
+            *_resting(pairs, hidden),
+            *both_have,
         ),
         closer=gains(logs, before, after),
         traces=tuple(
@@ -276,7 +278,8 @@ def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
         yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
 
 
-def _remarks(pairs: Sequence[Pair]) -> Iterator[str]:
+def _remarks(pairs: Sequence[Pair], selection: Selection) -> Iterator[str]:
+    yield from selection.remarks
     for pair in pairs:
         if axes := unusable_axes(pair):
             yield f"{pair.name}: {'; '.join(axes)}. These samples are no measurement; the diagnosis uses all others"

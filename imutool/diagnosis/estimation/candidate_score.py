@@ -6,6 +6,7 @@ from bisect import insort
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
+from itertools import chain
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -13,9 +14,10 @@ import numpy as np
 
 from imutool.array_types import Float, Float64, Int64
 from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit
-from imutool.diagnosis.estimation.jacobians import ForwardPass, effect_jacobian, priors
+from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, effect_jacobian, priors
 from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
+from imutool.diagnosis.estimation.trial.lag_start import lag_taken_back
 from imutool.diagnosis.estimation.unnamed_effects import finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.processes.forked import of_each
@@ -83,11 +85,12 @@ class CandidateScore:
         self.left = self.total - float(self.g @ self.solved_g)
         self.short = [axis.short() for axis in self.axes]
 
-    def linear(self, effect: Effect, start: Theta) -> _Linear:
-        """Derivatives of a candidate beside the fit, and what its start adds."""
+    def linear(self, effect: Effect, begun: Chosen) -> _Linear:
+        """Derivatives of a candidate beside the fit, and what it adds where it has begun."""
+        start = begun[-1][1]
         rows, N = [], np.diag(1.0 / priors(((effect, start),), self.now.settings)[1] ** 2)
         for k, (log, forward) in enumerate(zip(self.logs, self.now.passes, strict=True)):
-            with_it = forward if effect.linear else ForwardPass(log.pair, (*self.now.chosen, (effect, start)), forward)
+            with_it = forward if effect.linear else ForwardPass(log.pair, begun, forward)
             B, added = effect_jacobian(log.whiten, with_it, effect, onsets=False), with_it.added(forward)  # they are searched
             for column in range(log.pair.columns):
                 axis, on = self.axes[log.pair.columns * k + column], B.on(column)
@@ -223,7 +226,9 @@ class Candidates:
         order = [*slowest[::2], *slowest[1::2]]
 
         def scored(effect: Effect) -> tuple[float, Theta, float, list[_Linear]]:
-            linear = [score.linear(effect, start) for start in self.starts[effect.key]]
+            others = score.now.chosen
+            begun = [((*others, (effect, start)), *lag_taken_back(others, effect, start)) for start in self.starts[effect.key]]
+            linear = [score.linear(effect, each) for each in chain(*begun)]
             best = self._best(score, effect, linear)
             return best.log_p, best.start, best.gain, [each.short() for each in linear]
 

@@ -157,7 +157,9 @@ def test_what_the_score_promises_of_a_linear_effect_a_fit_keeps(pair: Pair) -> N
     for name in ("lever_arm", "gyro_scale", "accel_misalignment", "gyro_g_sensitivity"):
         ((physics, nothing),) = planted.acting({name: [0.0] * len(planted.acting({name: []})[0][0].parameters)})
         gained = now.objective - fit([log], (*now.chosen, (physics, nothing))).objective
-        assert panel.gain(physics, panel.linear(physics, nothing)) == pytest.approx(gained, rel=0.01, abs=0.1)
+        assert panel.gain(physics, panel.linear(physics, (*panel.now.chosen, (physics, nothing)))) == pytest.approx(
+            gained, rel=0.01, abs=0.1
+        )
 
 
 def test_the_score_promises_no_more_than_a_step_by_a_factor_of_e(pair: Pair) -> None:
@@ -166,7 +168,7 @@ def test_the_score_promises_no_more_than_a_step_by_a_factor_of_e(pair: Pair) -> 
     now = fit([log], planted.acting({"clock_offset": [0.0], "lever_arm": [0.0] * 3}))
     ((physics, _),) = planted.acting({"low_pass": [2.0]})
     score = CandidateScore([log], now)
-    assert score.gain(physics, score.linear(physics, np.array([2.0]))) < 0.0
+    assert score.gain(physics, score.linear(physics, (*score.now.chosen, (physics, np.array([2.0]))))) < 0.0
     assert physics.stage == Stage.BANDWIDTH
 
 

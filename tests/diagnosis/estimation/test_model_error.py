@@ -16,6 +16,7 @@ from imutool.diagnosis.estimation.trial.model_error import FOLLOWING, OF_MOTION,
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
 from imutool.diagnosis.reference.coverage import without_unseen_offset
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
+from imutool.recording import Recording
 from imutool.sensor import catalogue
 
 SETTINGS = SearchSettings()
@@ -87,6 +88,11 @@ def low_passed(seed: int, vibrates_hz: tuple[float, float], scale: float = 1.0) 
     white = rng.normal(size=(2, len(t[every]), 6))
     real = planted.recording("real", t[every], read[every] + planted.BIAS + noise * white[0])
     sim = planted.recording("sim", t[every], felt[every] + 0.3 * noise * white[1], start_ns=5_000_000_000)
+    return selected(real, sim)
+
+
+def selected(real: Recording, sim: Recording) -> Selection:
+    """Effects that separate a recording from a simulation."""
     settings = DiagnoseSettings()
     pairs = list(with_simulation(real, sim, settings))
     candidates = candidates_for(pairs)
@@ -125,3 +131,19 @@ def test_what_a_simulation_folds_is_no_effect_but_makes_the_low_pass_less_sure()
     assert len(found.selected) == 1
     (remark,) = found.remarks
     assert "accel scale" in remark
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_a_faint_low_pass_beside_a_large_arm_is_told_by_the_gyro_and_not_taken_for_scales(seed: int) -> None:
+    """The offset of clocks without an epoch has its lag; what it takes is a share of 1e-4 of what the arm does."""
+    felt, rng = planted.rich(seed, 60.0), np.random.default_rng(seed)
+    noise = np.array([1e-3] * 3 + [1e-2] * 3)
+    read = planted.ideal(felt, planted.acting({"lever_arm": [0.25, 0.0, 0.1], "low_pass": [15.0]}))
+    real, sim = (x + s * noise * rng.normal(size=x.shape) for x, s in ((read, 1.0), (planted.ideal(felt), 0.3)))
+    found = selected(
+        planted.recording("real", felt.t_s, real + planted.BIAS),
+        planted.recording("sim", felt.t_s, sim, start_ns=5_000_000_000),
+    )
+    arm, filtered = found.selected
+    assert (arm.effect.name, filtered.effect.name) == ("lever_arm", "low_pass")
+    assert abs(filtered.theta[0] - 15.0) < SURE * filtered.std[0] < 1.0

@@ -1,1 +1,1 @@
-"""Trial of the chosen effects: on unseen time, against a bias that walks and the errors of models."""
+"""Trial of the chosen effects: on unseen time, against a walk and the errors of models."""

@@ -22,16 +22,20 @@ def beside_offset(logs: Sequence[WhitenedLog], others: Chosen, effect: Effect, s
     from there end early where a lag is a period of a vibration: the filter is too fast, and other effects take the rest. The
     second begins with the start that leaves least.
     """
-    first = (*others, (effect, starts[0]))
+    begun = [chosen for start in starts for chosen in lag_taken_back(others, effect, start)]
+    best = (
+        [min((fit(logs, chosen, iterations=0) for chosen in begun), key=lambda found: found.objective).chosen] if begun else []
+    )
+    return [(*others, (effect, starts[0])), *best]
+
+
+def lag_taken_back(others: Chosen, effect: Effect, start: Theta) -> list[Chosen]:
+    """Effects with a low-pass whose lag a clock offset no longer takes; none without both."""
     place = next((k for k, (other, _) in enumerate(others) if other.name == "clock_offset"), None)
     if place is None or effect.lagless is None:
-        return [first]
+        return []
     offset, tau_s = others[place]
-    begun = [
-        (*others[:place], (offset, tau_s + np.array([low_pass.lag_s(start)])), *others[place + 1 :], (effect, start))
-        for start in starts
-    ]
-    return [first, min((fit(logs, chosen, iterations=0) for chosen in begun), key=lambda found: found.objective).chosen]
+    return [(*others[:place], (offset, tau_s + np.array([low_pass.lag_s(start)])), *others[place + 1 :], (effect, start))]
 
 
 def without_unseen_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect], settings: SearchSettings) -> Fit:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -11,7 +11,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
-from imutool.diagnosis.estimation.noise_estimate import is_coloured_noise
+from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise
 from imutool.diagnosis.estimation.observability import beyond_the_band, unidentified
 from imutool.diagnosis.estimation.significance import (
     Scatter,
@@ -139,8 +139,20 @@ class Trial:
             return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
 
         below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
+        below = frozenset(key for key in below & gains.keys() if not self._shown_elsewhere(key, gains, whole))
         below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
+
+    def _shown_elsewhere(self, key: str, gains: Mapping[str, float], whole: Fit) -> bool:
+        """Whether an effect explains more than chance on a sensor on which no larger one acts, and errs."""
+        (effect,) = (effect for effect, _ in whole.chosen if effect.key == key)
+        larger = {name for other, _ in whole.chosen if gains.get(other.key, 0.0) > gains[key] for name in other.sensors}
+        columns = [whole.logs[0].pair.signals[name] for name in effect.sensors if name not in larger]
+        if not columns:
+            return False
+        others = tuple(entry for entry in whole.chosen if entry[0] is not effect)
+        gained = axis_squares(fit(whole.logs, others, part=whole.part, near=whole)) - axis_squares(whole)
+        return self.candidates.log_p(effect, float(sum(gained[part].sum() for part in columns))) < self.threshold
 
     def _may_be_error(self, effect: Effect, whole: Fit) -> bool:
         """Whether an effect of a fit may be the error of its low-pass."""
