@@ -59,8 +59,7 @@ def summarize(
 
     `reals` are paths by the name of a log, `hidden` the unobservable parameters of the catalogue.
     """
-    pairs = [log.pair for log in logs]
-    noise = noise_floor(logs)
+    pairs, noise = [log.pair for log in logs], noise_floor(logs)
     exact = all(pair.exact for pair in pairs)
     # digits are a sample's, and a row beside poses is the mean of many
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
