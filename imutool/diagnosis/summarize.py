@@ -74,13 +74,9 @@ def summarize(
     findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
     both, chosen = zip(selection.selected, named, strict=True), selection.fitted.chosen
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
-    clock = chosen[: selection.always]  # where logs share no epoch
-    expected_too |= {effect.key for effect, _ in clock}
+    expected_too |= {effect.key for effect, _ in (clock := chosen[: selection.always])}  # where logs share no epoch
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
-    p_values = {
-        signal: min((f.p_value for f in findings if f.effect != JITTER and f.signal in (signal, "both")), default=1.0)
-        for signal in ("gyro", "accel")
-    }
+    p_values = {signal: _p_value(findings, signal) for signal in SENSORS}
     discounted = expected_too | {JITTER}  # where stamps are wrong, signals are not
     baseline = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in discounted)) for pair in pairs]
     unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
@@ -275,6 +271,11 @@ def _resting(pairs: Sequence[Pair], hidden: Sequence[str]) -> Iterator[str]:
     if "clock_offset" in hidden:
         names = ", ".join(dict.fromkeys(pair.name for pair in pairs))
         yield f"{names}: too little motion for anything but a bias, its drift, noise, digits and vibration"
+
+
+def _p_value(findings: Sequence[Finding], signal: str) -> float:
+    """Least p-value of the findings of a signal."""
+    return min((f.p_value for f in findings if f.effect != JITTER and f.signal in (signal, "both")), default=1.0)
 
 
 def _remarks(pairs: Sequence[Pair], selection: Selection) -> Iterator[str]:
