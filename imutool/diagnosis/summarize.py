@@ -61,9 +61,8 @@ def summarize(
     """
     pairs, noise = [log.pair for log in logs], noise_floor(logs)
     exact = all(pair.exact for pair in pairs)
-    # digits are a sample's, and a row beside poses is the mean of many
     sample = noise if exact else np.asarray(np.median([white_noise(pair.real) for pair in pairs], axis=0))
-    digits = timestamps.rounded(pairs, sample)
+    digits = timestamps.rounded(pairs, sample)  # are a sample's, and a row beside poses is the mean of many
     selection, named, idle = _worthwhile(logs, selection, noise, digits)
     after = [with_effects(pair, selection.fitted.chosen) for pair in pairs]  # held-out time stays unseen
     all_findings = [*named, *timestamps.saturated(pairs, after, selection.tried), *timestamps.dropped(pairs), *digits]
@@ -74,7 +73,8 @@ def summarize(
     findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
     both, chosen = zip(selection.selected, named, strict=True), selection.fitted.chosen
     expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
-    expected_too |= {effect.key for effect, _ in (clock := chosen[: selection.always])}  # where logs share no epoch
+    clock = chosen[: selection.always]  # where logs share no epoch
+    expected_too |= {effect.key for effect, _ in clock}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {signal: _p_value(findings, signal) for signal in SENSORS}
     discounted = expected_too | {JITTER}  # where stamps are wrong, signals are not
