@@ -76,7 +76,7 @@ def summarize(
     clock = chosen[: selection.always]  # where logs share no epoch
     expected_too |= {effect.key for effect, _ in clock}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
-    p_values = {signal: _p_value(findings, signal) for signal in SENSORS}
+    p_values = {str(signal): _p_value(findings, signal) for signal in SENSORS}
     discounted = expected_too | {JITTER}  # where stamps are wrong, signals are not
     baseline = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in discounted)) for pair in pairs]
     unexplained = unexplained_residuals(logs, after, noise, settings.held_out)
