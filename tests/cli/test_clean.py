@@ -198,6 +198,12 @@ def test_a_page_escapes_what_comes_from_the_log(folder: Path) -> None:
     assert "\u202e" not in page
 
 
+def test_a_page_says_yes_instead_of_true(folder: Path) -> None:
+    found = survey(folder / "spoiled.mcap")
+    rested = replace(found.findings[0], values={"at_rest": True})
+    assert "at rest yes" in cleaning_page.html([replace(found, findings=(rested,))])
+
+
 def test_a_page_of_a_log_cleaned_with_force_does_not_deny_it(folder: Path) -> None:
     found = replace(survey(folder / "spoiled.mcap"), reasons=("nobody trusts it",))
     assert "it is not cleaned" in cleaning_page.html([found])

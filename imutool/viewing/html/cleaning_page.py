@@ -12,7 +12,7 @@ from imutool.mcap_io.storage.target import Target
 from imutool.viewing.html.page import document, text
 
 VERDICTS = {
-    "good": "no faults",
+    "good": "no sample has a fault",
     "usable": "usable; the clean channel leaves out invalid samples, as listed below",
     "quarantine": "not trustworthy; it is not cleaned",
 }
@@ -72,6 +72,8 @@ def _as_text(value: Any) -> str:
         return ", ".join(f"{name.replace('_', ' ')} {_as_text(inner)}" for name, inner in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(map(_as_text, value))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
