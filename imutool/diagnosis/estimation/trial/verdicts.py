@@ -133,13 +133,17 @@ class Trial:
         gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
         left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
 
-        def hidden(iterations: int | None) -> frozenset[str]:
-            more = {key: gain_of(whole, k, iterations)[0] for key, k in left.items()} if FOLLOWING & gains.keys() else {}
-            denoised = any(log.pair.denoised for log in self.logs)
-            return below_model_error(gains | more, self.settings, denoised=denoised, poses=not exact)
+        def with_left(iterations: int | None) -> dict[str, float]:
+            return gains | {key: gain_of(whole, k, iterations)[0] for key, k in left.items() if FOLLOWING & gains.keys()}
 
-        below = hidden(0) & gains.keys() and hidden(None)  # no fit of the others leaves more than its start
-        below = frozenset(key for key in below & gains.keys() if not self._shown_elsewhere(key, gains, whole))
+        def hidden(every: Mapping[str, float]) -> frozenset[str]:
+            denoised = any(log.pair.denoised for log in self.logs)
+            return below_model_error(every, self.settings, denoised=denoised, poses=not exact) & gains.keys()
+
+        below = frozenset[str]()
+        if hidden(with_left(0)):  # no fit of the others leaves more than its start
+            every = with_left(None)
+            below = frozenset(key for key in hidden(every) if not self._shown_elsewhere(key, every, whole))
         below |= {one.effect.key for one in verdicts if self._may_be_error(one.effect, whole)}
         return [replace(verdict, false_discovery_rate=1.0) if verdict.effect.key in below else verdict for verdict in verdicts]
 
