@@ -8,11 +8,18 @@ from scipy.signal import butter, sosfilt, sosfilt_zi
 from support import planted
 
 from imutool.diagnosis.diagnose import candidates_for
+from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import without_second_orders
 from imutool.diagnosis.estimation.time_alignment import with_simulation
-from imutool.diagnosis.estimation.trial.model_error import FOLLOWING, OF_MOTION, below_model_error
+from imutool.diagnosis.estimation.trial.model_error import (
+    FOLLOWING,
+    OF_MOTION,
+    LowPassError,
+    below_model_error,
+    with_low_pass_error,
+)
 from imutool.diagnosis.estimation.trial.selection import SelectedEffect, Selection
 from imutool.diagnosis.reference.coverage import without_unseen_offset
 from imutool.diagnosis.settings import DiagnoseSettings, SearchSettings
@@ -147,3 +154,10 @@ def test_a_faint_low_pass_beside_a_large_arm_is_told_by_the_gyro_and_not_taken_f
     arm, filtered = found.selected
     assert (arm.effect.name, filtered.effect.name) == ("lever_arm", "low_pass")
     assert abs(filtered.theta[0] - 15.0) < SURE * filtered.std[0] < 1.0
+
+
+def test_what_is_larger_than_a_low_pass_says_nothing_of_its_error() -> None:
+    now = fit([planted.weighed(planted.pair(planted.rich()))], ())
+    selection, error = Selection((), now, now, 1), LowPassError(size=100.0, squares=0.1, cutoff_hz=CUTOFF_HZ)
+    assert with_low_pass_error(selection, error, {"accel_scale": 101.0}) is selection
+    assert with_low_pass_error(selection, error, {"accel_scale": 101.0, "lever_arm": 99.0}).within_error == ("lever_arm",)

@@ -23,10 +23,8 @@ def beside_offset(logs: Sequence[WhitenedLog], others: Chosen, effect: Effect, s
     second begins with the start that leaves least.
     """
     begun = [chosen for start in starts for chosen in lag_taken_back(others, effect, start)]
-    best = (
-        [min((fit(logs, chosen, iterations=0) for chosen in begun), key=lambda found: found.objective).chosen] if begun else []
-    )
-    return [(*others, (effect, starts[0])), *best]
+    fits = sorted((fit(logs, chosen, iterations=0) for chosen in begun), key=lambda found: found.objective)
+    return [(*others, (effect, starts[0])), *(found.chosen for found in fits[:1])]
 
 
 def lag_taken_back(others: Chosen, effect: Effect, start: Theta) -> list[Chosen]:

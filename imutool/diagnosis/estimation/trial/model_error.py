@@ -104,14 +104,15 @@ def _slow_squares(found: Fit, most_hz: float) -> float:
 
 def with_low_pass_error(selection: Selection, error: LowPassError, left: Mapping[str, float]) -> Selection:
     """Selection with a low-pass less sure, by the gains of effects that show its error."""
-    if not left:
+    shown = {name: gain for name, gain in left.items() if gain < error.size}
+    if not shown:
         return selection
-    share = SEEN_ERROR * float(np.sqrt(max(left.values()) / error.size))
+    share = SEEN_ERROR * float(np.sqrt(max(shown.values()) / error.size))
     return replace(
         selection,
         selected=tuple(
             replace(one, std=np.hypot(one.std, share * one.theta)) if one.effect.name in LOW_PASSES else one
             for one in selection.selected
         ),
-        within_error=tuple(left),
+        within_error=tuple(shown),
     )

@@ -46,10 +46,9 @@ class Selection:
         """What is no finding because it may be the error of a low-pass."""
         if not self.within_error:
             return ()
-        share = self.whole.logs[0].pair.settings.search.model_error_denoised ** 0.5
         names = ", ".join(name.replace("_", " ") for name in self.within_error)
-        why = f"a low-pass may err by {share:.0%} of what it does, because a simulation's samples fold its vibrations"
-        return (f"{names}: too small to tell beside the low-pass; {why}",)
+        why = "may be the error of the low-pass (the samples of a simulation alias its vibrations)"
+        return (f"{names}: more than chance, but {why}, so not among the findings",)
 
 
 def without(found: Selection, keys: Collection[str]) -> Selection:
