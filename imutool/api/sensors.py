@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -10,6 +11,7 @@ import msgspec
 from imutool import diagnosis_output
 from imutool.api import NamedProgress, checked, given_logs
 from imutool.diagnosis.result import Diagnosis
+from imutool.diagnosis.second_simulation import along_samples
 from imutool.errors import ConfigError
 from imutool.file_location import LogPath, local, location, several
 from imutool.mcap_io.storage import output_conflicts
@@ -52,10 +54,11 @@ def simulate(
     rate_hz: float | None = None,
     seed: int = 0,
     truth: str | None = None,
+    imu: str | None = None,
     overwrite: bool = False,
     progress: NamedProgress | None = None,
 ) -> Simulation:
-    """Simulate an IMU along the true poses of a log, and write the log.
+    """Simulate an IMU along the true poses of a log, or from a simulator's samples.
 
     Args:
         trajectory: MCAP log with poses.
@@ -65,11 +68,12 @@ def simulate(
         rate_hz: Sample rate; by default that of the log's IMU, otherwise 200 Hz.
         seed: Seed of the noise.
         truth: Pose topic; by default the first.
+        imu: Topic of a simulated IMU whose samples, without their white noise, are the ideal signals instead of the poses.
         overwrite: Replace an existing log.
         progress: Callback with steps done, steps in all, and the current step.
 
     Returns:
-        `recording`, the smoothed `motion`, and `remarks`.
+        `recording`, the smoothed `motion` (None with `imu`), and `remarks`.
 
     Raises:
         ConfigError: A setting, a settings file, or an existing log.
@@ -93,6 +97,7 @@ def simulate(
         truth=truth,
         overwrite=overwrite,
         progress=progress,
+        along=None if imu is None else partial(along_samples, imu=imu),
     )
 
 

@@ -18,7 +18,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {  # by name: the module, and the firs
     "vio": ("evaluate", "Score a visual-inertial estimate on the log's IMU, raw and with each model."),
     "view": ("view", "Show truth, raw and debiased: in the Rerun viewer, in a browser, or as files."),
     "live": ("live", "Debias a stream of samples as it comes, show it, and measure the delay."),
-    "simulate": ("simulate", "Simulate an IMU along the poses of a log, with a sensor's physics and noise."),
+    "simulate": ("simulate", "Simulate an IMU, with a sensor's physics and noise."),
     "conceal": ("simulate", "Make a sealed blind case, or open one and score the findings."),
     "diagnose": ("diagnose", "Find physics that a simulation leaves out, by comparison with a recording."),
     "audit": ("diagnose", "Find the errors of a simulator's IMU, without a recording."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +31,8 @@ class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulatio
 
     command: str
     trajectory: str
-    truth: str
+    truth: str | None
+    imu: str | None
     physics: dict[str, Any]
     noise: dict[str, Any]
     rate_hz: float
@@ -39,7 +41,7 @@ class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulatio
     samples: int
     duration_s: float
     stretches_s: list[list[float]]
-    motion: MotionQuality
+    motion: MotionQuality | None
     remarks: list[str]
 
 
@@ -54,11 +56,23 @@ def simulate(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     truth: Truth = None,
+    imu: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="Start from the samples of this simulated IMU, instead of the poses."),
+    ] = None,
     common: Common = COMMON,
 ) -> None:
-    """Simulate an IMU along the poses of a log, with a sensor's physics and noise."""
+    """Simulate an IMU, with a sensor's physics and noise.
+
+    It moves along the poses of a log, or as the samples of a simulated IMU say.
+    """
     from imutool.sensor.simulate import simulate as run
 
+    along = None
+    if imu is not None:
+        from imutool.diagnosis.second_simulation import along_samples
+
+        along = partial(along_samples, imu=imu)
     with common.progress("Simulating") as tell:
         simulation = run(
             trajectory,
@@ -70,21 +84,25 @@ def simulate(
             truth=truth,
             overwrite=common.overwrite,
             progress=tell,
+            along=along,
         )
         for remark in simulation.remarks:
             logger.warning("%s", remark)
     values = {key: value for key, value in simulation.plain().items() if key != "schema"}
-    report = SimulationReport(**values | {"motion": MotionQuality(**values["motion"])})
+    motion = None if values["motion"] is None else MotionQuality(**values["motion"])
+    report = SimulationReport(**values | {"motion": motion})
     if common.write(report):
         return
     acting = [effect["name"] for effect in report.physics["effect"] if not effect["column"]]
     acting += [f"a curve of {curve['variable']}" for curve in report.physics["unknown"]]
     acting += [term["term"] for term in report.physics["term"]] + ["bias"] * (report.physics["bias"] is not None)
     names = ", ".join(acting) or "ideal"
-    pieces = len(simulation.motion.stretches)
+    pieces = len(report.stretches_s)
     where = f"{report.duration_s:.1f} s" + (f" in {pieces} stretches" if pieces > 1 else "")
     say(f"{target}: {report.samples} samples at {report.rate_hz:g} Hz over {where}; physics {names}; noise {noise}")
-    motion = report.motion
+    if motion is None:
+        say(f"from the samples of {report.imu}, without their white noise")
+        return
     std = f"{motion.gyro_std_rad_s:.2g} rad/s and {motion.accel_std_m_s2:.2g} m/s²"
     say(f"uncertainty of the motion {std}; {motion.glitches} outliers and {motion.steps} jumps of the poses removed")
 

@@ -1,4 +1,4 @@
-"""Second simulation with found physics, along the first one's poses or samples.
+"""Simulation along the samples of another one, and the second simulation with found physics.
 
 A simulator's IMU often sits elsewhere than its poses, or has physics of its own. What is found is the difference to its
 samples, so a simulation along its poses alone would lose what the first one has. Its samples then are the ideal signals.
@@ -6,16 +6,18 @@ samples, so a simulation along its poses alone would lose what the first one has
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from imutool.array_types import Bool, Float64
 from imutool.diagnosis.audit.simulation import imu_in, read_simulation
 from imutool.diagnosis.diagnose import read_log
+from imutool.diagnosis.estimation.aligned_log import DEFAULT
 from imutool.diagnosis.estimation.time_alignment import LEAST_NOISE, same_motion, with_simulation
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.errors import ImutoolError
@@ -23,14 +25,13 @@ from imutool.file_location import Location
 from imutool.inertial.stationary import white_noise
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
-from imutool.mcap_io.write import write
 from imutool.noise.datasheet import Noise
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 from imutool.sensor import physics_file
-from imutool.sensor.channels import with_channels
-from imutool.sensor.effect import simulate_stretches
-from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.simulate import needs_channels, simulate, simulated
+from imutool.sensor.channels import needs_channels, with_channels
+from imutool.sensor.effect import Acting
+from imutool.sensor.physics_file_terms import additive_noise
+from imutool.sensor.simulate import LEAST_S, Simulation, even_stamps, of_noise, simulate, simulated, taken
 
 OF_NOISE = 1.5  # times a simulation's own noise, by which an ideal sensor along its poses may differ from its samples
 
@@ -47,22 +48,57 @@ def simulate_again(
         ConfigError: the target exists.
         DataError: an effect lacks a channel.
     """
-    file = physics_file.read(physics)
-    topic = imu_in(sim, imu)
-    if not needs_channels(file.acting(where=physics)) and _is_ideal(read(sim, imu=topic)):  # poses as `simulate` takes them
-        simulate(sim, out, physics=physics, overwrite=overwrite)
-        return
-    simulation, _ = read_simulation(sim, imu=topic)  # of the sensor, in a world whose z is up
-    with Log(real) as log:
-        recording = read_log(real, imu=imu or log.imu_topics[0])
-    if same_motion(recording.imu, simulation.imu, settings.alignment):
-        recording = with_channels(recording, real).recording
-    else:
-        recording = with_channels(simulation, sim).recording
-    about = {"command": "diagnose", "simulation": sim.name, "physics": json.dumps(physics_file.plain(file), ensure_ascii=False)}
-    again = _along_samples(simulation, recording, file, settings)
-    metadata = {**simulation.metadata, "imutool": about}
-    write(replace(again, name=out.stem, metadata=metadata), out, overwrite=overwrite)
+    topic, along = imu_in(sim, imu), None
+    needs = needs_channels(physics_file.read(physics).acting(where=physics))
+    if needs or not _is_ideal(read(sim, imu=topic)):  # poses as `simulate` takes them
+        with Log(real) as log:
+            recording = read_log(real, imu=imu or log.imu_topics[0])
+        along = partial(along_samples, imu=topic, beside=with_channels(recording, real).recording, settings=settings)
+    simulate(sim, out, physics=physics, overwrite=overwrite, along=along)
+
+
+def along_samples(
+    sim: Path,
+    truth: str | None,
+    acting: Acting,
+    start_ns: int | None,
+    noise: Noise,
+    rate_hz: float | None,
+    seed: int,
+    *,
+    imu: str | None,
+    beside: Recording | None = None,
+    settings: DiagnoseSettings = DEFAULT,
+) -> Simulation:
+    """Simulation whose samples, without their white noise, are the ideal signals of a sensor.
+
+    A recording `beside` it, of the same motion, tells more of the samples' noise, and has the channels.
+
+    Raises:
+        ConfigError, LogError: the log cannot be read, or has no such IMU.
+        DataError: the samples last for less than 2 s, or an effect lacks a channel.
+    """
+    found, _ = read_simulation(sim, imu=imu, truth=truth)  # of the sensor, in a world whose z is up
+    if beside is None or not same_motion(beside.imu, found.imu, settings.alignment):
+        beside = None
+    own = with_channels(found, sim).recording if beside is None and needs_channels(acting) else found
+    short = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, least_s=LEAST_S))
+    pairs = with_simulation(own if beside is None else beside, found, short, own_poses=beside is None)
+    ideals, clock_ns = [pair.ideal for pair in pairs], int(found.imu.t_ns[0]) if beside is None else int(beside.imu.t_ns[0])
+    sim_ns = clock_ns + nanoseconds(pairs[0].aligned_s)
+    own_s = seconds(found.imu.t_ns, sim_ns)
+    stamps = [even_stamps(x, rate_hz) if rate_hz else own_s[(own_s >= x.t_s[0]) & (own_s <= x.t_s[-1])] for x in ideals]
+    rate_hz = 1.0 / found.imu.period_s if rate_hz is None else rate_hz
+    started_s = None if start_ns is None else (start_ns - clock_ns) * 1e-9
+    out = taken(ideals, stamps, [*acting, (additive_noise(noise, rate_hz, seed), np.zeros(0))], started_s)
+    t_ns = sim_ns + np.round(out.stamp_s * 1e9).astype(np.int64)
+    return Simulation(
+        replace(found, imu=Imu(t_ns, out.gyro, out.accel), scalars={}, frames={}),
+        None,
+        tuple((float(x.t_s[0] - ideals[0].t_s[0]), float(x.t_s[-1] - ideals[0].t_s[0])) for x in ideals),
+        {"truth": next(iter(found.truths), None), "imu": found.imu_topic, "rate_hz": rate_hz, "seed": seed},
+        tuple(of_noise(noise, rate_hz)),
+    )
 
 
 def _is_ideal(sim: Recording) -> bool:
@@ -88,14 +124,3 @@ def _at(imu: Imu, stamps: Imu) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarr
 
 def _columns(imu: Imu) -> Float64[np.ndarray, "n 6"]:
     return np.concatenate([imu.gyro, imu.accel], axis=1)
-
-
-def _along_samples(sim: Recording, real: Recording, physics: PhysicsFile, settings: DiagnoseSettings) -> Recording:
-    """Simulation whose own samples, without their noise, are the ideal signals of a sensor with some physics."""
-    pairs = with_simulation(real, sim, settings)
-    stamp_s = seconds(sim.imu.t_ns, int(real.imu.t_ns[0]) + nanoseconds(pairs[0].aligned_s))
-    ideals = [pair.ideal for pair in pairs]
-    stamps = [stamp_s[(stamp_s >= ideal.t_s[0]) & (stamp_s <= ideal.t_s[-1])] for ideal in ideals]
-    out = simulate_stretches(ideals, stamps, physics.acting())
-    rows = np.searchsorted(stamp_s, out.stamp_s)
-    return replace(sim, imu=Imu(sim.imu.t_ns[rows], out.gyro, out.accel), scalars={}, frames={})

@@ -17,6 +17,8 @@ from imutool.mcap_io.codec.schemas import IMU, TF
 from imutool.mcap_io.fields import Fields, others
 from imutool.mcap_io.log import Log
 from imutool.recording import Recording, Scalars, seconds
+from imutool.sensor.effect import Acting
+from imutool.sensor.physics_file_terms import DRIVEN
 from imutool.units import AXES
 
 MOST_READ, MOST_TRIED = 200, 6  # fields of a log that are read, and those that become channels
@@ -66,6 +68,11 @@ def with_channels(recording: Recording, path: Location) -> Channels:
     added, untried = _distinct(names, varying, scalars, recording)
     new = {name: Scalars(varying[name].t_ns, varying[name].values[:, None], varying[name].unit) for name in added}
     return Channels(replace(recording, scalars={**scalars, **new}), added, untried)
+
+
+def needs_channels(acting: Acting) -> bool:
+    """Whether an effect follows another number of the log, such as a temperature."""
+    return any(effect.needs or effect.name == DRIVEN for effect, _ in acting)
 
 
 def brought_by_reference(topic: str, recording: Recording) -> bool:

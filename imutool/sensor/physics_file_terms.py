@@ -1,4 +1,4 @@
-"""Effects without a name in physics.toml: constant bias, driven gain, curve, product."""
+"""Effects without a name: constant bias, driven gain, curve, product and noise."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.errors import DataError
+from imutool.noise import datasheet
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.samples import SensorSamples
 from imutool.units import AXES, UNITS, Sensor
 
 DRIVEN = "driven"
 # Within the stage SENSOR effects act by name. What has no name was learned from the ideal signals and comes first, upper case
-# sorting before lower; a bias comes last, so that no scale acts on it.
-UNKNOWN, BIAS = "Unknown", "~bias"
+# sorting before lower; a bias and noise come last, so that no scale acts on them, and before the converter.
+UNKNOWN, BIAS, NOISE = "Unknown", "~bias", "~noise"
 
 Variable = Callable[[SensorSamples], Float64[np.ndarray, " n"]]
 
@@ -147,3 +148,27 @@ def _channel(samples: SensorSamples, name: str) -> Float64[np.ndarray, " n"]:
         listed = ", ".join(sorted(samples.channels)) or "(none)"
         raise DataError(f"no channel {name}", where="physics", expected=f"one of the log's channels: {listed}")
     return samples.channels[name]
+
+
+def additive_noise(noise: datasheet.Noise, rate_hz: float, seed: int) -> Effect:
+    """Effect of white noise and a walking bias, each from its own stream.
+
+    Unknown densities are zero.
+    """
+    densities = {name: np.nan_to_num(noise.values(name)) for name in datasheet.UNITS}
+    colour = noise.colour if noise.colour is not None and noise.colour.holds_at(rate_hz) else None
+
+    def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
+        dt = np.diff(samples.stamp_s, prepend=samples.stamp_s[0])[:, None]  # a walk goes on in a hole
+        out, coloured = [], None
+        if colour is not None:
+            readings = np.concatenate([samples.gyro, samples.accel], axis=1)
+            coloured = colour.drawn(samples.stamp_s, readings, np.random.default_rng([seed, 2]))
+        for k, (name, values) in enumerate((("gyro", samples.gyro), ("accel", samples.accel))):
+            white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
+            bias = np.cumsum(densities[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
+            noise = white if coloured is None else coloured[:, 3 * k : 3 * k + 3]
+            out.append(values + densities[f"{name}_density"] * np.sqrt(rate_hz) * noise + bias)
+        return samples.with_readings(*out)
+
+    return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)

@@ -10,7 +10,7 @@ that spectrum at its own rate, and follows the motion as it did when it was reco
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,10 +26,10 @@ from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
 from imutool.sensor import physics_file
-from imutool.sensor.channels import channels_at, with_channels
-from imutool.sensor.effect import Acting, Effect, Stage, Theta, simulate_stretches
+from imutool.sensor.channels import channels_at, needs_channels, with_channels
+from imutool.sensor.effect import Acting, simulate_stretches
 from imutool.sensor.physics_file import PhysicsFile
-from imutool.sensor.physics_file_terms import DRIVEN
+from imutool.sensor.physics_file_terms import additive_noise
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.trajectory import SmoothMotion, smooth_motion
 
@@ -40,17 +40,17 @@ LEAST_S = 2.0  # of trusted motion
 MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act there before samples are taken
 MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples; the truth that it was smoothed from is copied
 TRUTH_TOPIC = "/ground_truth/pose"
-NOISE = "~noise"  # within the stage SENSOR effects act by name: behind all, and before the converter
 
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Simulated recording, its smooth motion, settings and remarks."""
+    """Simulated recording, its smooth motion (None along samples), settings and remarks."""
 
     recording: Recording
-    motion: SmoothMotion = field(repr=False)
+    motion: SmoothMotion | None = field(repr=False)
+    stretches_s: Sequence[tuple[float, float]]
     settings: Mapping[str, Any] = field(repr=False)
     remarks: tuple[str, ...]
 
@@ -61,9 +61,10 @@ class Simulation:
             "schema": SCHEMA,
             **self.settings,
             "samples": len(self.recording.imu),
-            "duration_s": motion.duration_s,
-            "stretches_s": [[part.start_s, part.end_s] for part in motion.stretches],
-            "motion": {
+            "duration_s": sum(end_s - start_s for start_s, end_s in self.stretches_s),
+            "stretches_s": [list(stretch) for stretch in self.stretches_s],
+            "motion": motion
+            and {
                 "pose_noise_m": [part.noise_m for part in motion.stretches],
                 "pose_noise_rad": [part.noise_rad for part in motion.stretches],
                 "cutoff_hz": [list(part.cutoff_hz) for part in motion.stretches],
@@ -74,6 +75,10 @@ class Simulation:
             },
             "remarks": list(self.remarks),
         }
+
+
+# from a log, its pose topic, effects, the stamp from which they count, noise, rate and seed
+Along = Callable[[Path, str | None, Acting, int | None, noises.Noise, float | None, int], Simulation]
 
 
 def simulate(
@@ -87,11 +92,12 @@ def simulate(
     truth: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    along: Along | None = None,
 ) -> Simulation:
     """Simulate an IMU along the poses of a log and write the log `out`; see `simulated`.
 
     `physics` is a physics.toml, `noise` a data sheet's name or a TOML file. Without `rate_hz` the rate is that of the log's own
-    first IMU, 200 Hz where it has none.
+    first IMU, 200 Hz where it has none. `along` makes the simulation of other signals of the log than its poses.
 
     Raises:
         ConfigError: a setting, a file of settings or the target.
@@ -104,33 +110,39 @@ def simulate(
     sheet = noises.read(noise)
     if out.exists() and out.samefile(trajectory):
         raise ConfigError("is the trajectory itself", where=out, expected="another OUT")
-    report(0, 4, "reading")
-    source = _source(trajectory, truth, channels=needs_channels(acting))
-    own_rate = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
-    report(1, 4, "smoothing")
+    _check(rate_hz, seed)
+    report(0, 2, "simulating")
     try:
-        rate_hz = _rounded(own_rate) if rate_hz is None else rate_hz
-        simulation = simulated(source, acting, sheet, rate_hz, seed, start_ns=file.start_ns)
+        simulation = (along or _along_poses)(trajectory, truth, acting, file.start_ns, sheet, rate_hz, seed)
     except ImutoolError as error:
         raise error.at(trajectory) from error
-    report(2, 4, "writing")
+    report(1, 2, "writing")
     settings = {
         "command": "simulate",
         "trajectory": trajectory.name,
-        "truth": next(iter(source.truths)),
         "physics": physics_file.plain(file),
         "noise": noises.plain(sheet) | {"name": str(noise)},
         **simulation.settings,
     }
     texts = {key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in settings.items()}
-    recording = replace(simulation.recording, name=out.stem, metadata={**source.metadata, "imutool": texts})
+    recording = replace(simulation.recording, name=out.stem, metadata={**simulation.recording.metadata, "imutool": texts})
     write(recording, out, overwrite=overwrite)
-    report(4, 4, "")
+    report(2, 2, "")
     others = (
         f"{entry.name} of {entry.column} is no effect of an IMU, and not simulated" for entry in file.effect if entry.column
     )
     remarks = (*simulation.remarks, *others)
     return replace(simulation, recording=recording, settings=settings | {"output": str(out)}, remarks=remarks)
+
+
+def _along_poses(
+    path: Path, truth: str | None, acting: Acting, start_ns: int | None, noise: noises.Noise, rate_hz: float | None, seed: int
+) -> Simulation:
+    source = _source(path, truth, channels=needs_channels(acting))
+    own_hz = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
+    found = simulated(source, acting, noise, _rounded(own_hz) if rate_hz is None else rate_hz, seed, start_ns=start_ns)
+    settings = {"truth": next(iter(source.truths)), "imu": None, **found.settings}
+    return replace(found, recording=replace(found.recording, metadata=source.metadata), settings=settings)
 
 
 def simulated(
@@ -140,17 +152,13 @@ def simulated(
 
     Samples cover every trusted stretch. Stamps are whole periods after the first pose, on the poses' clock. Samples that an
     effect of the clock takes outside a stretch are left out. The true poses in a stretch are copied as they are;
-    `/motion/pose` holds the motion itself. Effects count time from `start_ns`, or from the first sample where the two lie
-    further apart than the motion lasts, so that it is another one.
+    `/motion/pose` holds the motion itself. Effects count time from `start_ns`; see `taken`.
 
     Raises:
         ConfigError: the rate or the seed.
         DataError: no poses, less than 2 s of the motion can be trusted, an effect lacks a channel.
     """
-    if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-        raise ConfigError(f"a rate of {rate_hz:g} Hz", where="rate_hz", expected=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
-    if seed < 0:
-        raise ConfigError(f"seed {seed} is negative", where="seed", expected="0 or more")
+    _check(rate_hz, seed)
     motion = smooth_motion(source.truth)
     if motion.duration_s < LEAST_S:
         raise DataError(
@@ -158,40 +166,52 @@ def simulated(
             expected=f"{LEAST_S:g} s of poses without a hole, and more",
             fix="Give a longer trajectory",
         )
-    remarks = _remarks(motion, source.truth, noise, rate_hz)
     ideals = motion.ideal_motions(rate_hz * max(1, int(np.ceil(MOTION_HZ / rate_hz))))
     needed = needs_channels(acting)
     if needed:
         ideals = [replace(ideal, channels=channels_at(source, ideal.t_s, motion.start_ns)) for ideal in ideals]
-    stamps = [_stamps(ideal, rate_hz) for ideal in ideals]
-    begins_s, started_s = float(stamps[0][0]), np.inf if start_ns is None else (start_ns - motion.start_ns) * 1e-9
-    begins_s = started_s if abs(started_s - begins_s) < stamps[-1][-1] - begins_s else begins_s
-    since = [replace(ideal, t_s=ideal.t_s - begins_s) for ideal in ideals]
-    out = simulate_stretches(
-        since, [part - begins_s for part in stamps], [*acting, (_noise(noise, rate_hz, seed), np.zeros(0))]
-    )
-    imu = Imu(_nanoseconds(motion, out.stamp_s + begins_s), out.gyro, out.accel)
+    stamps = [even_stamps(ideal, rate_hz) for ideal in ideals]
+    started_s = None if start_ns is None else (start_ns - motion.start_ns) * 1e-9
+    out = taken(ideals, stamps, [*acting, (additive_noise(noise, rate_hz, seed), np.zeros(0))], started_s)
     inside = motion.covers(source.truth.t_ns)
     return Simulation(
         Recording(
             name=source.name,
-            imu=imu,
+            imu=Imu(_nanoseconds(motion, out.stamp_s), out.gyro, out.accel),
             truths={TRUTH_TOPIC: source.truth.rows(inside), MOTION_TOPIC: _exact(motion, ideals, stamps)},
             scalars=dict(source.scalars) if needed else {},
             source=source.source,
         ),
         motion,
+        tuple((part.start_s, part.end_s) for part in motion.stretches),
         {"rate_hz": rate_hz, "seed": seed},
-        remarks,
+        (*_of_poses(motion, source.truth), *of_noise(noise, rate_hz)),
     )
 
 
-def needs_channels(acting: Acting) -> bool:
-    """Whether an effect follows another number of the log, such as a temperature."""
-    return any(effect.needs or effect.name == DRIVEN for effect, _ in acting)
+def _check(rate_hz: float | None, seed: int) -> None:
+    if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
+        raise ConfigError(f"a rate of {rate_hz:g} Hz", where="rate_hz", expected=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
+    if seed < 0:
+        raise ConfigError(f"seed {seed} is negative", where="seed", expected="0 or more")
 
 
-def _stamps(ideal: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
+def taken(
+    ideals: Sequence[IdealMotion], stamps: Sequence[Float64[np.ndarray, " _"]], acting: Acting, started_s: float | None
+) -> SensorSamples:
+    """Samples of a sensor at some stamps.
+
+    Its effects count time from `started_s`, or from the first sample if the two lie further apart than the motion lasts, so
+    that it is another one.
+    """
+    first_s = float(stamps[0][0])
+    began_s = first_s if started_s is None or abs(started_s - first_s) >= stamps[-1][-1] - first_s else started_s
+    since = [replace(ideal, t_s=ideal.t_s - began_s) for ideal in ideals]
+    out = simulate_stretches(since, [part - began_s for part in stamps], acting)
+    return replace(out, stamp_s=out.stamp_s + began_s)
+
+
+def even_stamps(ideal: IdealMotion, rate_hz: float) -> Float64[np.ndarray, " m"]:
     """Stamps of whole periods since the first pose, within a stretch."""
     first, last = np.ceil(ideal.t_s[0] * rate_hz - 1e-6), np.floor(ideal.t_s[-1] * rate_hz + 1e-6)
     return np.asarray(np.arange(first, last + 1.0) / rate_hz)
@@ -216,43 +236,19 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
     return np.asarray(motion.start_ns + np.round(stamp_s * 1e9).astype(np.int64))
 
 
-def _noise(noise: noises.Noise, rate_hz: float, seed: int) -> Effect:
-    """Effect of white noise and a walking bias, each from its own stream.
-
-    Unknown densities are zero.
-    """
-    densities = {name: np.nan_to_num(noise.values(name)) for name in noises.UNITS}
-    colour = noise.colour if noise.colour is not None and noise.colour.holds_at(rate_hz) else None
-
-    def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
-        dt = np.diff(samples.stamp_s, prepend=samples.stamp_s[0])[:, None]  # a walk goes on in a hole
-        out, coloured = [], None
-        if colour is not None:
-            readings = np.concatenate([samples.gyro, samples.accel], axis=1)
-            coloured = colour.drawn(samples.stamp_s, readings, np.random.default_rng([seed, 2]))
-        for k, (name, values) in enumerate((("gyro", samples.gyro), ("accel", samples.accel))):
-            white, walk = (np.random.default_rng([seed, k, kind]).normal(size=values.shape) for kind in (0, 1))
-            bias = np.cumsum(densities[f"{name}_walk"] * np.sqrt(np.abs(dt)) * walk, axis=0)
-            noise = white if coloured is None else coloured[:, 3 * k : 3 * k + 3]
-            out.append(values + densities[f"{name}_density"] * np.sqrt(rate_hz) * noise + bias)
-        return samples.with_readings(*out)
-
-    return Effect(NOISE, Stage.SENSOR, ("gyro", "accel"), "+ n + b(t)", (), "always", forward)
-
-
-def _remarks(motion: SmoothMotion, poses: Poses, noise: noises.Noise, rate_hz: float) -> tuple[str, ...]:
-    remarks = []
-    if noise.colour is not None and not noise.colour.holds_at(rate_hz):
-        remarks.append(f"the colour of the noise is that of {noise.colour.rate_hz:g} Hz, and not simulated at {rate_hz:g} Hz")
+def _of_poses(motion: SmoothMotion, poses: Poses) -> Iterator[str]:
     left_out = poses.duration_s - motion.duration_s
     if left_out > 0.05 * poses.duration_s:
-        remarks.append(
-            f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
-        )
+        yield f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
+
+
+def of_noise(noise: noises.Noise, rate_hz: float) -> Iterator[str]:
+    """Remarks on what of a noise is not simulated."""
+    if noise.colour is not None and not noise.colour.holds_at(rate_hz):
+        yield f"the colour of the noise is that of {noise.colour.rate_hz:g} Hz, and not simulated at {rate_hz:g} Hz"
     kinds = [name for name in noises.UNITS if "instability" not in name]
     if lacking := [name for name in kinds if np.isnan(noise.values(name)).any()]:
-        remarks.append(f"{', '.join(lacking)} not known in the noise file, and not simulated")
-    return tuple(remarks)
+        yield f"{', '.join(lacking)} not known in the noise file, and not simulated"
 
 
 def _rounded(rate_hz: float) -> float:

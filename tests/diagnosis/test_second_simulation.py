@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imutool.api.sensors import simulate as simulate_log
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.second_simulation import simulate_again
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -69,6 +70,34 @@ def test_a_simulated_imu_that_sits_beside_its_poses_stays_there(tmp_path: Path, 
     change = (wanted.imu.gyro - sim.imu.gyro).std(axis=0).max()
     assert np.abs(found.gyro - wanted.imu.gyro).max() < READ * change
     assert np.abs(found.accel - sim.imu.accel).max() < READ * (sim.imu.accel - sensor().imu.accel).std()
+
+
+@pytest.mark.parametrize("poses", [True, False])
+def test_a_simulator_that_runs_again_gets_the_physics_on_its_samples(tmp_path: Path, poses: bool) -> None:
+    """Of another motion, years later, with a sensor beside its poses and no recording."""
+    arm = [(effect, np.array([0.2, -0.1, 0.3])) for effect in catalogue.effects(["lever_arm"])]
+    sim, wanted = sensor(arm), sensor([*arm, *SCALE.acting()])
+    run, out, file = tmp_path / "run.mcap", tmp_path / "better.mcap", tmp_path / "physics.toml"
+    write(replace(sim if poses else replace(sim, truths={}), imu_topic="/sim/imu"), run)
+    physics_file.write(msgspec.structs.replace(SCALE, start_ns=int(sim.imu.t_ns[0]) - 10**18), file)
+    made = simulate_log(run, out, physics=file, imu="/sim/imu")
+    found = read(out)
+    assert (made.motion is None, bool(found.truths)) == (True, poses)
+    np.testing.assert_array_equal(found.imu.t_ns, sim.imu.t_ns)
+    change = (wanted.imu.gyro - sim.imu.gyro).std(axis=0).max()
+    assert np.abs(found.imu.gyro - wanted.imu.gyro).max() < READ * change
+    assert np.abs(found.imu.accel - sim.imu.accel).max() < READ * (sim.imu.accel - sensor().imu.accel).std()
+
+
+def test_samples_may_be_taken_at_another_rate_and_get_noise(tmp_path: Path) -> None:
+    sim = sensor()
+    write(sim, tmp_path / "run.mcap")
+    made = simulate_log(tmp_path / "run.mcap", tmp_path / "half.mcap", imu=sim.imu_topic, rate_hz=RATE_HZ / 2, noise="bmi160")
+    imu = read(tmp_path / "half.mcap").imu
+    assert made.plain()["rate_hz"] == RATE_HZ / 2
+    np.testing.assert_allclose(np.diff(imu.t_ns), 2e9 / RATE_HZ, atol=1.0)
+    noise = imu.gyro - sim.imu.gyro[::2][: len(imu)]
+    assert noise[:, 0].std() == pytest.approx(datasheet.read("bmi160").gyro_density[0] * np.sqrt(RATE_HZ / 2), rel=0.1)
 
 
 def test_poses_in_a_world_whose_z_is_down_are_no_obstacle(tmp_path: Path) -> None:
