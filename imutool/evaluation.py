@@ -92,7 +92,11 @@ def _evaluated(
     refused: Refused | None,
 ) -> list[dict[str, Any]]:
     """Results of one stretch of a log."""
-    warn_of_recordings([recording])
+    (found,) = warn_of_recordings([recording])
+    if (found.world != np.eye(3)).any() or found.position_unit != "m":
+        logger.warning("%s: until then its positions and velocities are not scored", recording.name)
+        orientations = replace(recording.truth, p_wb=np.zeros_like(recording.truth.p_wb), v_w=None)
+        recording = replace(recording, truths={next(iter(recording.truths)): orientations})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
         found, std = _corrected(recording.imu, model, start)

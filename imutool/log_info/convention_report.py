@@ -18,7 +18,7 @@ from imutool.cleaning.samples import BLOCK, Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
-from imutool.log_info.pose_imu_rotation import agreement, body_warnings, motion_warnings
+from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
@@ -54,10 +54,14 @@ def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
 
 
 def convention_warnings(whole: TopicSummary) -> list[str]:
-    """Warnings about units, axes and frames; a note without a correction is none."""
+    """Warnings about units, axes and frames; a note without a correction is none.
+
+    Corrections of the world and of the unit of positions stay in the totals.
+    """
     findings = [*Units().findings(whole), *Axes().findings(whole)]
-    fix = "; imutool convert LOG OUT --fix corrects it"
-    return [f.what + (fix if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values]
+    return [
+        f.what + (f"; {CORRECTION}" if "fix" in f.values else "") for f in findings if f.severity != "note" or "fix" in f.values
+    ]
 
 
 def constant_sensors(imu: Imu) -> list[str]:
@@ -68,15 +72,22 @@ def constant_sensors(imu: Imu) -> list[str]:
     return [f"{name} reads {value.tolist()} in {len(imu)} samples in a row: {why}" for name, value in constant.items()]
 
 
-def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
+def _warnings(imu: Imu, whole: TopicSummary) -> list[str]:
+    """Warnings about units, axes and frames of samples that are used uncorrected."""
+    warnings = [*constant_sensors(imu), *convention_warnings(whole)] if len(imu) else []
+    found = agreement(whole.truth, imu) if whole.truth is not None and not warnings else None
+    if whole.truth is None or found is None:
+        return warnings
+    topic, turned_deg = whole.truth.topic, [] if found.turned is None else found.turned.deg.tolist()
+    return [*body_warnings(topic, turned_deg), *motion_warnings(topic, found.explained, found.rms_rad_s)]
+
+
+def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
     """Log the warnings about units, axes and frames of samples that are used uncorrected."""
-    warnings = [*constant_sensors(imu), *convention_warnings(convention_summary(imu, truth))] if len(imu) else []
-    found = agreement(truth, imu) if truth is not None and not warnings else None
-    if truth is not None and found is not None:
-        turned_deg = [] if found.turned is None else found.turned.deg.tolist()
-        warnings = [*body_warnings(truth.topic, turned_deg), *motion_warnings(truth.topic, found.explained, found.rms_rad_s)]
-    for warning in warnings:
+    whole = convention_summary(imu, truth)
+    for warning in _warnings(imu, whole):
         logger.warning("%s: %s", where, warning)
+    return whole
 
 
 def check_one_sensor(recordings: Sequence[Recording]) -> None:
@@ -93,10 +104,24 @@ def check_one_sensor(recordings: Sequence[Recording]) -> None:
         )
 
 
-def warn_of_recordings(recordings: Iterable[Recording]) -> None:
+def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
     """Log those warnings for recordings in memory."""
+    return [warn_of_conventions(r.imu, truth_of(r), f"{r.name} {r.imu_topic}") for r in recordings]
+
+
+def check_conventions(recordings: Iterable[Recording]) -> None:
+    """Refuse recordings from which a training would learn wrong units, axes or frames; log other warnings.
+
+    Raises:
+        DataError: what `convert --fix` corrects.
+    """
     for recording in recordings:
-        warn_of_conventions(recording.imu, truth_of(recording), f"{recording.name} {recording.imu_topic}")
+        for warning in _warnings(recording.imu, convention_summary(recording.imu, truth_of(recording))):
+            where = f"{recording.name} {recording.imu_topic}"
+            if warning.endswith(CORRECTION):
+                what = warning.removesuffix(f"; {CORRECTION}")
+                raise DataError(what, where=where, expected="units, axes and poses that a model may learn", fix=CORRECTION)
+            logger.warning("%s: %s", where, warning)
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:

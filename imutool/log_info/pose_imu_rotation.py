@@ -22,6 +22,7 @@ ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 UNSURE_DEG = 3.0  # standard deviation of a rotation that is not reported
 TURNED_DEG = 10.0  # more than a mount that was meant to be straight
+CORRECTION = "imutool convert LOG OUT --fix corrects it"
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 
 
@@ -85,8 +86,8 @@ def _has_gap(
 def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
     """Warning of poses whose body is turned far against the gyro."""
     deg = float(np.linalg.norm(turned_deg))
-    fix = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; imutool convert LOG OUT --fix corrects it"
-    return [fix] if deg > TURNED_DEG else []
+    what = f"the body of the poses {topic} is turned by {deg:.0f}° against the gyro; {CORRECTION}"
+    return [what] if deg > TURNED_DEG else []
 
 
 def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]:

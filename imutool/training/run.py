@@ -24,7 +24,7 @@ from imutool.bias.networks.threads import settings_of_a_new_process, side_by_sid
 from imutool.bias_start.stretches import measured_recording, read_stretches
 from imutool.config import plain
 from imutool.errors import ConfigError
-from imutool.log_info.convention_report import warn_of_recordings
+from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
@@ -91,7 +91,7 @@ def train(
         config_of(chosen)  # a misspelt setting is an error before any log is read
     parts = [(log, measured_recording(part)) for log in logs for part in read_stretches(log, imu=imu, truth=truth)]
     recordings = [part for _, part in parts]
-    warn_of_recordings(recordings)
+    check_conventions(recordings)
     for recording in (recording for recording in recordings if recording.truth_caveat):
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     pool = Pool.of(recordings)

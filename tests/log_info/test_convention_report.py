@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
-from imutool.errors import ImutoolError, ModelError
+from imutool.errors import DataError, ImutoolError, ModelError
 from imutool.evaluation import evaluate
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.write import write
@@ -40,12 +41,17 @@ def in_ned(made: Recording) -> Recording:
     )
 
 
+def in_mm(made: Recording) -> Recording:
+    return replace(made, truths={"/ground_truth/pose": replace(made.truth, p_wb=1e3 * made.truth.p_wb, v_w=None)})
+
+
 CHANGES = {
     "accel looks like g": with_samples(lambda gyro: gyro, lambda accel: accel / 9.80665),
     "gyro looks like deg/s": with_samples(np.rad2deg, lambda accel: accel),
     "gyro contradicts": with_samples(lambda gyro: gyro[:, [1, 2, 0]], lambda accel: accel),
     "accel contradicts": with_samples(lambda gyro: gyro, lambda accel: -accel),
     "-z up (as in NED)": in_ned,
+    "are in mm and not in m": in_mm,
 }
 
 
@@ -58,19 +64,10 @@ def stop(done: int, total: int, text: str) -> None:
         raise StopError
 
 
-def stop_training(epoch: object) -> None:
-    raise StopError
-
-
-def trained(log: Path) -> None:
-    train([log], log.with_suffix(".safetensors"), method="linear", overwrite=True, progress=stop_training)
-
-
 USES: dict[str, Callable[[Path], object]] = {
     "debias": lambda log: debias(log, log.with_suffix(".out.mcap"), init="0,0,0,0,0,0", force=True, overwrite=True),
     "evaluate": evaluate,
     "diagnose": lambda log: diagnose([log], tell=stop),
-    "train": trained,
 }
 
 
@@ -95,11 +92,33 @@ def test_wrong_units_axes_and_frames_are_warned_of(
     warned(told, "evaluate", made, tmp_path / "log.mcap", caplog)
 
 
-@pytest.mark.parametrize("name", ["debias", "diagnose", "train"])
+@pytest.mark.parametrize("name", ["debias", "diagnose"])
 def test_every_use_of_wrong_samples_is_warned_of(
     name: str, made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     warned("accel looks like g", name, made, tmp_path / "log.mcap", caplog)
+
+
+@pytest.mark.parametrize("told", CHANGES)
+def test_no_model_learns_wrong_units_axes_or_frames(told: str, made: Recording, tmp_path: Path) -> None:
+    """Trained on a world whose z is down, the accelerometer got a bias of twice gravity."""
+    log, model = tmp_path / "log.mcap", tmp_path / "model.safetensors"
+    write(CHANGES[told](made), log)
+    with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
+        train([log], model, method="linear")
+    assert not model.exists()
+
+
+@pytest.mark.parametrize(("p_wb", "scored"), [(in_ned, False), (in_mm, False), (lambda made: made, True)])
+def test_positions_of_another_world_or_unit_are_not_scored(
+    p_wb: Callable[[Recording], Recording], scored: bool, made: Recording, tmp_path: Path
+) -> None:
+    log = tmp_path / "log.mcap"
+    write(p_wb(made), log)
+    (found,) = evaluate(log)
+    assert found["aoe_deg"] > 0.0
+    figures = [found[name] for name in ("ape_m", "velocity_rmse_m_s", "drift_velocity_m_s")]
+    assert [figure is not None for figure in figures] == 3 * [scored]
 
 
 def test_a_log_as_it_should_be_brings_no_warning(made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -67,6 +67,14 @@ def test_a_truth_of_another_frame_is_refused(flown: Recording) -> None:
         checked(with_gyro(flown, flown.imu.gyro[:, [1, 2, 0]]))
 
 
+@pytest.mark.parametrize("order", [[0, 1, 2, 3], [1, 2, 3, 0]], ids=["inverse", "x, y, z, w"])
+def test_quaternions_that_are_inverse_or_in_another_order_are_refused(flown: Recording, order: list[int]) -> None:
+    sign = np.array([1.0, -1.0, -1.0, -1.0]) if order == [0, 1, 2, 3] else np.ones(4)
+    poses = replace(flown.truth, q_wb_wxyz=(flown.truth.q_wb_wxyz * sign)[:, order], v_w=None)
+    with pytest.raises(DataError, match="do not follow the gyro"):
+        checked(replace(flown, truths={"/ground_truth/pose": poses}))
+
+
 def test_a_few_seconds_are_not_enough() -> None:
     with pytest.raises(DataError, match="expected at least 10 s"):
         checked(flight(1, duration_s=6.0))
