@@ -20,8 +20,8 @@ LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
 ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
-UNSURE_DEG = 3.0  # standard deviation of a rotation that is not reported
-TURNED_DEG = 10.0  # more than a mount that was meant to be straight
+UNSURE_SHARE, UNSURE_DEG = 0.1, (1.0, 3.0)  # of a rotation, within these: its standard deviation, if it is not reported
+TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 
@@ -142,7 +142,8 @@ def _turned(
     if np.linalg.eigvalsh(seen)[0] <= 0.0:
         return None
     std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
-    return Turned(np.degrees(quaternion.log(quaternion.of_matrix(turn))[0]), std_deg) if std_deg.max() < UNSURE_DEG else None
+    deg = np.degrees(quaternion.log(quaternion.of_matrix(turn))[0])
+    return Turned(deg, std_deg) if std_deg.max() < np.clip(UNSURE_SHARE * np.linalg.norm(deg), *UNSURE_DEG) else None
 
 
 def frames_of_copies(log: Log, topic: str) -> frozenset[str]:
