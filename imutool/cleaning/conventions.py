@@ -207,17 +207,23 @@ def _turns_against_poses(
 ) -> tuple[Reading | None, Truth, str]:
     """Reading of the gyro against the poses, the poses, and what is wrong with their quaternions.
 
-    They are misread where they leave no gyro, or other axes, and otherwise read the gyro as it is, and fit it clearly better.
+    They are misread where they leave no gyro, or other axes, and otherwise fit it clearly better, turned at most. Of several
+    such readings, alike up to a turn of the world, the one whose body is nearest to the gyro's counts.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
     if gyro is not None and not gyro.wrong:
         return gyro, truth, ""
+    best, read = gyro, (truth, "")
     for what, (rows, signs) in MISREAD.items():
         other = truth._replace(q_wb_wxyz=truth.q_wb_wxyz[:, rows] * signs)
         found = _gyro_against_poses(step, mean, start_ns, other)
-        if found is not None and found.as_is and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
-            return found, other, what
-    return gyro, truth, ""
+        if found is None or not found.sole or np.linalg.det(found.axes) < 0.0:
+            continue
+        if gyro is not None and found.misfit >= CLEARLY * gyro.misfit:
+            continue
+        if not read[1] or best is None or np.trace(found.axes) > np.trace(best.axes):
+            best, read = found, (other, what)
+    return best, *read
 
 
 def _gyro_against_poses(
