@@ -55,7 +55,7 @@ def _keeps_gravity(proposal: Proposal, columns: Columns) -> bool:
 
 
 def settle_accel_unit(proposal: Proposal, columns: Columns) -> None:
-    """Enter the unit in which the steady part of the acceleration is gravity, where size and name leave it open.
+    """Enter the accelerometer's unit, if open, in which its steady part is gravity.
 
     A body that moves fast has a median far from gravity, and one that turns over has directions that cancel out.
     """

@@ -95,7 +95,7 @@ def unit_named(text: str) -> str:
 
 
 def spaced_name(column: str) -> str:
-    """Name of a column with underscores between its words: UncompGyro_0, gyroTimestamp, xAccel, SENSgyro."""
+    """Name of a column with underscores between its words: UncompGyro_0, xAccel, SENSgyro."""
     return split_name(
         re.sub(rf"((?<=[a-z]{{2}})|(?<=^[xyz]))(?=[A-Z][a-z])|(?<=[A-Z]{{2}})(?={WHOLE_WORDS})", "_", column.strip())
     )[0]

@@ -24,7 +24,7 @@ def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
 
 
 def numbers(texts: list[str]) -> tuple[np.ndarray, list[str]] | None:
-    """Numbers of a column, and the few fields that are none, which count as missing; None of other texts."""
+    """Numbers of a column, nan for the few fields that are none, and these; None of texts."""
     if not any("_" in text for text in texts):
         try:
             return np.array(list(map(int, texts)), np.int64), []

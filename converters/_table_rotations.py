@@ -47,7 +47,7 @@ def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path) -> Float64[
 
 
 def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Bool[np.ndarray, " n"], list[str]]:
-    """Rows that hold a rotation, and notes on others: missing ones, and a few whose length is not one."""
+    """Rows that hold a rotation, and notes on those without one or of another length."""
     length = np.linalg.norm(q_wxyz, axis=1)
     missing = ~(length > 0.0)
     off = ~missing & (np.abs(length - 1.0) > NOT_UNIT)
