@@ -74,7 +74,8 @@ def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> None:
     found = agreement(truth, imu) if truth is not None and not warnings else None
     if truth is not None and found is not None:
         turned_deg = [] if found.turned is None else found.turned.deg.tolist()
-        warnings = [*body_warnings(truth.topic, turned_deg), *motion_warnings(truth.topic, found.explained, found.rms_rad_s)]
+        seen = found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg
+        warnings = [*body_warnings(truth.topic, turned_deg), *motion_warnings(truth.topic, *seen)]
     for warning in warnings:
         logger.warning("%s: %s", where, warning)
 
@@ -200,6 +201,7 @@ def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:
     warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
     for truth in usable:
         warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
-        if isinstance(truth.gyro_explained, float) and isinstance(truth.gyro_rms_rad_s, float):
-            warnings += motion_warnings(truth.topic, truth.gyro_explained, truth.gyro_rms_rad_s)
+        explained, rms, jumps, largest = truth.gyro_explained, truth.gyro_rms_rad_s, truth.jumps, truth.largest_jump_deg
+        if isinstance(explained, float) and isinstance(rms, float) and isinstance(jumps, int) and isinstance(largest, float):
+            warnings += motion_warnings(truth.topic, explained, rms, jumps, largest)
     return warnings

@@ -295,6 +295,6 @@ def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
     found = None if poses is None else agreement(poses, imu)
     if found is None:
         return truth
-    truth = msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
+    truth = msgspec.structs.replace(truth, **found.figures())
     deg, std_deg = (UNSET, UNSET) if found.turned is None else (values.tolist() for values in found.turned)
     return msgspec.structs.replace(truth, body_turned_deg=deg, body_turned_std_deg=std_deg)
