@@ -220,15 +220,7 @@ def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Samples with an axis at the end of its range, by `saturation.RULE`."""
-    at_limit = np.zeros(len(values), bool)
-    for axis in values.T:
-        ends = saturation.Ends()
-        ends.see(axis)
-        for side in (-1, 1):
-            limit = ends.limit(side)
-            if limit is not None:
-                at_limit |= axis == limit
-    return at_limit
+    return np.any([saturation.at_limit(axis) for axis in values.T], axis=0)
 
 
 class _Rest(NamedTuple):

@@ -113,7 +113,11 @@ def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, 
         return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
     often = "once" if jumps == 1 else f"{jumps} times"
     said = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
-    return [f"{said}: markers that were exchanged or hidden, or clocks that differ"] if jumps else []
+    return (
+        [f"{said}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
+        if jumps
+        else []
+    )
 
 
 class Body(NamedTuple):
