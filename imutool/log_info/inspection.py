@@ -220,7 +220,9 @@ def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Samples with an axis at the end of its range, by `saturation.RULE`."""
-    return np.any([saturation.at_limit(axis) for axis in values.T], axis=0)
+    x, y, z = (saturation.at_limit(axis) for axis in values.T)
+    either: Bool[np.ndarray, " n"] = x | y | z
+    return either
 
 
 class _Rest(NamedTuple):

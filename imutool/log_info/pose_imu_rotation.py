@@ -104,7 +104,7 @@ def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
 
 
 def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, largest_deg: float) -> list[str]:
-    """Warning of poses that do not turn as the gyro does, or that turn at times where it does not."""
+    """Warning of poses that do not turn as the gyro does, or at times jump."""
     if explained <= LEAST_EXPLAINED and rms_rad_s >= UNLIKE_RAD_S:
         causes = (
             "clocks that differ, a gyro in another unit, poses of another recording or body, jumps or noise, or quaternions"

@@ -63,7 +63,7 @@ def turned_alike(
 
 
 def begin_at(network: BiasNetwork, sensor: Sensor, solution: Solution, trained: Sequence[Sensor]) -> None:
-    """Start a network from a closed form, its accelerometer turned with the gyro where that alone is trained."""
+    """Start a network from a closed form; where the gyro alone is trained, turn both sensors."""
     solved = {sensor: (solution.W, solution.covariance)}
     if (*trained,) == ("gyro",):
         solved["accel"] = turned_alike(*solved["gyro"])
@@ -75,7 +75,7 @@ def begin_at(network: BiasNetwork, sensor: Sensor, solution: Solution, trained: 
 def effects_turned_alike(
     names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]
 ) -> tuple[tuple[str, ...], Float[Tensor, " q"], Float[Tensor, "q q"]]:
-    """Effects of an accelerometer that is turned as the gyro is, their parameters and covariance; none of no misalignment."""
+    """Effects of an accelerometer turned as the gyro is, their parameters and covariance."""
     if "gyro_misalignment" not in names:
         return (), theta[:0], covariance[:0, :0]
     entries = {"gyro_misalignment": OFF_DIAGONAL, "gyro_scale": DIAGONAL}
