@@ -245,3 +245,15 @@ def test_fix_leads_back_to_the_sensors_that_flew(flown: tuple[Imu, Truth]) -> No
     np.testing.assert_allclose(planted.accel @ accel.T, imu.accel, atol=1e-12)
     assert survey.verdict == "usable"
     assert not looked(Imu(imu.t_ns, planted.gyro @ gyro.T, planted.accel @ accel.T), truth, fix=True).findings
+
+
+@pytest.mark.parametrize("late_s", [-1.2, 0.8, 7.0])
+def test_the_clock_of_poses_of_a_body_that_turns_on_and_on_is_found(late_s: float) -> None:
+    """A drone that flies circles: the median of its gyro is no bias."""
+    omega = waves(80.0, (0.06, 0.06, 0.12)) + np.array([0.0, 0.0, -0.4])
+    imu, poses = turned(omega)
+    truth = of_poses("/ground_truth/pose", Poses(poses.t_ns + round(late_s * 1e9), poses.p_wb, poses.q_wb_wxyz))
+    assert truth is not None
+    found = judge(motion_of(imu), truth, 1.0)
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(late_s, abs=0.01)
