@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+import struct
+import warnings
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,6 +32,7 @@ MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own
     "parquet": b"PAR1",
     "sheet": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
 }
+MAT_HEADER, MAT_COMPRESSED, MAT_STEP = 128, 15, 1 << 20  # bytes before the first element, type of a packed one, bytes at once
 ZIP = b"PK\x03\x04"
 SHEETS = "xl/workbook.xml", "xl/workbook.bin", "content.xml"  # members of Excel's and LibreOffice's files
 
@@ -141,17 +145,43 @@ def _npy_shape(member: Any) -> tuple[int, ...]:
 def _load_mat(path: Path, columns: Columns) -> None:
     scipy_io = _module("scipy.io", path)
     try:
-        listed = scipy_io.whosmat(path)
-    except TypeError as error:  # scipy reads no header of an object
-        fix = "Save arrays from MATLAB (of an object struct(...), of a table table2array), or a table with writetable as CSV"
-        raise DataError("holds MATLAB objects, as tables and timetables are", where=path, expected="arrays", fix=fix) from error
-    _check_size(path, sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in listed))
+        size = sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in scipy_io.whosmat(path))
+        has_objects = False
+    except TypeError:  # scipy reads no header of an object
+        size, has_objects = _unpacked_bytes(path), True
+    _check_size(path, size)
     try:
-        content = scipy_io.loadmat(path, simplify_cells=True)
+        with warnings.catch_warnings(action="ignore"):  # objects share a name
+            content = scipy_io.loadmat(path, simplify_cells=True)
     except Exception as error:  # scipy raises whatever damaged bytes lead to
-        raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
+        if not has_objects:
+            raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
+        content = {}
     for name, value in _flat(content):
         columns.add(name, value)
+    if has_objects:
+        fix = "Save arrays from MATLAB (of an object struct(...), of a table table2array), or a table with writetable as CSV"
+        if not columns.values:
+            raise DataError("holds MATLAB objects, as tables and timetables are", where=path, expected="arrays", fix=fix)
+        columns.remarks.losses.append(f"its MATLAB objects are left out. {fix}")
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """Bytes of the elements of a .mat file, unpacked; no further than the limit."""
+    with path.open("rb") as file:
+        order = "<" if file.read(MAT_HEADER).endswith(b"IM") else ">"
+        total = 0
+        while len(tag := file.read(8)) == 8 and total <= LIMIT:
+            kind, size = struct.unpack(f"{order}II", tag)
+            if kind != MAT_COMPRESSED:
+                total += size
+                file.seek(size, 1)
+                continue
+            unpacker, packed = zlib.decompressobj(), file.read(size)
+            while packed and total <= LIMIT:
+                total += len(unpacker.decompress(packed, MAT_STEP))
+                packed = unpacker.unconsumed_tail
+    return total
 
 
 def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

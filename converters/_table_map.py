@@ -96,11 +96,11 @@ class Proposal(msgspec.Struct):
     rate_hz: float = 0.0
     hints: list[str] = []  # lines to confirm
 
-    def settle_gyro_unit(self, unit: str, reason: str) -> None:
-        """Enter the unit of the gyro, which was open."""
-        self.open.remove("gyro_unit")
-        self.reasons[:] = [each for each in self.reasons if each != NO_UNIT.format("gyro")] + [reason]
-        self.entries["gyro_unit"] = unit
+    def settle_unit(self, sensor: str, unit: str, reason: str) -> None:
+        """Enter the unit of a sensor, which was open."""
+        self.open.remove(f"{sensor}_unit")
+        self.reasons[:] = [each for each in self.reasons if each != NO_UNIT.format(sensor)] + [reason]
+        self.entries[f"{sensor}_unit"] = unit
 
     def toml(self, several: Sequence[str] = (), *, own_times: bool = False) -> str:
         """The proposal as a map file, with a question behind what is open; `several` are the topics of more than one IMU."""

@@ -54,6 +54,26 @@ def _keeps_gravity(proposal: Proposal, columns: Columns) -> bool:
     return steady is not None and abs(steady / STANDARD_GRAVITY - 1.0) < STEADY_BAND
 
 
+def settle_accel_unit(proposal: Proposal, columns: Columns) -> None:
+    """Enter the accelerometer's unit, if open, in which its steady part is gravity.
+
+    A body that moves fast has a median far from gravity, and one that turns over has directions that cancel out.
+    """
+    needed = {"time", "time_unit", "gyro", "gyro_unit", "accel"}
+    if proposal.open != ["accel_unit"] or not needed <= proposal.entries.keys():
+        return
+    if (rows := _rows(proposal, columns)) is None:
+        return
+    t_ns, gyro, accel = rows
+    steady = steady_force(t_ns, gyro * GYRO_SI[str(proposal.entries["gyro_unit"])], accel)
+    near = [
+        u for u, size in ACCEL_SI.items() if steady is not None and abs(steady * size / STANDARD_GRAVITY - 1.0) < STEADY_BAND
+    ]
+    if len(near) == 1:
+        reason = f"with the gyro's turns taken out, the acceleration has a steady part of {steady:.4g}: gravity in {near[0]}"
+        proposal.settle_unit("accel", near[0], reason)
+
+
 def unit_by_motion(proposal: Proposal, columns: Columns) -> tuple[str, str] | None:
     """Unit with which gravity turns as the gyro says, and the reason."""
     rows = _rows(proposal, columns)

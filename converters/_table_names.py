@@ -33,6 +33,7 @@ RATE_OR_FORCE_UNITS = r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
 ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth|ref|reference)(_|$)"  # no sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
+WHOLE_WORDS = "gyr|acc|time"  # that begin behind capitals
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
     "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
@@ -94,8 +95,10 @@ def unit_named(text: str) -> str:
 
 
 def spaced_name(column: str) -> str:
-    """Name of a column with underscores between its words: UncompGyro_0, gyroTimestamp, xAccel."""
-    return split_name(re.sub(r"((?<=[a-z]{2})|(?<=^[xyz]))(?=[A-Z][a-z])", "_", column.strip()))[0]
+    """Name of a column with underscores between its words: UncompGyro_0, xAccel, SENSgyro."""
+    return split_name(
+        re.sub(rf"((?<=[a-z]{{2}})|(?<=^[xyz]))(?=[A-Z][a-z])|(?<=[A-Z]{{2}})(?={WHOLE_WORDS})", "_", column.strip())
+    )[0]
 
 
 def split_name(column: str) -> tuple[str, str]:

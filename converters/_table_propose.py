@@ -125,10 +125,10 @@ def _propose_gyro_unit(proposal: Proposal, columns: Columns) -> None:
         proposal.reasons.append(f"the names of the columns say {stated}, and {said}")
     if "gyro_unit" not in proposal.open or stated:
         return
-    motion = unit_by_motion(proposal, columns) if proposal.open == ["gyro_unit"] else None
+    motion = unit_by_motion(proposal, columns) if {*proposal.open} <= {"gyro_unit", "accel_unit"} else None
     found = {unit: reason for unit, reason in ((steps[0] if steps else "", said), motion or ("", "")) if unit}
     if len(found) == 1:
-        proposal.settle_gyro_unit(*found.popitem())
+        proposal.settle_unit("gyro", *found.popitem())
     else:
         proposal.reasons.extend(found.values())
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from ._table_headerless import name_headerless
 from ._table_names import UNITS, split_name
-from ._table_text import COMMENTS, Columns, is_number, read_csv
+from ._table_numbers import is_number
+from ._table_text import COMMENTS, Columns, read_csv
 from ._table_times import rises
 
 SENSORS = {  # words in the names of files and of sensors

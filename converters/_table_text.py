@@ -19,6 +19,7 @@ from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, join_dates
 from ._table_names import unit_named
+from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
@@ -37,8 +38,6 @@ SECONDS, NANOSECONDS = (
 STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
-COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-DECIMAL_COMMA = re.compile(r"[+-]?(0?,\d+|\d+,(\d\d?|\d{4,}))([eE][+-]?\d+)?")  # in quotes; of 1,234 it may mark thousands
 
 
 @dataclass
@@ -132,18 +131,6 @@ def _is_row(line: str, delimiter: str | None, least: int) -> bool:
     return not line.startswith(COMMENTS) and sum(map(is_number, line.split(delimiter))) >= least
 
 
-def is_number(text: str) -> bool:
-    """Whether a field is a number, perhaps with a decimal comma."""
-    text = text.strip().strip('"')
-    if "_" in text:  # Python reads 2026_06_15 as a number, nobody else does
-        return False
-    try:
-        float(text)
-    except ValueError:
-        return bool(COMMA_NUMBER.fullmatch(text))
-    return True
-
-
 def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS) -> None:
     """Add the columns of a table of text with `least` numbers in a row.
 
@@ -177,22 +164,30 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
             empty.append(named)
             continue
         name = named or f"column {place}"
-        if any((COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA).fullmatch(text) for text in texts[:100]):
-            texts[:] = [text.replace(",", ".") for text in texts]
+        if pointed := decimal_points(texts, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA):
+            texts[:] = pointed
             commas.append(name)
-        if (values := _numbers(texts)) is not None:
-            columns.values[name], columns.texts[name], columns.units[name] = values, texts, units.get(name, "")
-        elif (found := calendar_times(texts)) is not None:
-            columns.values[name], columns.units[name] = found[0], "ns"
-            columns.remarks.notes.extend(f"{name}: {note}" for note in found[1])
-        elif len(set(texts)) == 1:
-            columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
-        else:
-            columns.remarks.losses.append(f"{name} is left out: its fields, as {texts[0][:40]!r}, are no numbers")
+        _add_fields(columns, name, texts, units.get(name, ""))
     if left := ", ".join(filter(None, empty)):
         columns.remarks.notes.append(f"columns without a value are left out: {left}")
     if commas:
         columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
+
+
+def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
+    """Add a column of texts as numbers or times, or say what it is instead."""
+    if (found := numbers(texts)) is not None:
+        columns.values[name], columns.texts[name], columns.units[name] = found[0], texts, unit
+        if odd := found[1]:
+            columns.remarks.notes.append(f"{name}: {len(odd)} fields, as {odd[0][:40]!r}, are no numbers and count as missing")
+    elif (dated := calendar_times(texts)) is not None:
+        columns.values[name], columns.units[name] = dated[0], "ns"
+        columns.remarks.notes.extend(f"{name}: {note}" for note in dated[1])
+    elif len(set(texts)) == 1:
+        columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
+    else:
+        wrong = next((text for text in texts if text and not is_number(text)), texts[0])
+        columns.remarks.losses.append(f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers")
 
 
 def _width(rows: list[list[str]], above: list[list[str]]) -> int:
@@ -280,16 +275,3 @@ def _distinct(names: list[str]) -> list[str]:
             above = text
             distinct.append(text)
     return distinct
-
-
-def _numbers(texts: list[str]) -> np.ndarray | None:
-    if any("_" in text for text in texts):
-        return None
-    try:
-        return np.array(list(map(int, texts)), np.int64)
-    except (ValueError, OverflowError):
-        pass
-    try:
-        return np.array([float(text) if text else np.nan for text in texts])
-    except ValueError:
-        return None

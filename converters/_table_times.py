@@ -25,6 +25,7 @@ RATE = rf"(({OF})_?)*(fs|f_?samp|srate|odr|hz|rate|freq|frequency)(_({OF}))*"  #
 PERIOD = rf"(({OF})_?)*(dt|delta_?t|period|interval)|sampl(e|ing)_?time"
 PERIOD_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 COUNTER = r"packet|count|index|seq|frame|sample(?![ _]?time)"  # in the name of a column that counts
+FEWEST_STAMPS = 3  # that change, for the rate of the rows that share them
 MOST_STEP = 4.0  # of a counter; a column of larger steps may be a clock
 MOST_SKIPPED = 0.1  # share of a counter's steps that lost samples make longer; more may be packets of other sensors
 MOST_ODD = 0.01  # share of its steps that are no multiple of the usual one
@@ -112,8 +113,11 @@ def units_of_time(first: float, step: float) -> list[str]:
 
 def rate_of_rows(column: str, values: np.ndarray, unit: str) -> list[str]:
     """Line of a map that counts rows, where several have one stamp."""
-    first, last = float(values[0]), float(values[-1])
-    step = (last - first) / max(int(np.argmax(values == values[-1])), 1)  # the last rows have one stamp, too
+    first = float(values[0])
+    changed = np.flatnonzero(np.diff(values) > 0) + 1  # the first and the last stamp may hold part of their rows
+    if len(changed) < FEWEST_STAMPS:
+        return []
+    step = float(np.polyfit(changed - changed[0], values[changed].astype(float) - first, 1)[0])
     units = [unit] if unit in TIME_NS else units_of_time(first, step)
     if not step > 0.0 or len(units) != 1:
         return []

@@ -25,9 +25,10 @@ from ._table_files import kind_of, load
 from ._table_folder import POSES_GROUP, TRUTH_GROUP, is_split, load_split
 from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
 from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
+from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
 from ._table_propose import propose
-from ._table_rotations import of_matrices, unit_by_poses
+from ._table_rotations import known_rotations, of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
@@ -35,7 +36,7 @@ from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 LARGEST_NS, MOST_LOSSES = 2**63 - 1, 8  # losses in a refusal
-DATA_FILE = "data.hdf5"
+DATA_FILE, POSES_TOPIC = "data.hdf5", "/ground_truth/pose"
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
@@ -158,7 +159,8 @@ def _proposal(columns: Columns) -> Proposal:
         proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
         if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, turned(columns, proposal.entries))):
             kind = "poses" if "quaternion_wxyz" in proposal.entries else "orientations"
-            proposal.settle_gyro_unit(unit, f"the {kind} turn as far as a gyro in {unit} says")
+            proposal.settle_unit("gyro", unit, f"the {kind} turn as far as a gyro in {unit} says")
+    settle_accel_unit(proposal, columns)
     return proposal
 
 
@@ -245,21 +247,19 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     else:
         expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices, or nine columns"
         raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
-    p = (
-        _vectors(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
-        if table.position
-        else np.zeros((len(q_wxyz), 3))
-    )
-    if not table.position:
-        remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
+    p = np.zeros((len(q_wxyz), 3))
+    if table.position:
+        p = _vectors(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
-    q_wxyz = np.where(q_wxyz.any(axis=1, keepdims=True), q_wxyz, np.nan)  # zeros stand where a pose is missing
-    kept = in_order(t_ns, np.concatenate([p, q_wxyz], axis=1), "/ground_truth/pose")
-    remarks.notes.extend(kept.notes)
+    known, notes = known_rotations(q_wxyz, POSES_TOPIC)
+    kept = in_order(t_ns[known], np.concatenate([p, q_wxyz], axis=1)[known], POSES_TOPIC)
+    remarks.notes.extend(notes + kept.notes)
     if not len(kept.t_ns):
         return {}
-    topic = "/ground_truth/pose" if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
+    if not table.position:
+        remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
+    topic = POSES_TOPIC if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
 
 

@@ -30,6 +30,8 @@ TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best 
 LEAST_TRUTH_S = 1.0
 NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses without positions
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room (docs/diagnosis.md)
+MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
+SAME = 100.0  # samples whose poses have the same error
 ITERATIONS = 4
 HUBER_MEDIANS = 1.5  # threshold of an outlier, in medians of the residuals
 
@@ -61,7 +63,8 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     assert poses.v_w is not None
     start = prior(model, int(imu.t_ns[0]))
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - bias_over(model, piece, start.rest)
-    offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows])
+    mount_std = 0.0 if model.card else MOUNT_STD  # a trained model knows it
+    offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows], mount_std)
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
@@ -89,8 +92,11 @@ def bias_from_truth(
     q_wb_wxyz: Quaternions,
     v_w: Rows,
     trusted: Bool[np.ndarray, " n"],
+    mount_std: float = 0.0,
 ) -> Vector6:
     """Constant bias of samples with true poses: the slope in time of the integration error.
+
+    With `mount_std` (rad) the body of the poses may be turned against the gyro, which a constant else takes up in motion.
 
     Rotation and velocity are integrated from the first true pose; their errors e(t) = e_0 + (sum of A) b are fitted at all
     trusted poses with Huber's weights, e_0 being the error of the first pose itself. The accelerometer is rotated with the true
@@ -103,7 +109,7 @@ def bias_from_truth(
         running = _integrated(rate - offset[:3], dt)
         R = quaternion.matrix(running)
         error = quaternion.rotate(running, quaternion.log(quaternion.multiply(quaternion.inverse(running), turned)))
-        offset[:3] -= _slope(error, np.cumsum(R * dt[..., None], axis=0), trusted[1:])
+        offset[:3] -= _slope(error, np.cumsum(R * dt[..., None], axis=0), trusted[1:], R - np.eye(3), mount_std)
     R_wb = quaternion.matrix(_attitudes(t_s, rate - offset[:3], q_wb_wxyz, trusted))
     a_w = (R_wb @ force[..., None])[..., 0] + np.array(GRAVITY_W)
     dv = np.cumsum(_step_means(a_w) * dt, axis=0)
@@ -133,17 +139,28 @@ def _attitudes(
     return quaternion.unit(quaternion.multiply(q_hat, quaternion.exp(np.stack(filled, axis=1))))
 
 
-def _slope(error: Rows, by: Float64[np.ndarray, "n 3 3"], valid: Bool[np.ndarray, " n"]) -> Float64[np.ndarray, "3"]:
-    """b of error = e_0 + by b, by least squares with Huber's weights."""
+def _slope(
+    error: Rows,
+    by: Float64[np.ndarray, "n 3 3"],
+    valid: Bool[np.ndarray, " n"],
+    by_nuisance: Float64[np.ndarray, "n 3 3"] | None = None,
+    nuisance_std: float = 0.0,
+) -> Float64[np.ndarray, "3"]:
+    """b of error = e_0 + by b + by_nuisance z, by least squares with Huber's weights; z has a prior about zero."""
     y = error[valid]
-    X = np.concatenate([by[valid], np.broadcast_to(np.eye(3), (len(y), 3, 3))], axis=2)
-    weight = np.ones(len(y))
+    parts = [by[valid], np.broadcast_to(np.eye(3), (len(y), 3, 3))]
+    if by_nuisance is not None and nuisance_std > 0.0:
+        parts.append(by_nuisance[valid])
+    X = np.concatenate(parts, axis=2)
+    k, weight, ridge = X.shape[2], np.ones(len(y)), np.zeros((X.shape[2],) * 2)
     for _ in range(ITERATIONS):
-        weighted = (X * weight[:, None, None]).reshape(-1, 6).T
-        solution = np.linalg.lstsq(weighted @ X.reshape(-1, 6), weighted @ y.ravel(), rcond=None)[0]
+        weighted = (X * weight[:, None, None]).reshape(-1, k).T
+        solution = np.linalg.lstsq(weighted @ X.reshape(-1, k) + ridge, weighted @ y.ravel(), rcond=None)[0]
         size = quaternion.length(y - X @ solution)
         middle = (len(size) - 1) // 2
         limit = max(HUBER_MEDIANS * float(np.partition(size, middle)[middle]), 1e-9)
         weight = limit / np.maximum(size, limit)
+        if nuisance_std > 0.0:
+            ridge[range(6, k), range(6, k)] = SAME * (limit / nuisance_std) ** 2
     slope: Float64[np.ndarray, "3"] = solution[:3]
     return slope

@@ -135,9 +135,8 @@ def _rate_readings(fast: float) -> list[tuple[str, Float64[np.ndarray, "3 3"]]]:
 def _reading(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
     unit, matrix = readings[choice.best]
     as_is = next(row for row, (name, M) in enumerate(readings) if name == unit and (RATES[unit] * np.eye(3) == M).all())
-    return Reading(
-        np.round(matrix / RATES[unit]), unit, choice.certain, float(choice.misfit[choice.best]), float(choice.misfit[as_is])
-    )
+    misfits = float(choice.misfit[choice.best]), float(choice.misfit[as_is])
+    return Reading(np.round(matrix / RATES[unit]), unit, choice.certain, *misfits)
 
 
 def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"]) -> Reading | None:
@@ -207,17 +206,19 @@ def _turns_against_poses(
 ) -> tuple[Reading | None, Truth, str]:
     """Reading of the gyro against the poses, the poses, and what is wrong with their quaternions.
 
-    They are misread where they leave no gyro, or other axes, and otherwise read the gyro as it is, and fit it clearly better.
+    Misread ones leave no gyro or other axes, and otherwise fit it clearly better, turned at most; the least turn counts.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
     if gyro is not None and not gyro.wrong:
         return gyro, truth, ""
+    fitting = []
     for what, (rows, signs) in MISREAD.items():
         other = truth._replace(q_wb_wxyz=truth.q_wb_wxyz[:, rows] * signs)
         found = _gyro_against_poses(step, mean, start_ns, other)
-        if found is not None and found.as_is and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
-            return found, other, what
-    return gyro, truth, ""
+        if found is not None and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
+            fitting.append((found, other, what))
+    turns = (each for each in fitting if np.linalg.det(each[0].axes) > 0.0)
+    return max(turns, key=lambda each: float(np.trace(each[0].axes)), default=(gyro, truth, ""))
 
 
 def _gyro_against_poses(

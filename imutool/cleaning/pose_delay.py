@@ -32,19 +32,24 @@ class Delay(NamedTuple):
 def pose_delay(motion: Motion, truth: Truth) -> Delay | None:
     """Delay of the poses' stamps by the lengths of the rates; None where it is not shown.
 
-    Where no delay up to `LONGEST_DELAY_S` fits, the poses may be on a clock of their own.
+    Where no delay up to `LONGEST_DELAY_S` fits, the poses may be on a clock of their own. The gyro's median is its bias, but
+    for a body that turns on and on about one axis: where nothing fits, no bias is taken off.
     """
-    near = _near_delay(motion, truth)
-    if near is not None:
-        return near
-    apart_s = _clock_difference(motion, truth)
+    bias = median(motion.table()[1][:, :3])
+    near = _near_delay(motion, truth, bias)
+    return near or _far_delay(motion, truth, bias) or _far_delay(motion, truth, np.zeros(3))
+
+
+def _far_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> Delay | None:
+    """Delay of any size, of poses that may be on a clock of their own."""
+    apart_s = _clock_difference(motion, truth, bias)
     if apart_s is None:
         return None
-    found = _near_delay(motion, truth._replace(t_ns=truth.t_ns - round(apart_s * 1e9)))
+    found = _near_delay(motion, truth._replace(t_ns=truth.t_ns - round(apart_s * 1e9)), bias)
     return None if found is None else Delay(apart_s + found.seconds, found.std_s)
 
 
-def _clock_difference(motion: Motion, truth: Truth) -> float | None:
+def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> float | None:
     """Seconds from the IMU's clock to that of the poses, by the lengths of the rates at every lag.
 
     None if chance explains the best lag.
@@ -56,7 +61,7 @@ def _clock_difference(motion: Motion, truth: Truth) -> float | None:
     if not all(LEAST_SHARED <= n <= MOST_STEPS for n in count):
         return None
     true = np.interp(STEP_S * np.arange(count[0]), true_s, np.linalg.norm(rate, axis=1))
-    gyro = np.interp(step[0] + np.arange(count[1]), step, np.linalg.norm(mean[:, :3] - median(mean[:, :3]), axis=1))
+    gyro = np.interp(step[0] + np.arange(count[1]), step, np.linalg.norm(mean[:, :3] - bias, axis=1))
     from imutool.inertial.correlation import cross_correlation  # scipy, which poses on the IMU's clock never need
 
     found = cross_correlation(gyro, true, LEAST_SHARED)
@@ -66,10 +71,10 @@ def _clock_difference(motion: Motion, truth: Truth) -> float | None:
     return 1e-9 * (int(first[0]) - start_ns) + STEP_S * (lag - int(step[0]) - 0.5)
 
 
-def _near_delay(motion: Motion, truth: Truth) -> Delay | None:
+def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> Delay | None:
     """Delay of at most `LONGEST_DELAY_S`: turns over a second find it, and turns between neighbouring poses refine it."""
     period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
-    slow, fast = (_Turns.of(motion, truth, n, period_ns) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
+    slow, fast = (_Turns.of(motion, truth, n, period_ns, bias) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
     if min(len(slow.size) + FEWEST, len(fast.size)) < DELAY_PARTS * FEWEST:  # of the slow ones a log holds fewer
         return None
     coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
@@ -101,13 +106,13 @@ class _Turns(NamedTuple):
     gyro: Float64[np.ndarray, "m 3"]
 
     @classmethod
-    def of(cls, motion: Motion, truth: Truth, apart: int, period_ns: int) -> _Turns:
+    def of(cls, motion: Motion, truth: Truth, apart: int, period_ns: int, bias: Float64[np.ndarray, "3"]) -> _Turns:
         """Turns between poses that are `apart` rows apart, as far as the gyro covers them at every delay."""
         first, last, rate = turning(truth, apart)
         step, mean = motion.table()
         use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)
         inside = (first_s > LONGEST_DELAY_S + STEP_S * step[0]) & (last_s + LONGEST_DELAY_S < STEP_S * (step[-1] + 1))
-        gyro = mean[:, :3] - median(mean[:, :3])
+        gyro = mean[:, :3] - bias
         return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], step, gyro)
 
     def correlations(self, lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:

@@ -82,7 +82,19 @@ class Corrections:
         earlier = content.metadata.get(RECORD, {})  # of another round, or of an earlier command
         record = {topic: "; ".join(filter(None, (earlier.get(topic), note))) for topic, note in self.notes.items()}
         metadata = {**content.metadata, RECORD: {**earlier, **record}}
-        return replace(content, messages=lambda: self._in_order(content), metadata=metadata)
+        return replace(content, messages=lambda: self._after_zero(content), metadata=metadata)
+
+    def _after_zero(self, content: MessageLog) -> Iterator[Message]:
+        """Corrected messages; poses that belong before the zero of the log's clock have no time there."""
+        before = 0
+        for message in self._in_order(content):
+            if message.log_time >= 0:
+                yield message
+            else:
+                before += 1
+        if before:
+            said = f"{before} messages of poses belong before the zero of the log's clock, and are left out"
+            content.remarks.notes.append(said)
 
     def _in_order(self, content: MessageLog) -> Iterator[Message]:
         """Corrected messages; where poses come from another clock, they are sorted in by the corrected one."""

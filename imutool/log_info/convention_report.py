@@ -79,7 +79,8 @@ def _warnings(imu: Imu, whole: TopicSummary) -> list[str]:
     if whole.truth is None or found is None:
         return warnings
     topic, turned_deg = whole.truth.topic, [] if found.turned is None else found.turned.deg.tolist()
-    return [*body_warnings(topic, turned_deg), *motion_warnings(topic, found.explained, found.rms_rad_s)]
+    seen = found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg
+    return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
@@ -225,6 +226,7 @@ def truth_warnings(truths: Sequence[TruthInfo]) -> list[str]:
     warnings = [f"{truth.topic}: shares no time with the IMU" for truth in usable if truth.coverage == 0.0]
     for truth in usable:
         warnings += body_warnings(truth.topic, truth.body_turned_deg or [])
-        if isinstance(truth.gyro_explained, float) and isinstance(truth.gyro_rms_rad_s, float):
-            warnings += motion_warnings(truth.topic, truth.gyro_explained, truth.gyro_rms_rad_s)
+        explained, rms, jumps, largest = truth.gyro_explained, truth.gyro_rms_rad_s, truth.jumps, truth.largest_jump_deg
+        if isinstance(explained, float) and isinstance(rms, float) and isinstance(jumps, int) and isinstance(largest, float):
+            warnings += motion_warnings(truth.topic, explained, rms, jumps, largest)
     return warnings

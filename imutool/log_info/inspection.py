@@ -220,15 +220,9 @@ def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Samples with an axis at the end of its range, by `saturation.RULE`."""
-    at_limit = np.zeros(len(values), bool)
-    for axis in values.T:
-        ends = saturation.Ends()
-        ends.see(axis)
-        for side in (-1, 1):
-            limit = ends.limit(side)
-            if limit is not None:
-                at_limit |= axis == limit
-    return at_limit
+    x, y, z = (saturation.at_limit(axis) for axis in values.T)
+    either: Bool[np.ndarray, " n"] = x | y | z
+    return either
 
 
 class _Rest(NamedTuple):
@@ -295,6 +289,6 @@ def _against_gyro(log: Log, truth: TruthInfo, imu: Imu) -> TruthInfo:
     found = None if poses is None else agreement(poses, imu)
     if found is None:
         return truth
-    truth = msgspec.structs.replace(truth, gyro_rms_rad_s=found.rms_rad_s, gyro_explained=found.explained)
+    truth = msgspec.structs.replace(truth, **found.figures())
     deg, std_deg = (UNSET, UNSET) if found.turned is None else (values.tolist() for values in found.turned)
     return msgspec.structs.replace(truth, body_turned_deg=deg, body_turned_std_deg=std_deg)

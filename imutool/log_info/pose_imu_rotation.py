@@ -20,6 +20,8 @@ LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
 ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
+JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s; by the usual misfit; of the gyro's turn
+LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
 UNSURE_SHARE, UNSURE_DEG = 0.1, (1.0, 3.0)  # of a rotation, within these: its standard deviation, if it is not reported
 TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
@@ -39,6 +41,13 @@ class Agreement(NamedTuple):
     rms_rad_s: float
     explained: float
     turned: Turned | None  # None if the motion does not show it
+    jumps: int  # steps of a tenth of a second in which the poses turn and the gyro does not
+    largest_jump_deg: float
+
+    def figures(self) -> dict[str, float]:
+        """Entries of a report on the poses."""
+        own = {"gyro_rms_rad_s": self.rms_rad_s, "gyro_explained": self.explained}
+        return own | {"jumps": self.jumps, "largest_jump_deg": self.largest_jump_deg}
 
 
 def agreement(poses: Truth, imu: Imu) -> Agreement | None:
@@ -66,10 +75,15 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
         return None
     left, _, right = np.linalg.svd(gyro.T @ omega)
     turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
-    rms = float(np.sqrt(((gyro - omega @ turn.T) ** 2).sum(axis=1).mean()))
+    misfit = np.linalg.norm(gyro - omega @ turn.T, axis=1)
+    rms = float(np.sqrt((misfit**2).mean()))
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
     body = _turned(turn, gyro, omega, rms, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
-    return Agreement(rms, explained, body)
+    off_deg = np.degrees(misfit * (end - begin))
+    clear = JUMP_SHARE * np.linalg.norm(gyro, axis=1) < misfit  # else a scale or a clock may be off
+    jumps_deg = off_deg[clear & (off_deg > max(JUMP_DEG, JUMP_MEDIANS * median(off_deg)))]
+    jumps = len(jumps_deg) if jumps_deg.sum() > LEAST_JUMPS_DEG else 0
+    return Agreement(rms, explained, body, jumps, float(jumps_deg.max()) if jumps else 0.0)
 
 
 def _has_gap(
@@ -90,15 +104,21 @@ def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
     return [what] if deg > TURNED_DEG else []
 
 
-def motion_warnings(topic: str, explained: float, rms_rad_s: float) -> list[str]:
-    """Warning of poses that do not turn as the gyro does."""
-    if explained > LEAST_EXPLAINED or rms_rad_s < UNLIKE_RAD_S:
-        return []
-    causes = (
-        "clocks that differ, a gyro in another unit, poses of another recording or body, jumps or noise, or quaternions"
-        " inverted or in another order"
+def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, largest_deg: float) -> list[str]:
+    """Warning of poses that do not turn as the gyro does, or at times jump."""
+    if explained <= LEAST_EXPLAINED and rms_rad_s >= UNLIKE_RAD_S:
+        causes = (
+            "clocks that differ, a gyro in another unit, poses of another recording or body, jumps or noise, or quaternions"
+            " inverted or in another order"
+        )
+        return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
+    often = "once" if jumps == 1 else f"{jumps} times"
+    said = f"the poses {topic} turn by up to {largest_deg:.0f}° in 0.1 s that the gyro does not show, {often}"
+    return (
+        [f"{said}: markers that were exchanged or hidden, a gyro at the end of its range, or clocks that differ"]
+        if jumps
+        else []
     )
-    return [f"the poses {topic} explain {explained:.0%} of the gyro's motion: {causes}"]
 
 
 class Body(NamedTuple):

@@ -110,6 +110,8 @@ class TruthInfo(Section, frozen=True):
     ends_before_s: float | UnsetType = UNSET
     gyro_rms_rad_s: float | UnsetType = UNSET  # what the poses do not explain of the log's first gyro
     gyro_explained: float | UnsetType = UNSET  # share of its motion that they do
+    jumps: int | UnsetType = UNSET  # steps of a tenth of a second in which the poses turn and the gyro does not
+    largest_jump_deg: float | UnsetType = UNSET
     body_turned_deg: list[float] | UnsetType = UNSET  # rotation vector from the poses' body to the gyro's axes
     body_turned_std_deg: list[float] | UnsetType = UNSET
 

@@ -20,6 +20,7 @@ from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
 from imutool.training.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, without_motion
 from imutool.units import Sensor
@@ -112,4 +113,6 @@ def _solved(
         theta, covariance = fit.problem.solve(columns, without=without)
         network.take(sensor, effects[sensor], theta[columns], covariance)
         biases[sensor] = fit.problem.own_at(theta)[:, :3]
+        if sensor == "gyro" and "accel" not in fits:
+            network.take("accel", *effects_turned_alike(effects[sensor], theta[columns], covariance))
     return network, biases

@@ -33,7 +33,7 @@ from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
 from imutool.training.closed_form import widest
 from imutool.training.fit import Epoch, note
-from imutool.training.log_signals import loaded_signals, signals_of
+from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.settings import SensorPrior, TrainSettings
 from imutool.training.training_windows import Part, Pool
@@ -231,14 +231,14 @@ class PhysicsFirst:
         for sensor in pool.sensors:
             report(note(f"looking for effects on the {sensor}"))
             chosen = calibrate(pool, sensor, gyro, config.effects(sensor), "train", signals, None, settings.sensors)
-            own_prior = chosen.problem.own_prior
-            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals, own_prior, settings.sensors)
-            of_choice = ("gains", "forms", "problem", "named")
-            fits[sensor] = replace(whole, **{name: getattr(chosen, name) for name in of_choice})
+            whole = calibrate(pool, sensor, gyro, chosen.effects, "all", signals, chosen.problem.own_prior, settings.sensors)
+            fits[sensor] = replace(whole, gains=chosen.gains, forms=chosen.forms, problem=chosen.problem, named=chosen.named)
             model.take(sensor, fits[sensor].effects, fits[sensor].theta, fits[sensor].covariance)
             if sensor == "gyro":
                 error = torch.from_numpy(model.error("gyro", signals)).to(pool.gyro)
                 gyro = pool.gyro - error - fits[sensor].own[pool.log, :3]
+        if "accel" not in pool.sensors and config.effects("accel") is None:
+            model.take("accel", *effects_turned_alike(fits["gyro"].effects, fits["gyro"].theta, fits["gyro"].covariance))
         if scale is not None and _warm(model.config):
             model.take_temperature(scale.channel, temperature_tensors(scale, recordings, model.temperature_theta()))
         return cls(model, fits, _corrected(model, recordings, scale, loads), scale, loads)

@@ -28,6 +28,7 @@ from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
 from imutool.training import bias_spread, closed_form
+from imutool.training.log_signals import begin_at
 from imutool.training.objectives.increments import IncrementObjective
 from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective, RestBiases, WindowEndObjective, error
 from imutool.training.settings import TrainSettings, settings_for
@@ -195,8 +196,7 @@ class Training:
         lengths = self.settings.window_s[sensor]
         if sensor not in self._constant:
             solution = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=True)
-            self.model.begin_at(sensor, solution.W)
-            self.model.take_covariance(sensor, solution.covariance)
+            begin_at(self.model, sensor, solution, self.pool.sensors)
         # constants that take the nuisances of their logs: the descent knows none
         scored, pool = corrected(self.model.eval(), self.pool, "train", sensors_up_to(sensor))
         constants = closed_form.solve(scored, sensor, pool, rest, lengths, matrix=False, nuisances=False)

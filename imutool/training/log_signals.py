@@ -21,9 +21,11 @@ from torch import Tensor
 
 from imutool.array_types import Float, Float64, Int
 from imutool.bias import temperature
+from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import online_signals
 from imutool.bias_start.earlier_load import EARLIER_S, PRIOR, loads_after
 from imutool.bias_start.fitness import head
+from imutool.geometry import so3
 from imutool.inertial.strapdown import truth_velocity
 from imutool.recording import Poses, Recording, nanoseconds, seconds
 from imutool.sensor import catalogue
@@ -31,15 +33,61 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
-from imutool.training.closed_form import CLOCK, LEVER, ROTATION, Integrated, integrated, minus_log_likelihood
+from imutool.training.closed_form import CLOCK, LEVER, ROTATION, Integrated, Solution, integrated, minus_log_likelihood
 from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
-from imutool.units import AXES
+from imutool.units import AXES, Sensor
 
+TRIADS_RAD = 5e-3  # plausible rotation between the gyro and the accelerometer of one chip
+OFF_DIAGONAL, DIAGONAL = (1, 2, 3, 5, 6, 7), (0, 4, 8)  # of a 3x3 matrix, row by row
 COLD = 0  # index of the time zero
 SWEEPS = 5
 CLEAR = 10.0  # of twice the log-likelihood, by which different times beat one for all (as BIC: Kass and Raftery 1995)
+
+
+def turned_alike(
+    W: Float[Tensor, "3 3"], covariance: Float[Tensor, "9 9"]
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "9 9"]]:
+    """Matrix of an accelerometer that is turned as a gyro with the matrix W, and its covariance.
+
+    Poses without positions show the gyro alone. The rotation in W, the orthogonal factor of I - W, is mostly the mount of the
+    poses' body, which turns both sensors: an accelerometer that stayed behind would contradict the gyro.
+    """
+    left, _, right = torch.linalg.svd(torch.eye(3).to(W) - W)
+    R = left @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(left @ right).sign())]).to(W)) @ right
+    swapped = torch.eye(9).to(W).reshape(3, 3, 9).transpose(0, 1).reshape(9, 9)
+    J = (torch.eye(9).to(W) - swapped) / 2.0  # the antisymmetric part
+    turns = so3.hat(torch.eye(3).to(W)).reshape(3, 9)
+    return torch.eye(3).to(W) - R, J @ covariance @ J.mT + TRIADS_RAD**2 * turns.mT @ turns
+
+
+def begin_at(network: BiasNetwork, sensor: Sensor, solution: Solution, trained: Sequence[Sensor]) -> None:
+    """Start a network from a closed form; where the gyro alone is trained, turn both sensors."""
+    solved = {sensor: (solution.W, solution.covariance)}
+    if (*trained,) == ("gyro",):
+        solved["accel"] = turned_alike(*solved["gyro"])
+    for each, (W, covariance) in solved.items():
+        network.begin_at(each, W)
+        network.take_covariance(each, covariance)
+
+
+def effects_turned_alike(
+    names: Sequence[str], theta: Float[Tensor, " p"], covariance: Float[Tensor, "p p"]
+) -> tuple[tuple[str, ...], Float[Tensor, " q"], Float[Tensor, "q q"]]:
+    """Effects of an accelerometer turned as the gyro is, their parameters and covariance."""
+    if "gyro_misalignment" not in names:
+        return (), theta[:0], covariance[:0, :0]
+    entries = {"gyro_misalignment": OFF_DIAGONAL, "gyro_scale": DIAGONAL}
+    places = [
+        entries[form.name][k] if form.name in entries else None
+        for form in temperature.forms("gyro", tuple(names))
+        for k in range(len(form.parameters))
+    ]
+    S = torch.stack([torch.eye(9).to(theta)[place] if place is not None else theta.new_zeros(9) for place in places], dim=1)
+    W, C = turned_alike((S @ theta).reshape(3, 3), S @ covariance @ S.mT)
+    order = [*OFF_DIAGONAL, *DIAGONAL]
+    return ("accel_misalignment", "accel_scale"), W.flatten()[order], C[order][:, order]
 
 
 def without_nuisances(

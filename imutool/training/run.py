@@ -98,7 +98,9 @@ def train(
     check_trainable(recordings, pool)
     if "accel" not in pool.sensors:
         names = ", ".join(recording.name for recording in recordings if not recording.truth.has_positions)
-        logger.warning("the true poses of %s have no positions: the gyro alone is trained", names)
+        logger.warning(
+            "the true poses of %s have no positions: the gyro alone is trained, and the accelerometer turned with it", names
+        )
     descent = _Descent(kept, resume, device, progress or (lambda epoch: None))
     trainer: Trainer = TRAINERS[method] if method in TRAINERS else partial(_network_alone, method)
     with side_by_side():

@@ -167,6 +167,8 @@ def judged(case: Case, start: str) -> Iterator[tuple[str, Judgement]]:
     for length_s in WINDOWS_S:
         grown = one.errors(length_s, from_s)
         for name, axes in (("attitude", slice(0, 3)), ("velocity", slice(3, 6))):
+            if name == "velocity" and not (case.exact or recording.truth).has_positions:
+                continue
             parts = (P[:, axes, axes] for P in grown[1:])
             features = features_of(one.motion, one.motion.windows(length_s, from_s))[: len(grown.error)]
             yield f"{name} {length_s:g} s", Judgement(grown.error[:, axes], *parts, features)

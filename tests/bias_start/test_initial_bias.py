@@ -196,6 +196,19 @@ def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
     assert start.how == "truth over 12.0 s, ±1e-06 rad/s"
 
 
+@pytest.mark.parametrize("turn", [0.05, -0.1])
+def test_a_body_of_poses_that_is_turned_against_the_sensor_is_no_bias_of_the_gyro(biased: Recording, turn: float) -> None:
+    """Markers are meant to be straight, and are off by some degrees; a trained model has their mean."""
+    truth = biased.truth
+    q = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec([turn, 0.0, -0.4 * turn])
+    mounted = replace(biased, truths={"/truth": Poses(truth.t_ns, truth.p_wb, q.as_quat(scalar_first=True))})
+    off = from_truth(sees_everything(), mounted).rest[:3] - GYRO_BIAS
+    assert np.abs(off).max() < 2e-3  # 0.01 rad/s and more without
+    card = sees_everything()
+    card.card = {"logs": [{}]}
+    assert np.abs(from_truth(card, mounted).rest[:3] - GYRO_BIAS).max() > 5e-3
+
+
 def test_after_the_truth_the_rest_bias_is_followed_from_what_it_showed() -> None:
     """Four seconds of truth, and a stop after which the gyro is another; the start itself knows nothing of that."""
     imu, attitude = resting([(5.0, 15.0)])

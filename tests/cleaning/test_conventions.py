@@ -97,6 +97,27 @@ def test_misread_quaternions_of_poses_are_named_and_not_the_gyro(what: str, flow
     assert found.gyro.as_is
 
 
+@pytest.mark.parametrize("what", MISREAD)
+@pytest.mark.parametrize("number", [row for row, P in enumerate(PERMUTATIONS) if np.linalg.det(P) > 0][1::7])
+def test_misread_quaternions_of_a_body_that_is_turned_against_the_gyro_are_named(
+    what: str, number: int, flown: tuple[Imu, Truth]
+) -> None:
+    imu, truth = flown
+    rows, signs = MISREAD[what]
+    misread = np.empty_like(truth.q_wb_wxyz)
+    misread[:, rows] = truth.q_wb_wxyz * signs
+    planted = Imu(imu.t_ns, imu.gyro @ PERMUTATIONS[number], imu.accel @ PERMUTATIONS[number])
+    found = judge(motion_of(planted), truth._replace(q_wb_wxyz=misread), 1.0)
+    assert found.quaternions
+    assert found.gyro is not None
+    rows, signs = MISREAD[found.quaternions]  # some readings are alike, up to a turn of the world
+    q = Rotation.from_quat(misread[:, rows] * signs, scalar_first=True)
+    rate = (q[:-1].inv() * q[1:]).as_rotvec() * 1e9 / np.diff(truth.t_ns)[:, None]
+    middle = 0.5 * (truth.t_ns[1:] + truth.t_ns[:-1])
+    measured = np.stack([np.interp(middle, imu.t_ns, column) for column in (planted.gyro @ found.gyro.axes.T).T], axis=1)
+    assert np.median(np.abs(measured - rate)) < 0.2 * np.median(np.abs(rate))
+
+
 @pytest.mark.parametrize(("unit", "up"), [("mm", "+z"), ("cm", "-z"), ("mm", "+y"), ("m", "+z")])
 def test_the_unit_of_positions_is_named_by_the_accelerometer(unit: str, up: str, flown: tuple[Imu, Truth]) -> None:
     imu, truth = flown
@@ -224,3 +245,15 @@ def test_fix_leads_back_to_the_sensors_that_flew(flown: tuple[Imu, Truth]) -> No
     np.testing.assert_allclose(planted.accel @ accel.T, imu.accel, atol=1e-12)
     assert survey.verdict == "usable"
     assert not looked(Imu(imu.t_ns, planted.gyro @ gyro.T, planted.accel @ accel.T), truth, fix=True).findings
+
+
+@pytest.mark.parametrize("late_s", [-1.2, 0.8, 7.0])
+def test_the_clock_of_poses_of_a_body_that_turns_on_and_on_is_found(late_s: float) -> None:
+    """A drone that flies circles: the median of its gyro is no bias."""
+    omega = waves(80.0, (0.06, 0.06, 0.12)) + np.array([0.0, 0.0, -0.4])
+    imu, poses = turned(omega)
+    truth = of_poses("/ground_truth/pose", Poses(poses.t_ns + round(late_s * 1e9), poses.p_wb, poses.q_wb_wxyz))
+    assert truth is not None
+    found = judge(motion_of(imu), truth, 1.0)
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(late_s, abs=0.01)

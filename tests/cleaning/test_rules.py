@@ -11,6 +11,7 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wit
 
 from imutool.cleaning.finding import Finding
 from imutool.cleaning.rule import CleaningSettings
+from imutool.cleaning.rules import saturation
 from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -395,3 +396,42 @@ def test_stamps_in_batches_are_no_missing_samples(made: ImuBatch) -> None:
         "stamps come in batches of about 10.0 samples: the driver's, not the sensor's; imutool convert LOG OUT --restamp"
         in (survey.reasons[0])
     )
+
+
+def turned_on_a_table(limit: float | None, seconds: float = 40.0) -> np.ndarray:
+    """Rates of an axis that rests, and then turns at a constant rate again and again, clipped before a drifting calibration."""
+    t = np.arange(round(seconds * 100.0)) / 100.0
+    rate = 8.0 * np.clip(3.0 * np.sin(0.9 * (t - 10.0)), -1.0, 1.0) * (t > 10.0)
+    rate += np.random.default_rng(3).normal(0.0, 0.005, len(t))
+    return (rate if limit is None else np.clip(rate, -limit, limit)) * (1.0 + 2e-6 * t)
+
+
+@pytest.mark.parametrize("limit", [7.9, 5.0, None])
+def test_an_axis_that_is_clipped_before_its_calibration_is_saturated_and_a_constant_rate_is_not(limit):
+    rates = turned_on_a_table(limit)
+    plateau = saturation.Plateau()
+    for first in range(0, len(rates), 333):  # parts as they come from a file
+        part = slice(first, first + 333)
+        number = np.arange(len(rates))[part]
+        plateau.see(rates[part], number, 10 * number)
+    marked = saturation.at_limit(rates)
+    if limit is None:
+        assert plateau.flat(-1) is plateau.flat(1) is None
+        assert not marked.any()
+        return
+    for side in (-1, 1):
+        flat = plateau.flat(side)
+        assert flat is not None
+        assert flat[0] == pytest.approx(side * limit, rel=1e-3)
+        assert np.array_equal(flat[2], 10 * flat[1])
+        assert (side * rates[flat[1]] > 0.99 * limit).all()
+    assert np.isin(np.concatenate([plateau.flat(-1)[1], plateau.flat(1)[1]]), np.flatnonzero(marked)).all()
+    assert marked.sum() > 0.9 * (np.abs(rates) > 0.9999 * limit).sum()
+
+
+def test_a_clipped_and_calibrated_axis_is_a_finding(made):
+    rates = np.resize(turned_on_a_table(5.0), len(made.stamp_ns))
+    (one,) = (each for each in look(with_values(made, slice(None), 1, rates)).findings if each.values.get("limit", 0.0) > 0.0)
+    assert one.rule == "saturation"
+    assert one.values == {"axis": "gyro.y", "limit": pytest.approx(5.0, rel=1e-3)}
+    assert "clipped before a calibration" in one.what

@@ -316,3 +316,19 @@ def test_units_and_stamps_in_messages_of_a_drivers_own_type_are_corrected_at_onc
     np.testing.assert_allclose(found.accel, resting.imu.accel, rtol=1e-12)
     assert (found.gyro == resting.imu.gyro).all()
     assert np.abs(found.t_ns - made.imu.t_ns).max() <= 200
+
+
+def test_poses_that_belong_before_the_zero_of_the_clock_are_left_out_and_counted(tmp_path: Path) -> None:
+    """A recorder that counts from zero, and poses whose stamps are late."""
+    made = flight(3, duration_s=50.0, rate_hz=100.0, truth_rate_hz=50.0)
+    start_ns, late_ns = int(made.imu.t_ns[0]), 1_500_000_000
+    t_ns = np.concatenate([[0, 20_000_000], made.truth.t_ns - start_ns + late_ns])
+    rows = np.maximum(np.arange(len(t_ns)) - 2, 0)
+    late = Poses(t_ns, made.truth.p_wb[rows], made.truth.q_wb_wxyz[rows])
+    imu = replace(made.imu, t_ns=made.imu.t_ns - start_ns)
+    write(replace(made, imu=imu, truths={"/ground_truth/pose": late}), tmp_path / "late.mcap")
+    report = convert(tmp_path / "late.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "right.mcap").truth
+    assert fixed.t_ns[0] >= 0
+    assert len(made.truth) - 2 <= len(fixed) <= len(made.truth)
+    assert any("belong before the zero of the log's clock, and are left out" in note for note in report.notes)

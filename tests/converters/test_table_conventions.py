@@ -5,6 +5,7 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+import scipy.io
 from support.tables import write_csv
 
 from imutool.converters import table
@@ -144,7 +145,50 @@ def test_a_motion_capture_without_any_pose_is_no_truth(tmp_path):
     path = write_csv(tmp_path / "rest.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *np.zeros((4, COUNT))])
     log = table.read_sequence(table.sequences(path)[0])
     assert log.poses == {}
-    assert f"/ground_truth/pose: {COUNT} samples that are not finite are left out" in log.remarks.notes
+    assert f"/ground_truth/pose: {COUNT} samples without a pose are left out" in log.remarks.notes
+    assert not any("zeros stand for them" in note for note in log.remarks.notes)
+
+
+def test_a_few_quaternions_of_another_length_are_left_out_and_named(tmp_path):
+    """Motion captures that were resampled across a change of the quaternion's sign have such."""
+    names = ["t_ns", *IMU_NAMES, *(f"vicon_orientation_{a}" for a in "wxyz")]
+    spoilt = np.where(np.isin(np.arange(COUNT), (17, 40))[:, None], 0.6 * Q_WXYZ, Q_WXYZ)
+    log = table.read_sequence(table.sequences(write_csv(tmp_path / "wand.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *spoilt.T]))[0])
+    np.testing.assert_allclose(
+        log.poses["/ground_truth/pose"].q_wb_wxyz, np.delete(Q_WXYZ, (17, 40), axis=0), rtol=0, atol=1e-15
+    )
+    assert any("2 quaternions whose length is not 1 are left out, the first in row 18" in note for note in log.remarks.notes)
+    path = write_csv(tmp_path / "angles.csv", names, [T_NS, *GYRO.T, *ACCEL.T, *(0.6 * Q_WXYZ).T])
+    with pytest.raises(DataError, match="expected norm 1"):  # columns of something else
+        table.read_sequence(table.sequences(path)[0])
+
+
+def test_single_fields_that_are_no_numbers_lose_no_column(tmp_path):
+    names = ["t_ns", *IMU_NAMES, "pressure", "state"]
+    rows = [
+        [str(t), *map(repr, gyro), *map(repr, accel), "101.5", "idle"]
+        for t, gyro, accel in zip(T_NS.tolist(), GYRO.tolist(), ACCEL.tolist(), strict=True)
+    ]
+    rows[200][1], rows[210][4], rows[220][7], rows[230][7] = "-8,00E-05", "ERR", "-", "1_0"
+    (tmp_path / "log.csv").write_text("\n".join(";".join(row) for row in [names, *rows]) + "\n")
+    log = table.read_sequence(table.sequences(tmp_path / "log.csv")[0])
+    imu = log.imus["/imu0"]
+    assert np.array_equal(imu.t_ns, np.delete(T_NS, 210))
+    assert imu.gyro[200, 0] == -8e-5
+    assert len(log.scalars["/pressure"].t_ns) == COUNT - 2
+    assert "accel_x [m/s^2]: 1 fields, as 'ERR', are no numbers and count as missing" in log.remarks.notes
+    assert "pressure: 2 fields, as '-', are no numbers and count as missing" in log.remarks.notes
+    assert log.remarks.losses == []
+
+
+def test_a_column_of_words_names_one_of_them(tmp_path):
+    rows = [
+        [t, *gyro, *accel, "7" if n < 100 else "off"] for n, (t, gyro, accel) in enumerate(zip(T_NS, GYRO, ACCEL, strict=True))
+    ]
+    text = "\n".join(",".join(map(str, row)) for row in [["t_ns", *IMU_NAMES, "mode"], *rows])
+    (tmp_path / "log.csv").write_text(text + "\n")
+    losses = table.read_sequence(table.sequences(tmp_path / "log.csv")[0]).remarks.losses
+    assert losses == ["mode is left out: its fields, as 'off', are no numbers"]
 
 
 NAMES_OF_AXES = [
@@ -236,6 +280,29 @@ def test_objects_of_matlab_are_refused_with_what_to_save(tmp_path):
     (tmp_path / "log.mat").write_bytes(header + np.array([14, len(array)], np.uint32).tobytes() + array)
     with pytest.raises(DataError, match="holds MATLAB objects"):
         table.read_sequence(table.sequences(tmp_path / "log.mat")[0])
+
+
+def test_arrays_beside_an_object_of_matlab_are_read_and_the_object_is_named(tmp_path):
+    """A workspace that was saved whole holds a serial port, a timer or a figure."""
+    scipy.io.savemat(tmp_path / "log.mat", {"t_ns": T_NS, "SENSgyro": GYRO, "SENSacc": ACCEL})
+    scipy.io.savemat(tmp_path / "one.mat", {"x": 1.0})
+    texts = b"".join(np.array([1, 8], np.uint32).tobytes() + word.ljust(8, b"\0") for word in (b"port", b"MCOS", b"serial"))
+    inside = np.array([6, 8, 17, 0], np.uint32).tobytes() + texts + (tmp_path / "one.mat").read_bytes()[128:]
+    with (tmp_path / "log.mat").open("ab") as file:
+        file.write(np.array([14, len(inside)], np.uint32).tobytes() + inside)
+    columns = load(tmp_path / "log.mat", "mat")
+    np.testing.assert_array_equal(columns.values["SENSgyro[2]"], GYRO[:, 2])
+    assert propose(columns).entries["accel"] == [f"SENSacc[{axis}]" for axis in range(3)]
+    assert [loss.partition(".")[0] for loss in columns.remarks.losses] == ["its MATLAB objects are left out"]
+
+
+def test_an_object_of_matlab_hides_no_array_that_is_too_large(tmp_path, monkeypatch):
+    scipy.io.savemat(tmp_path / "log.mat", {"zeros": np.zeros(10_000)}, do_compression=True)
+    with (tmp_path / "log.mat").open("ab") as file:
+        file.write(np.array([14, 16, 6, 8, 17, 0], np.uint32).tobytes())
+    monkeypatch.setattr("imutool.converters._table_files.LIMIT", 50_000)
+    with pytest.raises(DataError, match="unpacks to"):
+        load(tmp_path / "log.mat", "mat")
 
 
 def test_gravity_in_hundredths_is_asked_about_where_two_units_fit():

@@ -291,3 +291,34 @@ def test_the_orientation_beside_the_rates_shows_their_unit(tmp_path, unit, size,
     np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-12)
     assert f"the orientations turn as far as a gyro in {unit} says" in log.remarks.notes
     assert log.poses == {}
+
+
+@pytest.mark.parametrize(("unit", "size"), [("rad/s", 1.0), ("deg/s", 180.0 / np.pi)])
+def test_poses_that_jump_at_times_still_show_the_unit(tmp_path, unit, size):
+    """A motion capture that exchanges markers turns by itself in a tenth of its steps."""
+    jumps = Rotation.from_rotvec(np.where(RNG.random(COUNT)[:, None] < 0.004, RNG.normal(0.0, 0.25, (COUNT, 3)), 0.0))
+    q = (TURNED * jumps * Rotation.from_rotvec(RNG.normal(0.0, 0.02, (COUNT, 3)))).as_quat()[:, [3, 0, 1, 2]]
+    names = [
+        "time [s]",
+        *(f"Acc_{a} [m/s^2]" for a in "XYZ"),
+        *(f"Gyr_{a}" for a in "XYZ"),
+        *(f"vicon_orientation_{a}" for a in "wxyz"),
+    ]
+    walking = np.array([0.0, 0.0, 9.81]) + RNG.normal(0.0, 3.0, (COUNT, 3))
+    log = read(write_csv(tmp_path / "wand.csv", names, [T_S, *walking.T, *(size * GYRO).T, *q.T]))
+    assert f"the poses turn as far as a gyro in {unit} says" in log.remarks.notes
+
+
+@pytest.mark.parametrize(("unit", "size"), [("m/s^2", 1.0), ("g", 1.0 / 9.80665)])
+@pytest.mark.parametrize("gyro_unit", [" [rad/s]", ""])
+def test_the_accelerometer_of_a_body_that_swings_shows_its_unit_by_its_steady_part(tmp_path, unit, size, gyro_unit):
+    """Its median length is far from gravity, and its directions cancel out."""
+    angle = 6.0 * T_S
+    turned = Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0])
+    gyro = np.tile([6.0, 0.0, 0.0], (COUNT, 1)) + RNG.normal(0.0, 0.002, (COUNT, 3))
+    push = 9.0 * np.stack([np.zeros(COUNT), np.cos(1.3 * angle), np.sin(1.3 * angle)], axis=1)
+    accel = turned.inv().apply(push + np.array([0.0, 0.0, 9.81])) + RNG.normal(0.0, 0.02, (COUNT, 3))
+    names = ["time [s]", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a}{gyro_unit}" for a in "xyz")]
+    log = read(write_csv(tmp_path / "wand.csv", names, [T_S, *(size * accel).T, *gyro.T]))
+    np.testing.assert_allclose(log.imus["/imu0"].accel, accel, rtol=1e-9)
+    assert any(note.endswith(f"gravity in {unit}") and "steady part" in note for note in log.remarks.notes)

@@ -98,6 +98,16 @@ def test_several_rows_with_one_stamp_propose_their_rate(tmp_path):
     assert "# rate_hz = 100  # in place of time and time_unit, if the rows are evenly spaced" in str(caught.value)
 
 
+def test_whole_seconds_show_the_rate_of_their_rows_though_the_first_and_the_last_are_cut(tmp_path):
+    """By their span it would be off by up to a row in each of them: over 100 s a second."""
+    rows = np.arange(COUNT)
+    t = np.floor(1.7e9 + 0.85 + rows / 19.4)
+    with pytest.raises(ConfigError) as caught:
+        read(write_csv(tmp_path / "imu.csv", NAMES, [t, *ACCEL_G.T, *(COUNTS * 0.07).T]))
+    rate = float(str(caught.value).partition("# rate_hz = ")[2].split()[0])
+    assert abs(rate - 19.4) < 0.03
+
+
 def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
     rows = [f"15:04:{n // 100:02d}.{n % 100:02d}0\t{x}\t{y}\t{z}\t1\t2\t3" for n, (x, y, z) in enumerate(ACCEL_G)]
     names = ["Time(s)", *(f"a{a}(g)" for a in "xyz"), *(f"w{a}(deg/s)" for a in "xyz")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.cleaning.truth import Truth
@@ -48,7 +49,7 @@ def test_poses_of_the_same_motion_explain_the_gyro_whatever_its_mount_and_bias()
     turned_deg, std_deg = found.turned
     assert np.abs(turned_deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * std_deg.max()
     assert 0.001 < std_deg.max() < 0.5
-    assert motion_warnings("/mocap", found.explained, found.rms_rad_s) == []
+    assert motion_warnings("/mocap", found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg) == []
 
 
 def test_poses_that_turn_about_one_axis_show_no_mount() -> None:
@@ -80,7 +81,7 @@ def test_poses_of_another_motion_do_not():
     assert found is not None
     assert found.explained < 0.3
     assert found.turned is None
-    (warning,) = motion_warnings("/mocap", found.explained, found.rms_rad_s)
+    (warning,) = motion_warnings("/mocap", found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg)
     assert warning.startswith("the poses /mocap explain ")
     assert "another recording" in warning
 
@@ -89,3 +90,24 @@ def test_a_gyro_at_rest_or_poses_of_another_time_show_nothing():
     late = poses()._replace(t_ns=poses().t_ns + 10**12)
     assert agreement(poses(), imu(share=0.0)) is None
     assert agreement(late, imu()) is None
+
+
+@pytest.mark.parametrize(
+    ("sizes_deg", "warned"), [((40.0,), True), ((7.0, -7.0, 7.0), True), ((7.0,), False), ((2.0,) * 40, False)]
+)
+def test_poses_that_jump_are_named(sizes_deg: tuple[float, ...], warned: bool) -> None:
+    """As a motion capture does that exchanges markers."""
+    truth = poses()
+    after = np.zeros(len(truth.t_ns))
+    for place, size in enumerate(sizes_deg, 1):
+        after[len(after) * place // (len(sizes_deg) + 1) :] += np.radians(size)
+    jumped = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(after[:, None] * [0.0, 0.6, 0.8])
+    found = agreement(truth._replace(q_wb_wxyz=jumped.as_quat(scalar_first=True)), imu())
+    assert found is not None
+    assert found.explained > 0.5
+    assert found.jumps == (len(sizes_deg) if warned else 0)
+    said = motion_warnings("/mocap", found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg)
+    assert len(said) == warned
+    if warned:
+        assert abs(found.largest_jump_deg - abs(sizes_deg[0])) < 1.0
+        assert f"that the gyro does not show, {'once' if len(sizes_deg) == 1 else f'{len(sizes_deg)} times'}:" in said[0]

@@ -7,22 +7,27 @@ from itertools import product
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
-from imutool.cleaning.samples import Samples
+from imutool.cleaning.samples import Numbers, Samples
+from imutool.recording.columns import median, quantile
 from imutool.units import ASCII_UNITS, SENSORS
 
 SAMPLES = 5
 PILE = 2.0
 LEVELS = 10
 FEW_SAMPLES, FAR, FINE_LEVELS = 3, 0.05, 64  # 64 levels: one step of the sensor is then at most 3 % of its range
+BAND, QUIET = 0.97, 0.75  # of the extreme value, and of the calmest steps: what is less is quieter than the sensor at rest
+LEAST_FLAT, MOSTLY = 30, 0.6  # of noise, 0.39 are so quiet; EuRoC, TUM-VI, FETCH and BROAD have at most 0.52
+BLOCK, FEW_BLOCKS, CALMEST = 50, 3, 0.05  # samples of a block, least blocks away from the extreme, quantile of their steps
 RULE = (
     f"an axis is saturated at its own largest or smallest value where at least {SAMPLES} samples hold exactly "
     f"that value, more than {PILE:g} times as many as either of the next two values, among at least "
     f"{LEVELS} values, and it is not the median; {FEW_SAMPLES} samples are enough among at least {FINE_LEVELS} values, "
-    f"where the next value is {100 * FAR:g} % nearer to zero"
+    f"where the next value is {100 * FAR:g} % nearer to zero; or where {LEAST_FLAT} samples, and {MOSTLY:.0%} of those within "
+    f"{1 - BAND:.0%} of it, change by less than {QUIET:.0%} of the axis' calmest steps: clipped before a calibration"
 )
 KEPT = 3  # values at either end: the last one, and the two it is compared with
 
@@ -64,6 +69,58 @@ class Ends:
         return float(levels[0 if side < 0 else -1]) if len(levels) else np.nan
 
 
+class Plateau:
+    """Samples near an end of an axis that change less than at rest.
+
+    A sensor that is clipped before its calibration for temperature or scale has no value that repeats.
+    """
+
+    def __init__(self) -> None:
+        self._last, self._samples = np.nan, 0
+        self._blocks = [np.zeros((2, 0))]  # largest size and median step
+        self._extreme = {-1: 0.0, 1: 0.0}
+        self._near = {side: (np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)) for side in (-1, 1)}
+
+    def see(self, values: Float64[np.ndarray, " n"], number: Numbers, stamp_ns: Int64[np.ndarray, " n"]) -> None:
+        """Add the next samples, in order."""
+        finite = np.isfinite(values)
+        step = np.nan_to_num(np.abs(np.diff(values, prepend=self._last)), nan=np.inf)
+        self._last, self._samples = values[-1] if len(values) else self._last, self._samples + len(values)
+        whole = len(values) // BLOCK * BLOCK
+        blocks = (np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), np.median(step[:whole].reshape(-1, BLOCK), axis=1))
+        self._blocks.append(np.stack(blocks))
+        for side, near in self._near.items():
+            self._extreme[side] = float(np.max(side * values, where=finite, initial=self._extreme[side]))
+            both = [np.concatenate(pair) for pair in zip(near, (side * values, step, number, stamp_ns), strict=True)]
+            kept = both[0] > BAND * self._extreme[side]
+            self._near[side] = both[0][kept], both[1][kept], both[2][kept], both[3][kept]
+
+    def flat(self, side: int) -> tuple[float, Numbers, Int64[np.ndarray, " m"]] | None:
+        """Limit at the low (-1) or high (1) end, numbers and stamps of the samples there; None without saturation."""
+        value, step, number, stamp_ns = self._near[side]
+        size, calm = np.concatenate(self._blocks, axis=1)
+        calm = calm[(size < 0.5 * self._extreme[side]) & (calm > 0.0) & np.isfinite(calm)]
+        if len(calm) < FEW_BLOCKS or 2 * len(value) > self._samples:
+            return None
+        quiet = step < QUIET * quantile(calm, CALMEST)
+        if quiet.sum() < max(LEAST_FLAT, MOSTLY * len(value)):
+            return None
+        return side * float(median(value[quiet])), number[quiet], stamp_ns[quiet]
+
+
+def at_limit(values: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Saturated samples of an axis, by `RULE`."""
+    ends, plateau, found = Ends(), Plateau(), np.zeros(len(values), bool)
+    ends.see(values)
+    plateau.see(values, np.arange(len(values)), np.arange(len(values)))
+    for side in (-1, 1):
+        if (limit := ends.limit(side)) is not None:
+            found |= values == limit
+        elif (flat := plateau.flat(side)) is not None:
+            found[flat[1]] = True
+    return found
+
+
 class Saturation(Rule):
     """Rule for saturated samples; it keeps them.
 
@@ -74,7 +131,7 @@ class Saturation(Rule):
 
     def __init__(self) -> None:
         super().__init__()
-        self._ends = [Ends() for _ in AXES]
+        self._ends, self._plateaus = [Ends() for _ in AXES], [Plateau() for _ in AXES]
         self._places: dict[tuple[int, int], tuple[float, Intervals]] = {}
 
     def see(self, samples: Samples) -> None:
@@ -82,6 +139,7 @@ class Saturation(Rule):
         for axis, ends in enumerate(self._ends):
             values = samples.values[:, axis]
             ends.see(values)
+            self._plateaus[axis].see(values, samples.number, samples.stamp_ns)
             for side in (-1, 1):
                 level = ends.extreme(side)
                 known = self._places.get((axis, side))
@@ -100,3 +158,10 @@ class Saturation(Rule):
                 what = f"samples with {AXES[axis]} at the end of its range, {limit:.4g} {ASCII_UNITS[SENSORS[axis // 3]]}"
                 values = {"axis": AXES[axis], "limit": limit}
                 yield Finding("saturation", "warning", what, **places.where(), values=values, confidence=0.9)
+            elif (flat := self._plateaus[axis].flat(side)) is not None:
+                limit, places = flat[0] * float(whole.scale[axis]), Intervals()
+                places.add(*flat[1:])
+                end = f"the end of its range, {limit:.4g} {ASCII_UNITS[SENSORS[axis // 3]]}"
+                what = f"samples with {AXES[axis]} flat near {end}: clipped before a calibration"
+                values = {"axis": AXES[axis], "limit": limit}
+                yield Finding("saturation", "warning", what, **places.where(), values=values, confidence=0.8)
