@@ -16,6 +16,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.bias.model import GAP_S
 from imutool.cleaning import rows
+from imutool.cleaning.rules.saturation import at_limit
 from imutool.cleaning.rules.stuck import repeated
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.file_location import Location
@@ -99,6 +100,21 @@ def measured_recording(recording: Recording, *, free_fall: bool = False) -> Reco
         logger.warning(stuck, again.sum(), seconds(imu.t_ns[again][:1], int(imu.t_ns[0]))[0])
         imu = imu.rows(~again)
     return replace(recording, imu=imu)
+
+
+def within_range(recording: Recording) -> Recording:
+    """A recording without the samples whose gyro is saturated: a model would learn another scale from them.
+
+    Those of the accelerometer stay, because the gyro's windows need them, with a warning.
+    """
+    imu, told = recording.imu, "%s: %d of %d samples have the %s at the end of its range, %s"
+    gyro, accel = (np.logical_or.reduce([at_limit(column) for column in x.T]) for x in (imu.gyro, imu.accel))
+    if accel.any():
+        logger.warning(told, recording.name, accel.sum(), len(imu), "accelerometer", "from which its model learns too little")
+    if not gyro.any():
+        return recording
+    logger.warning(told, recording.name, gyro.sum(), len(imu), "gyro", "and are left out")
+    return replace(recording, imu=imu.rows(~gyro))
 
 
 def longest_stretch(recording: Recording) -> Recording:

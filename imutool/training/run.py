@@ -21,7 +21,7 @@ from imutool.bias.model import BiasModel
 from imutool.bias.networks import neural_ode as neural_ode_network
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.threads import settings_of_a_new_process, side_by_side
-from imutool.bias_start.stretches import measured_recording, read_stretches
+from imutool.bias_start.stretches import measured_recording, read_stretches, within_range
 from imutool.config import plain
 from imutool.errors import ConfigError
 from imutool.log_info.convention_report import check_conventions
@@ -90,8 +90,9 @@ def train(
     if method == hybrid.Model.method:
         config_of(chosen)  # a misspelt setting is an error before any log is read
     parts = [(log, measured_recording(part)) for log in logs for part in read_stretches(log, imu=imu, truth=truth)]
+    check_conventions(part for _, part in parts)
+    parts = [(log, within_range(part)) for log, part in parts]
     recordings = [part for _, part in parts]
-    check_conventions(recordings)
     for recording in (recording for recording in recordings if recording.truth_caveat):
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     pool = Pool.of(recordings)

@@ -19,6 +19,7 @@ from imutool.bias.model_file import load
 from imutool.config import build
 from imutool.config import load as load_settings
 from imutool.errors import ConfigError, DataError, LogError, ModelError, NumericsError
+from imutool.evaluation import evaluate
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording, seconds
@@ -457,3 +458,16 @@ def test_a_physics_file_of_which_hybrid_knows_nothing_is_refused(tmp_path: Path,
     said = imutool(*words, cwd=tmp_path)
     assert said.returncode == 3
     assert "linear has no effects" in said.stderr
+
+
+def test_samples_at_the_end_of_the_gyros_range_teach_no_scale(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """They made a model of 85 degrees on a sequence on which a constant bias has 1.6."""
+    errors = {}
+    for share in (1.0, 0.7):
+        made = flight(2, duration_s=30.0, still_s=0.5, rate_hz=100.0)
+        limit = share * np.abs(made.imu.gyro).max()
+        write(replace(made, imu=replace(made.imu, gyro=np.clip(made.imu.gyro, -limit, limit))), tmp_path / f"{share}.mcap")
+        train([tmp_path / f"{share}.mcap"], tmp_path / f"{share}.safetensors", method="linear", settings=LINEAR)
+        errors[share] = evaluate(tmp_path / "1.0.mcap", models=[tmp_path / f"{share}.safetensors"], init="truth")[1]["aoe_deg"]
+    assert errors[0.7] < 1.5 * errors[1.0] + 0.2
+    assert "at the end of its range, and are left out" in caplog.text
