@@ -130,7 +130,8 @@ def test_a_jump_of_the_clock_counts_as_an_hour_at_most(perfect: Make) -> None:
 
 
 def test_logs_of_different_rates_are_refused_with_each_rate(perfect: Make) -> None:
-    with pytest.raises(DataError, match=r"different rates \(exact_1 200.0, exact_2 100.0 Hz\).*logs of one sensor"):
+    said = r"different rates \(exact_1 200.0, exact_2 100.0 Hz\).*logs of one sensor at one rate. Train a model"
+    with pytest.raises(DataError, match=said):
         Pool.of([perfect(1, duration_s=4.0), perfect(2, duration_s=4.0, rate_hz=100.0)])
 
 
