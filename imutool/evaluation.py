@@ -92,8 +92,8 @@ def _evaluated(
     refused: Refused | None,
 ) -> list[dict[str, Any]]:
     """Results of one stretch of a log."""
-    (found,) = warn_of_recordings([recording])
-    if (found.world != np.eye(3)).any() or found.position_unit != "m":
+    (whole,) = warn_of_recordings([recording])
+    if (whole.world != np.eye(3)).any() or whole.position_unit != "m":
         logger.warning("%s: until then its positions and velocities are not scored", recording.name)
         orientations = replace(recording.truth, p_wb=np.zeros_like(recording.truth.p_wb), v_w=None)
         recording = replace(recording, truths={next(iter(recording.truths)): orientations})

@@ -103,9 +103,9 @@ def measured_recording(recording: Recording, *, free_fall: bool = False) -> Reco
 
 
 def within_range(recording: Recording) -> Recording:
-    """A recording without the samples whose gyro is saturated: a model would learn another scale from them.
+    """A recording without the samples whose gyro is saturated.
 
-    Those of the accelerometer stay, because the gyro's windows need them, with a warning.
+    A model would learn another scale from them. Those of the accelerometer stay, because the gyro's windows need them.
     """
     imu, told = recording.imu, "%s: %d of %d samples have the %s at the end of its range, %s"
     gyro, accel = (np.logical_or.reduce([at_limit(column) for column in x.T]) for x in (imu.gyro, imu.accel))

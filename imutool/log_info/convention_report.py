@@ -111,7 +111,7 @@ def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
 
 
 def check_conventions(recordings: Iterable[Recording]) -> None:
-    """Refuse recordings from which a training would learn wrong units, axes or frames; log other warnings.
+    """Refuse recordings that would teach wrong units, axes or frames; log other warnings.
 
     Raises:
         DataError: what `convert --fix` corrects.

@@ -91,8 +91,7 @@ def train(
         config_of(chosen)  # a misspelt setting is an error before any log is read
     parts = [(log, measured_recording(part)) for log in logs for part in read_stretches(log, imu=imu, truth=truth)]
     check_conventions(part for _, part in parts)
-    parts = [(log, within_range(part)) for log, part in parts]
-    recordings = [part for _, part in parts]
+    recordings = [within_range(part) for _, part in parts]
     for recording in (recording for recording in recordings if recording.truth_caveat):
         logger.warning("%s: %s, and the model learns them", recording.name, recording.truth_caveat)
     pool = Pool.of(recordings)
