@@ -1,11 +1,11 @@
 """Fitness of a bias model for a log, from its samples: `fits`, `doubtful` or `unfit`.
 
 The inertial filter predicts the samples of each half second: at rest no velocity and no rate, in motion a bounded velocity,
-which ties the gyro to the direction of gravity. Under a model that fits, the innovations e of the bounded velocity are small,
-e^T S^-1 e ~ chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking
-and Navigation, 2001, sec. 5.4), and the bias that the log shows by itself lies within the prior of the training runs. And the
-innovations of the raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`). The
-sensor's own model has this right whatever bias a new switching-on gave; a log that asks for less than half is another unit's.
+which ties the gyro to gravity. Under a model that fits, the innovations e of the bounded velocity are small, e^T S^-1 e ~
+chi-square with three degrees of freedom (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation, 2001, sec. 5.4), and the bias that the log shows lies within the prior of the training runs. The innovations of the
+raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`), whatever bias a new
+switching-on gave; a log that asks for less than half is another unit's.
 Where one of the three fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant
 bias: the model is unfit if even from its start in this log it explains the samples worse than no model, or if its bias and its
 correction are both another unit's.
@@ -30,7 +30,7 @@ from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness
 from imutool.bias_start.bias_tracking import BiasFilter, Samples, innovations, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std
+from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std, turned_axes
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
@@ -91,14 +91,14 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     none = _evidence(samples, unknown)
     share = share_of_correction(none.innovations, _evidence(corrected, unknown).innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
-    other_bias = list(_other_bias(found, prior, most))
-    refuted = list(_refuted(share))
-    contradictions = [*other_bias, *_disagreement(found, none), *refuted]
+    other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean)
+    other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
+    contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
     if contradictions:
         used = _started(start, prior)
         same = np.array_equal(used.mean, prior.mean)
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
-        if worse or (other_bias and refuted):
+        if other_axes or worse or (other_bias and refuted):
             return Fitness("unfit", (*contradictions, *worse))
     doubts = [
         *(sentence for sentence in contradictions if not confirmed or sentence not in other_bias),

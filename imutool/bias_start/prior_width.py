@@ -9,6 +9,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import COLUMNS, Vector6
+from imutool.cleaning.conventions import axis_names, signed_permutations
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State
 
@@ -20,6 +21,9 @@ BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
 LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
+TURNED = (
+    20.0  # chi-square that turned axes leave at most, and by which they are better; own logs of other turn-ons have up to 7
+)
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 
 
@@ -100,6 +104,22 @@ def shown_bias(
     measured = precision > LEAST_SHOWN / before
     gain = np.where(measured, 1.0 - after / before, 1.0)
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
+
+
+def turned_axes(difference: Vector6, std: Vector6, mean: Vector6) -> list[str]:
+    """Sentence on a log whose bias is that of the training runs in turned axes, and clearly not as it is.
+
+    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing.
+    """
+    rotations = np.array([P for P in signed_permutations() if np.linalg.det(P) > 0.0])  # the identity first
+    turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
+    chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
+    best = int(np.argmin(chi_square))
+    if chi_square[best] > TURNED or chi_square[0] - chi_square[best] < TURNED:
+        return []
+    return [
+        f"its bias is that of the training runs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
+    ]
 
 
 def supported_std(

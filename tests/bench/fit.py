@@ -33,6 +33,7 @@ TAMPERED: dict[str, Callable[[Imu], Imu]] = {
     "own, all axes permuted": lambda imu: replace(imu, gyro=imu.gyro[:, [1, 2, 0]], accel=imu.accel[:, [1, 2, 0]]),
     "own, axes of the gyro permuted": lambda imu: replace(imu, gyro=imu.gyro[:, [1, 2, 0]]),
     "own, x and y turned by 180 degrees": lambda imu: replace(imu, gyro=imu.gyro * [-1, -1, 1], accel=imu.accel * [-1, -1, 1]),
+    "own, y and z turned by 180 degrees": lambda imu: replace(imu, gyro=imu.gyro * [1, -1, -1], accel=imu.accel * [1, -1, -1]),
     "own, gyro in deg/s": lambda imu: replace(imu, gyro=np.degrees(imu.gyro)),
     "own, accelerometer in g": lambda imu: replace(imu, accel=imu.accel / 9.81),
     "own, another switching-on (0.02 rad/s)": lambda imu: replace(imu, gyro=imu.gyro + np.array([0.0, 0.02, 0.0])),

@@ -109,6 +109,24 @@ def test_gravity_confirms_the_sensors_own_correction(model: BiasModel, scaled: I
     assert "% of the model's correction" in found.reasons[0]
 
 
+@pytest.mark.parametrize("half_turns", [True, False])
+def test_turned_axes_are_caught_though_a_scale_is_the_same_in_them(
+    model: BiasModel, recording: Recording, half_turns: bool
+) -> None:
+    """As of a driver in FRD for a model of FLU; a new turn-on bias is none."""
+    scale, bias = np.diag([0.08, -0.06, 0.05]), np.array([0.03, 0.02, -0.03, 0.6, -0.7, 0.6])
+    gyro, accel = recording.imu.gyro @ (np.eye(3) + scale).T + bias[:3], recording.imu.accel + bias[3:]
+    own = corrects(model, scale)
+    turn_on = {"prior_mean": model.prior_mean + bias, "prior_std": np.array([0.01] * 3 + [0.15] * 3)}
+    wide = linear.Model(linear.Config(), model.rate_hz, dict(own.tensors) | turn_on)
+    wide.card = model.card
+    P = np.diag([1.0, -1.0, -1.0]) if half_turns else np.eye(3)
+    shift = np.zeros(3) if half_turns else np.array([0.012, -0.01, 0.008])
+    found = judged(wide, replace(recording.imu, gyro=(gyro + shift) @ P, accel=accel @ P))
+    assert found.verdict == ("unfit" if half_turns else "fits")
+    assert ("+x -y -z: the axes are turned" in " ".join(found.reasons)) is half_turns
+
+
 def test_the_correction_of_another_unit_is_caught_though_its_bias_agrees(
     model: BiasModel, recording: Recording, scaled: Imu
 ) -> None:
