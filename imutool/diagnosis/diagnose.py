@@ -58,7 +58,7 @@ from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
-from imutool.sensor.effects import clock_wander, gyro_bias_drift
+from imutool.sensor.effects import clock_wander, gyro_bias_drift, low_pass
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
@@ -159,11 +159,10 @@ def _beside_reference(
         report(3, 4, "simulating again")
         diagnosis = _resimulated(diagnosis, logs, selection, simulated)
     diagnosis = replace(diagnosis, findings=summarize.with_similar(diagnosis.findings, selection, similar.result()))
-    poses = any(not pair.exact for pair in pairs)
+    caveat = reference_caveat(recordings) if (poses := any(not pair.exact for pair in pairs)) else ""
     follows = [own_poses_sentence(pairs)] if poses and simulated is not None else []
     remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
     findings, located = (*conventions, *wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
-    caveat = reference_caveat(recordings) if poses else ""
     diagnosis = replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))
@@ -227,6 +226,7 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     exact = all(pair.exact for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     left_out = {*SHOWN_BY_SAMPLES, NEEDS_POSES if exact else NEEDS_SIMULATION}
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
+    effects = [form for effect in effects for form in low_pass.forms(effect, each_sensor=exact)]
     end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
     effects = [*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]

@@ -189,6 +189,7 @@ class SearchSettings(Settings, frozen=True):
     model_error: Positive = 1e-5  # of the largest effect's squares (0.3 % of its size) may be its model's error
     model_error_denoised: Positive = 1e-3  # the same beside a simulation whose noise was filtered out (3 %)
     model_error_resonance: Positive = 1e-2  # the same beside a mount that rings, whose model is simplified
+    model_error_low_pass: Positive = 1e-2  # of another filter beside a low-pass, whose order and form may be others
     model_error_clock: Positive = 0.1  # of a filter beside a clock of poses, whose drift is no straight line (a third of it)
     observable_squares: Positive = 36.0  # six standard deviations, for some thousand hypotheses
 

@@ -246,10 +246,11 @@ def _parameters(pairs: Sequence[AlignedLog], selected: SelectedEffect) -> dict[s
         jitter_s = np.concatenate([pair.stamp_s - timestamps.even(pair.stamp_s)[0] for pair in pairs])
         std = float(jitter_s.std())
         return {"std": Estimate(std, std / np.sqrt(2.0 * len(jitter_s)), "s")}
-    return {
+    fitted = {
         parameter.name: Estimate(float(value), float(std), parameter.unit)
         for parameter, value, std in zip(selected.effect.parameters, selected.theta, selected.std, strict=True)
     }
+    return fitted | {parameter.name: Estimate(value, 0.0, parameter.unit) for parameter, value in selected.effect.constants}
 
 
 def _curve(selected: SelectedEffect, fitted: Fit) -> Curve | None:

@@ -18,23 +18,33 @@ from imutool.diagnosis.result import CONVENTIONS, Diagnosis, Estimate, Finding
 from imutool.noise.colour import measured
 from imutool.noise.datasheet import Noise
 from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects.low_pass import RATE, digital
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
 NO_EFFECT = CONVENTIONS | {"dropped_samples", "timestamp_jitter", "reference_error", "reference_smoothing"}
 
 
+NONE = Estimate(math.nan, math.nan, "")
+
+
 def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> Chosen:
     """Candidates that were found, strongest first, with the values of the first finding of each."""
-    by_name, found = {effect.name: effect for effect in reversed(candidates)}, dict[str, Mapping[str, Estimate]]()
+    found = dict[str, tuple[Effect, Theta]]()
     for finding in findings:
-        if finding.effect in by_name and finding.effect not in NO_EFFECT:
-            found.setdefault(finding.effect, finding.parameters)
+        alike = [effect for effect in candidates if effect.name == finding.effect and finding.effect not in NO_EFFECT]
+        on_it = [effect for effect in alike if effect.sensors == (finding.signal,)]
+        on_it += [one for one in alike for of, value in one.constants if finding.parameters.get(of.name, NONE).value == value]
+        if alike and (effect := [*on_it, *alike][0]).key not in found:
+            found[effect.key] = _started(effect, finding.parameters)
+    return tuple(found.values())
 
-    def values(effect: Effect, parameters: Mapping[str, Estimate]) -> Theta:
-        return np.array([parameters[of.name].value if of.name in parameters else of.null_value for of in effect.parameters])
 
-    return tuple((by_name[name], values(by_name[name], parameters)) for name, parameters in found.items())
+def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect, Theta]:
+    """An effect with found values; a low-pass is digital if its rate was found."""
+    effect = digital(effect) if effect.lagless is not None and RATE.name in parameters else effect
+    values = [parameters[of.name].value if of.name in parameters else of.null_value for of in effect.parameters]
+    return effect, np.array(values)
 
 
 def to_physics_file(d: Diagnosis) -> PhysicsFile:

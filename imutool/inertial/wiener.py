@@ -6,8 +6,9 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta
+from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter, uniform_filter1d
-from scipy.signal import ShortTimeFFT
+from scipy.signal import ShortTimeFFT, butter, sosfiltfilt
 from scipy.signal.windows import hann
 from scipy.stats import beta
 
@@ -23,6 +24,8 @@ CHANCE = 1e-4  # of noise to share more at one frequency
 APART = 2  # times the frequencies of a mean: so far from what is shared, nothing of a motion is left in what is not
 ALMOST_ALL, NO_NOISE = 0.9, 1e-12  # of the frequencies, which a recording shares; of the largest power, as good as none
 CALM = 1.2  # times `white_noise`, that pure white noise is
+STEPS, LEAST_SAMPLES, MOST_S = 4, 100, 0.5  # of a fit of two clocks; a larger difference is none of their rates
+SLOW_HZ = 8.0  # of the rates by which they are compared: a vibration has another delay one period later
 SMOOTH = 3  # times the frequencies of a mean: over which noise is taken to have one density
 Parts = Complex128[np.ndarray, "f t k"]
 
@@ -121,10 +124,47 @@ def _line(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
     return np.asarray(line)
 
 
-def recorded_at(imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int) -> Float64[np.ndarray, "m 6"]:
-    """Recorded samples at the times of a simulation; NaN outside of them."""
+def recorded_at(
+    imu: Imu, t_s: Float64[np.ndarray, " m"], start_ns: int, gyro: Float64[np.ndarray, "m 3"] | None = None
+) -> Float64[np.ndarray, "m 6"]:
+    """Recorded samples at the times of a simulation; NaN outside of them.
+
+    If its rates `gyro` are given, clocks of two rates are brought to one: half a period of drift hides what is shared.
+    """
     own_s, columns = seconds(imu.t_ns, start_ns), [*imu.gyro.T, *imu.accel.T]
+    own_s = own_s if gyro is None else own_s + _drift_s(own_s, imu.gyro, t_s, gyro)
     return np.stack([np.interp(t_s, own_s, column, left=np.nan, right=np.nan) for column in columns], axis=1)
+
+
+def _drift_s(
+    own_s: Float64[np.ndarray, " n"],
+    recorded: Float64[np.ndarray, "n 3"],
+    t_s: Float64[np.ndarray, " m"],
+    gyro: Float64[np.ndarray, "m 3"],
+) -> Float64[np.ndarray, " n"]:
+    """Line of time to add to recorded stamps.
+
+    With it slow rates agree beside any linear map of them (Gauss-Newton). Nothing if that changes less than a period, or
+    explains no more.
+    """
+    inside = (t_s >= own_s[0]) & (t_s <= own_s[-1])
+    rate_hz, at = float((len(t_s) - 1) / np.ptp(t_s)), t_s[inside]
+    if len(at) < LEAST_SAMPLES or not np.ptp(gyro, axis=0).all():
+        return np.zeros(len(own_s))
+    slow = butter(2, min(SLOW_HZ, 0.4 * rate_hz), fs=rate_hz, output="sos")
+    read = sosfiltfilt(slow, np.stack([np.interp(at, own_s, column) for column in recorded.T], axis=1), axis=0)
+    rate, line, squares = make_interp_spline(t_s, sosfiltfilt(slow, gyro, axis=0), k=3), np.zeros(2), []
+    since = np.column_stack([np.ones(len(at)), (at - at.mean()) / np.ptp(at)])
+    for _ in range(STEPS):
+        now = np.clip(at + since @ line, t_s[0], t_s[-1])
+        A = np.column_stack([rate(now), np.ones(len(at))])
+        M = np.linalg.lstsq(A, read, rcond=None)[0]
+        left, slope = read - A @ M, rate(now, 1) @ M[:3]
+        squares.append(float((left**2).sum()))
+        columns = np.stack([since[:, j, None] * slope for j in (0, 1)], axis=2).reshape(-1, 2)
+        line = line + np.linalg.lstsq(columns, left.ravel(), rcond=None)[0]
+    moved = abs(line[1]) > 1.0 / rate_hz and abs(line).max() < MOST_S and squares[-1] < squares[0]
+    return line[0] + (own_s - at.mean()) / np.ptp(at) * line[1] if moved else np.zeros(len(own_s))
 
 
 def _noise_std(

@@ -96,7 +96,7 @@ class Effect:
     alternatives: out of how many the starts are the best, given the samples; so many times likelier does chance look like one.
     needs: channels that it cannot do without, such as "temperature"; a channel whose name contains it serves.
     kind: of the catalogue, driven by the channel `variable`, or unknown: a curve of `variable`, or a term, on one `axis`.
-    variant: tells effects of one name apart.
+    variant: tells effects of one name apart; constants: parameters that no fit changes, which a finding states.
     jumps: what comes out is no smooth function of the parameters: an edge between two samples.
     trained: a bias model can have it: its error follows from the sensor's own samples and is linear in all parameters but those
         `fixed_in_training`.
@@ -124,6 +124,7 @@ class Effect:
     variable: str = ""
     axis: int | None = None
     variant: str = ""
+    constants: tuple[tuple[Parameter, float], ...] = ()
     jumps: bool = False
     trained: bool = False
     diagnosed: bool = True

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
 
-from imutool.inertial.wiener import denoised, wiener_filter
+from imutool.inertial.wiener import denoised, recorded_at, wiener_filter
+from imutool.recording import Imu
 
 RATE_HZ, DURATION_S, MOTION_HZ = 400.0, 60.0, 5.0
 
@@ -107,3 +108,19 @@ def test_nothing_is_taken_from_shocks_that_a_recording_shares() -> None:
     recorded = x + 0.01 * rng.normal(size=x.shape)
     off = denoised(x, RATE_HZ, recorded=recorded)[0] - x
     assert np.sqrt((off**2).mean()) < 1e-6
+
+
+def test_a_clock_that_runs_fast_does_not_hide_what_is_shared() -> None:
+    """Over a minute 200 ppm are 12 ms: a period of 80 Hz."""
+    rate, start_ns = motion(5), 1_700_000_000_000_000_000
+    t_s = np.arange(len(rate)) / RATE_HZ
+    turns = 2.0 * np.pi * np.cumsum(80.0 + 5.0 * np.sin(2.0 * np.pi * 0.1 * t_s)) / RATE_HZ
+    vibration = np.cos(turns[:, None] + [0.0, 1.0, 2.0])
+    t_ns = start_ns + np.round(t_s * (1.0 + 2e-4) * 1e9).astype(np.int64)
+    recorded = recorded_at(Imu(t_ns, rate, vibration), t_s, start_ns, rate)
+    known = np.isfinite(recorded).all(axis=1)
+    for k in (3, 4, 5):
+        assert np.corrcoef(recorded[known, k], vibration[known, k - 3])[0, 1] > 0.9
+    own_clock = recorded_at(Imu(t_ns, rate, vibration), t_s, start_ns)
+    known = np.isfinite(own_clock).all(axis=1)
+    assert abs(np.corrcoef(own_clock[known, 3], vibration[known, 0])[0, 1]) < 0.5

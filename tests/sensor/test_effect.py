@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 from support.planted import simulate_samples
 
@@ -15,7 +16,7 @@ from imutool import registry
 from imutool.errors import ConfigError, DataError
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Stage, distort
-from imutool.sensor.effects import clock_wander
+from imutool.sensor.effects import clock_wander, low_pass
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.sensor.signals import SLOW_S
 
@@ -339,6 +340,49 @@ def test_a_low_pass_has_the_gain_and_phase_of_its_formula(f_hz: float, cutoff_hz
     exact = 1.0 / (1.0 + 1j * f_hz / cutoff_hz)
     for values in (out.gyro, out.accel, out.alpha):
         assert abs(response(values[:, 0], f_hz, felt.t_s) / exact - 1.0) < promised(f_hz)
+
+
+@pytest.mark.parametrize(("order", "name", "shape"), [(1, "low_pass", ()), (2, "second_order_low_pass", (0.5**0.5,))])
+@pytest.mark.parametrize("cutoff_hz", [8.0, 40.0, 80.0])  # of 200 Hz
+def test_a_digital_low_pass_is_that_of_scipy(order: int, name: str, shape: tuple[float, ...], cutoff_hz: float) -> None:
+    """Once the start is forgotten, up to half of the rate."""
+    felt = lively()
+    felt = replace(felt, gyro=felt.gyro + np.random.default_rng(order).normal(size=felt.gyro.shape))
+    b, a = butter(order, cutoff_hz, fs=felt.rate_hz)
+    out = act(name, felt, cutoff_hz, *shape, felt.rate_hz)
+    for values, exact in ((out.gyro, lfilter(b, a, felt.gyro, axis=0)), (out.accel, lfilter(b, a, felt.accel, axis=0))):
+        np.testing.assert_allclose(values[100:-100], exact[100:-100], atol=1e-6)
+
+
+@pytest.mark.parametrize(("order", "cutoff_hz"), [(4, 25.0), (4, 70.0), (3, 25.0), (0, 0.4429 * 25.0)])
+def test_a_low_pass_of_higher_order_and_a_moving_average_are_those_of_scipy(order: int, cutoff_hz: float) -> None:
+    felt = lively()
+    felt = replace(felt, gyro=felt.gyro + np.random.default_rng(order).normal(size=felt.gyro.shape))
+    b, a = butter(order, cutoff_hz, fs=felt.rate_hz) if order else (np.full(8, 1.0 / 8.0), [1.0])  # 40 ms at 200 Hz
+    out = act("low_pass", felt, cutoff_hz * felt.rate_hz / 200.0 if not order else cutoff_hz, felt.rate_hz, float(order))
+    for values, exact in ((out.gyro, lfilter(b, a, felt.gyro, axis=0)), (out.accel, lfilter(b, a, felt.accel, axis=0))):
+        np.testing.assert_allclose(values[200:-200], exact[200:-200], atol=1e-6)
+
+
+@pytest.mark.parametrize("order", [0.0, 1.0, 3.0, 4.0])
+@pytest.mark.parametrize("rate_hz", [math.inf, 200.0])
+def test_the_lag_of_a_low_pass_is_that_of_slow_motion(order: float, rate_hz: float) -> None:
+    design = low_pass.Design(20.0, None, rate_hz, order)
+    f_hz = np.array([0.01])
+    assert design.lag_s == pytest.approx(-np.angle(design.answer(f_hz))[0] / (2.0 * np.pi * f_hz[0]), rel=1e-4)
+    assert abs(design.answer(np.array([20.0]))[0]) == pytest.approx(0.5**0.5, rel=0.02 if order == 0.0 else 1e-9)
+
+
+@pytest.mark.parametrize("name", ["low_pass", "second_order_low_pass"])
+def test_a_low_pass_of_one_sensor_leaves_the_other(name: str) -> None:
+    felt, (both,) = lively(), catalogue.effects([name])
+    theta = np.array([10.0] if name == "low_pass" else [10.0, 0.7])
+    for sensor, other in (("gyro", "accel"), ("accel", "gyro")):
+        one = next(form for form in low_pass.forms(both, each_sensor=True) if form.sensors == (sensor,))
+        for forward in ("forward", "lagless"):
+            out, of_both = (getattr(effect, forward)(felt, theta) for effect in (one, both))
+            np.testing.assert_array_equal(getattr(out, sensor), getattr(of_both, sensor))
+            assert getattr(out, other) is getattr(felt, other)
 
 
 @pytest.mark.parametrize("f_hz", [3.0, 66.0])  # of 200 Hz

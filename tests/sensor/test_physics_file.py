@@ -147,6 +147,16 @@ def test_parameters_go_in_the_effects_own_order_and_what_is_left_out_does_nothin
     np.testing.assert_array_equal(theta, [1.0, 2.0, np.inf])
 
 
+def test_a_low_pass_acts_on_the_sensor_that_the_file_names() -> None:
+    rng = np.random.default_rng(1)
+    felt = IdealMotion(0.01 * np.arange(200), *(rng.normal(size=(200, 3)) for _ in range(3)))
+    slow = {"f_c": Value(value=5.0, unit="Hz")}
+    for signal, changed in (("accel", [False, True]), ("gyro", [True, False]), ("both", [True, True]), ("", [True, True])):
+        effect, theta = one(PhysicsFile(effect=(Entry(name="low_pass", signal=signal, parameters=slow),)))
+        out = effect.forward(felt, theta)
+        assert [bool((out.gyro != felt.gyro).any()), bool((out.accel != felt.accel).any())] == changed
+
+
 @pytest.fixture
 def ideal() -> SensorSamples:
     rng = np.random.default_rng(0)

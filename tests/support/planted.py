@@ -15,6 +15,7 @@ from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
 from imutool.sensor.effect import Acting, Effect, SignalState, in_stage_order
+from imutool.sensor.effects import low_pass
 from imutool.sensor.made_up_flight import FlightSettings, trajectory
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
@@ -72,14 +73,20 @@ def shaken(seed: int = 1, duration_s: float = DURATION_S) -> IdealMotion:
 
 
 def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
-    """Effects of the catalogue by name, with their parameters."""
-    return tuple((_catalogue.diagnosed([name])[0], np.array(theta, dtype=float)) for name, theta in effects.items())
+    """Effects of the catalogue by name, with their parameters; a low-pass without all is analog."""
+    found = ((_catalogue.diagnosed([name])[0], np.array(theta, dtype=float)) for name, theta in effects.items())
+    return tuple((one if len(theta) == len(one.parameters) else _analog(one), theta) for one, theta in found)
+
+
+def _analog(effect: Effect) -> Effect:
+    return low_pass.forms(effect, each_sensor=False)[0]
 
 
 def catalogue() -> tuple[Effect, ...]:
     """All that a fit can find beside a simulation, without another channel of the log."""
     others = {*SHOWN_BY_SAMPLES, "clock_wander"}
-    return tuple(one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in others)
+    found = (one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in others)
+    return tuple(form for one in found for form in low_pass.forms(one, each_sensor=True))
 
 
 def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:

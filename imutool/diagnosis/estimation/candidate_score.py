@@ -22,6 +22,7 @@ from imutool.diagnosis.estimation.unnamed_effects import finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.processes.forked import of_each
 from imutool.sensor.effect import Effect, Stage, Theta
+from imutool.sensor.effects import low_pass
 
 FILTERS = Stage.MOUNT, Stage.BANDWIDTH
 UNSURE = 0.5  # of a score, by which derivatives beside an earlier fit may be wrong
@@ -267,7 +268,7 @@ def restored(described: Portable, like: Fit, effects: Sequence[Effect]) -> Fit:
     """Fit as another process described it; finer curves are made again."""
     by_key, chosen = {effect.key: effect for effect in effects}, list[tuple[Effect, Theta]]()
     for key, names, theta in described.chosen:
-        whole = by_key[key]
+        whole = low_pass.digital(by_key[key]) if low_pass.RATE.name in names else by_key[key]
         free = [k for k, parameter in enumerate(whole.parameters) if parameter.name in names]
         effect = with_free(whole, free) if len(free) == len(names) else finer_curve(like.logs, whole)
         assert effect is not None, f"{key} was made from the same samples"

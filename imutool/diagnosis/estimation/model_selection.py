@@ -18,6 +18,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.noise_estimate import axis_squares
 from imutool.diagnosis.estimation.observability import (
+    LOW_PASSES,
     WANDER,
     beyond_the_band,
     values_of,
@@ -27,7 +28,7 @@ from imutool.diagnosis.estimation.observability import (
     without_implausible,
 )
 from imutool.diagnosis.estimation.significance import bic, gain_for, unnamed_count
-from imutool.diagnosis.estimation.trial.lag_start import beside_offset, without_unseen_low_pass
+from imutool.diagnosis.estimation.trial.lag_start import beside_offset, with_form_of_low_pass, without_unseen_low_pass
 from imutool.diagnosis.estimation.trial.model_error import LowPassError
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.verdicts import Trial
@@ -93,7 +94,10 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
         gained = axis_squares(now) - axis_squares(better or now)
         if better is not None and gained.max() >= settings.negligible_share * largest[gained.argmax()]:
             largest = np.maximum(largest, gained)
-            before, now = now.objective, search.pruned(search.exchanged(with_finer_curve(search.logs, better)))
+            better = with_finer_curve(search.logs, better)
+            if better.chosen[-1][0].name in LOW_PASSES:
+                better = with_form_of_low_pass(search.logs, better, search.named)
+            before, now = now.objective, search.pruned(search.exchanged(better))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
         else:
@@ -107,6 +111,11 @@ class _Search(Trial):
     trials: dict[str, Fit] = field(default_factory=dict)  # with one more candidate than `trials_of`
     trials_of: Fit | None = None
 
+    @property
+    def searched(self) -> tuple[Effect, ...]:
+        """Named candidates, but for low-passes that come in as the form of another."""
+        return tuple(one for one in self.named if not one.constants and (one.name != LOW_PASSES[1] or not one.variant))
+
     def removable(self, now: Fit) -> range:
         """Indices of effects but for those of every fit and the last, which has just come in."""
         return range(len(self.always), len(now.chosen) - 1)
@@ -115,7 +124,7 @@ class _Search(Trial):
         """The best fit with one more effect; none if chance explains its gain, or the error of a low-pass may do so."""
         settings, share, count = self.settings, self.settings.rival_share, self.settings.fitted_each_round
         self.trials_of, self.trials = now, self.trials if self.trials_of is now else {}
-        allowed = self.named + (self.unnamed if unnamed_count(now) < settings.most_unnamed else ())
+        allowed = self.searched + (self.unnamed if unnamed_count(now) < settings.most_unnamed else ())
         allowed, error = tuple(effect for effect in allowed if effect.key not in but_for), LowPassError.of(now)
         best: tuple[float, Fit] | None = None
         unsure = set[str]()
@@ -164,7 +173,7 @@ class _Search(Trial):
             without = fit(self.logs, others, iterations=2, near=now)
             own_log_p = self.candidates.log_p(mine, without.objective - now.objective)
             unfitted = fit(self.logs, others, iterations=0, near=now)  # refitted, a nonlinear effect may diverge for good
-            for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.named, 2)[:2]:
+            for log_p, effect, start, _ in self.candidates.ranked(unfitted, self.searched, 2)[:2]:
                 if effect.key == mine.key and effect.linear:  # its score is its gain
                     break
                 if effect.key == mine.key or (log_p > own_log_p and not mine.linear):
@@ -181,6 +190,7 @@ class _Search(Trial):
             rivals = self.rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
+        now = with_form_of_low_pass(self.logs, now, self.named)
         now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
         log_p, most = self.candidates.log_p, self.threshold

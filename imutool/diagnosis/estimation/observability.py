@@ -128,7 +128,7 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[
     """Fit with the plainer of two effects where the other is not clearly better (BIC)."""
     poses = any(log.pair.band_hz is not None for log in logs)
     for complex_one, theta in now.chosen:
-        sizes = _plainer(complex_one.name, theta, poses=poses)
+        sizes = _plainer(complex_one, theta, poses=poses)
         rest = tuple(entry for entry in now.chosen if entry[0] is not complex_one)
         plainer = [effect for effect in named if effect.name in sizes and effect.key not in now.keys]
         parts = [(with_free(e, sizes[e.name][0], complex_one.sensors), np.array(sizes[e.name][1])) for e in plainer]
@@ -140,19 +140,20 @@ def with_plainer_effects(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[
     return now
 
 
-def _plainer(name: str, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
+def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple[Sequence[int], Sequence[float]]]:
     """Effects that may stand for one: their free parameters, by index, and a start.
 
     A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift or step of a bias beside a
     temperature of the log, two gains of axes that hardly change their sign, three scales as one gravity within what Earth has.
     """
+    name = effect.name
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
     if name == LOW_PASSES[1]:
-        return {
-            "clock_offset": ([0], [-low_pass.lag_s(theta)]),
-            "low_pass": ([0], [1.0 / (2.0 * np.pi * low_pass.lag_s(theta))]),
-        }
+        lag_s = low_pass.Design.of(effect, theta).lag_s
+        if len(effect.sensors) == 1:
+            return {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
+        return {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
     if name == "gyro_delay" and poses:
         return {"clock_offset": ([0], [-theta[0]])}
     if name in PLAINER:

@@ -174,12 +174,12 @@ def _simulated(
     if ideal is not None:
         t_s = seconds(sim.truth.t_ns[:1], start_ns + nanoseconds(shift_s))[0] + ideal.t_s
         ideal = replace(ideal, t_s=t_s, channels=_channels(real, start_ns + np.round(t_s * 1e9).astype(np.int64)))
-        witnesses = recorded_at(sim.imu, t_s, start_ns + nanoseconds(shift_s)), recorded_at(real.imu, t_s, start_ns)
+        witnesses = recorded_at(sim.imu, t_s, start_ns + nanoseconds(shift_s)), recorded_at(real.imu, t_s, start_ns, ideal.gyro)
         ideal, left = _shared_motion(ideal, 1.0 / period_s, np.concatenate(witnesses, axis=1), settings.alignment)
         return ideal, np.zeros(6), None if own_poses else left
     t_s = np.linspace(t_sim[0], t_sim[-1], round((t_sim[-1] - t_sim[0]) / period_s) + 1)  # on the samples, if they are even
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
-    recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns)  # which does not share errors of poses either
+    recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
     clean = refined(clean, white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)))
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))

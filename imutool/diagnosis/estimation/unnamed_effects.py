@@ -24,7 +24,7 @@ from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.effects.low_pass import smoothed
+from imutool.sensor.effects.low_pass import Design, smoothed
 from imutool.sensor.physics_file_terms import VARIABLES, Variable, product_of
 from imutool.sensor.physics_file_terms import driven as channel_effect
 from imutool.sensor.samples import Recent, SensorSamples
@@ -284,10 +284,10 @@ def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:
     gain, of_lag = without.objective - found.objective, alike.objective - found.objective
     if of_lag >= LAG_SHARE * gain:
         return False
-    return gain < sum(_smoothed_squares(log, theta, found.part) for log in found.logs)
+    return gain < sum(_smoothed_squares(log, Design.of(effect, theta), found.part) for log in found.logs)
 
 
-def _smoothed_squares(log: WhitenedLog, theta: Theta, part: str) -> float:
+def _smoothed_squares(log: WhitenedLog, design: Design, part: str) -> float:
     """White squares that a low-pass takes from the noise that is left of a simulation; infinite if that is unknown."""
     left, share = log.pair.noise_left, SMOOTHED_SHARE if isinstance(log.pair, Pair) else 1.0  # of a signal it is all noise
     if left is None:
@@ -296,5 +296,5 @@ def _smoothed_squares(log: WhitenedLog, theta: Theta, part: str) -> float:
     density = make_interp_spline(left.f_hz, left.density, k=1)(np.fft.rfftfreq(n, 1.0 / rate_hz).clip(max=left.f_hz[-1]))
     white = np.fft.rfft(np.random.default_rng(0).normal(scale=np.sqrt(rate_hz / 2.0), size=(n, log.pair.columns)), axis=0)
     noise = np.fft.irfft(np.sqrt(density) * white, n, axis=0)
-    before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, theta)))
+    before, after = (log.whiten(x)[log.rows(part)] for x in (noise, smoothed(noise, rate_hz, design)))
     return share * float((before**2).sum() - (after**2).sum())

@@ -29,6 +29,8 @@ from imutool.sensor.trajectory import Stretch, smooth_motion
 from imutool.units import AXES, SENSORS, UNITS
 
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
+SELDOM = 0.1  # of the samples of an axis that are equal to the one before: digits are finer than the noise
+MOSTLY_NEW = 0.3  # of the samples that repeat the one before: more is a topic that is faster than its sensor
 MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 COPIED = 0.5  # share of a simulation's poses whose stamps the recording has, too: above, it may follow them
 DRIFTING = frozenset({"clock_skew", "clock_jump", "clock_wander"})
@@ -56,6 +58,8 @@ def align_all(
             refused.append(error.at(recording.name))
             continue
         pairs += [without_unusable(pair, settings.reference) for pair in aligned]
+        if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
+            remarks.append(f"{recording.name}: {again} samples repeat the one before on every axis, and do not count")
         covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
         if covered < settings.reference.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
@@ -166,12 +170,14 @@ def own_poses_sentence(pairs: Sequence[Pair]) -> str:
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
-    """Pair without clipped samples, and without axes that are stuck or nearly always clipped.
+    """Pair without clipped and repeated samples, and axes stuck or nearly always clipped.
 
     Raises:
         DataError: no axis is left.
     """
-    known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real))
+    known = ~(
+        timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real) | repeats(pair.real)[:, None]
+    )
     known &= True if pair.known is None else pair.known
     if known.all():
         return pair
@@ -186,6 +192,18 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
             fix="Record with a sensor that works, of a wider range or of finer digits",
         )
     return reduced
+
+
+def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+    """Samples that repeat the one before on every axis.
+
+    The axes seldom read the same twice otherwise. A driver that missed a sample may send the last one again. Digits that are
+    coarser than the noise repeat by themselves.
+    """
+    equal = np.concatenate([np.zeros((1, 6), bool), np.diff(real, axis=0) == 0])[: len(real)]
+    again = equal.all(axis=1)
+    by_chance = equal[~again].mean(axis=0) if (~again).any() else np.ones(6)
+    return np.asarray(again & bool(by_chance.max() < SELDOM and again.mean() < MOSTLY_NEW))
 
 
 # ── without a reference ──

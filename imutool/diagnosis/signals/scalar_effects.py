@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.jacobians import SplineCurve
 from imutool.diagnosis.estimation.unnamed_effects import LAGS_S
 from imutool.diagnosis.signals.aligned_signal import AlignedSignal
 from imutool.sensor.effect import Effect, Kind, Parameter, Stage, Theta
-from imutool.sensor.effects.low_pass import smoothed
+from imutool.sensor.effects.low_pass import Design, smoothed
 from imutool.sensor.robot_effects.signal_samples import IdealSignal, Samples, SignalSamples
 from imutool.units import AXES
 
@@ -122,7 +122,7 @@ def _low_pass(ideal: IdealSignal, theta: Theta) -> IdealSignal:
 
 
 def _lagless(ideal: IdealSignal, theta: Theta) -> IdealSignal:
-    return replace(ideal, fine=smoothed(ideal.fine, ideal.rate_hz, theta))
+    return replace(ideal, fine=smoothed(ideal.fine, ideal.rate_hz, Design(float(theta[0]))))
 
 
 def _dead_bands(size: float, unit: str) -> Iterator[Effect]:

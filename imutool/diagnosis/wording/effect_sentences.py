@@ -120,6 +120,15 @@ def _mount_resonance(w: Words) -> str:
     return f"the mount rings after shocks at {w.main}, which no sample predicts"
 
 
+def _low_pass(w: Words) -> str:
+    """Cut-off of a filter, and its order."""
+    order = w.finding.parameters.get("order")
+    form = (
+        "first-order low-pass" if order is None else f"low-pass of order {order.value:g}" if order.value else "moving average"
+    )
+    return f"{w.it} is too slow for what happens above {w.main} ({form})"
+
+
 def _reference_error(w: Words) -> str:
     """Short wrong intervals, or an attitude that is turned throughout."""
     if any(name.startswith("turned_") for name in w.finding.parameters):
@@ -156,7 +165,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
     "accel_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
     "gyro_dead_band": "{w.it} reads zero below {w.main}",
-    "low_pass": "{w.it} is too slow for what happens above {w.main} (first-order low-pass)",
+    "low_pass": _low_pass,
     "second_order_low_pass": "{w.it} is too slow for fast motion, {w.main.labelled} (second-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",

@@ -6,11 +6,17 @@ so that N is smooth, and a few taps follow it. They minimise relative squares ov
 Slow frequencies count most: a body moves slowly, and a delay of a hundredth of a sample would look like a clock's offset. Gain
 and phase are right to 1e-4 up to a tenth of the sample rate and to 1e-3 up to a quarter (the bilinear transform is off by 27 %
 in frequency there, a hold by half a sample).
+
+A digital filter, made by that bilinear transform at its own `rate` and with the cut-off frequency kept (as by
+`scipy.signal.butter`), answers a frequency f as the analog one does f_c tan(pi f / rate) / tan(pi f_c / rate): H is 0 at half
+of its rate. Samples of another rate see it by its frequencies. An `order` n is that of a Butterworth filter. Order 0
+is the mean of the last T seconds, f_c = 0.443 / T, and at a rate that of the last T rate samples.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -20,9 +26,11 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import lfilter
 
 from imutool.array_types import Complex128, Float64
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
-from imutool.sensor.samples import IdealMotion, Vectors
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.samples import IdealMotion, SensorSamples, Vectors
+from imutool.units import SENSORS, Sensor
 
+MOST = 0.4999  # cycles a sample of a digital filter: its gain is 0 at a half
 START_HZ = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)
 FORGOTTEN = 4.0  # periods of the cut-off frequency, after which less than 1e-10 of a sample is left
 AHEAD, BEHIND = 5, 8  # samples that a tap looks ahead and back: this is no filter for samples as they arrive
@@ -30,36 +38,99 @@ BAND = 0.35  # of the sample rate
 OMEGA = np.linspace(0.0, 2.0 * np.pi * BAND, 48)  # rad a sample
 SLOW, FALL = 0.02, 3  # of half the sample rate, from where on, and by which power of the frequency, relative errors may grow
 WEIGHT = 1.0 / (SLOW**FALL + (OMEGA / np.pi) ** FALL)
+RATE = Parameter("rate", "Hz", 200.0, positive=True, null_value=math.inf)  # of a digital filter
+ORDER = Parameter("order", "-", 1.0, null_value=1.0)  # of a Butterworth filter; 0: a moving average
+AVERAGE = 0.4429  # f_c T of a moving average: there it has lost half of the power
+HIGHER = 0, 4  # orders that a diagnosis tries, beside the first and the second
 WAVES = np.exp(-1j * OMEGA[:, None] * np.arange(-AHEAD, BEHIND + 1))
 
 
-def _forward(motion: IdealMotion, cutoff_hz: Theta) -> IdealMotion:
-    """The filter starts settled; an infinite cut-off frequency lets everything pass."""
-    if math.isinf(cutoff_hz[0]):
+def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
+    """f_c (Hz), the rate of a digital filter, and the order.
+
+    The filter starts settled; an infinite cut-off frequency lets everything pass.
+    """
+    if math.isinf(theta[0]):
         return motion
-    a = 2.0 * math.pi * float(cutoff_hz[0]) / motion.rate_hz  # rad a sample
+    design = _design(theta)
+    if math.isfinite(design.rate_hz) or design.order != 1.0:
+        return behind_gain(motion, design, lag=True)
+    a = 2.0 * math.pi * float(theta[0]) / motion.rate_hz  # rad a sample
     gyro, accel, alpha = (slowed(motion, x, _first_order(a)) for x in (motion.gyro, motion.accel, motion.alpha))
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
-def lag_s(theta: Theta) -> float:
-    """Lag (s) far below the cut-off (Hz), of a first order, or of a second by its damping."""
-    twice_zeta = 2.0 * float(theta[1]) if len(theta) > 1 else 1.0
-    return twice_zeta / (2.0 * math.pi * float(theta[0]))
+class Design(NamedTuple):
+    """Design of a low-pass: of second order if it has a damping, digital if it has a rate."""
+
+    cutoff_hz: float
+    zeta: float | None = None
+    rate_hz: float = math.inf
+    order: float = 1.0
+
+    @classmethod
+    def of(cls, effect: Effect, theta: Theta) -> Design:
+        """Design of an effect of this or of second order."""
+        values = dict(zip((parameter.name for parameter in effect.parameters), theta.tolist(), strict=True))
+        values |= {parameter.name: value for parameter, value in effect.constants}
+        return cls(float(theta[0]), values.get("zeta"), values.get(RATE.name, math.inf), values.get(ORDER.name, 1.0))
+
+    @property
+    def lag_s(self) -> float:
+        """Lag far below the cut-off."""
+        if not self.order:
+            return 0.5 * (AVERAGE / self.cutoff_hz - (1.0 / self.rate_hz if math.isfinite(self.rate_hz) else 0.0))
+        twice_zeta = float(-self.poles.real.sum()) if self.zeta is None else 2.0 * self.zeta
+        cutoff = math.pi * self.cutoff_hz
+        if math.isfinite(self.rate_hz):
+            cutoff = self.rate_hz * math.tan(min(cutoff / self.rate_hz, math.pi * MOST))
+        return 0.5 * twice_zeta / cutoff
+
+    @property
+    def poles(self) -> Complex128[np.ndarray, " order"]:
+        """Poles of a Butterworth filter with a cut-off of one rad/s."""
+        n = round(self.order)
+        return np.asarray(np.exp(0.5j * np.pi * (2.0 * np.arange(1, n + 1) + n - 1.0) / n))
+
+    def answer(self, f_hz: Float64[np.ndarray, " f"]) -> Complex128[np.ndarray, " f"]:
+        """What it makes of a wave of one, by frequency."""
+        if not self.order:
+            window_s = AVERAGE / self.cutoff_hz
+            own = np.sinc(np.clip(f_hz / self.rate_hz, 0.0, 0.5))  # of a mean of samples, up to half of their rate
+            return np.asarray(np.sinc(f_hz * window_s) / own * np.exp(-2j * np.pi * f_hz * self.lag_s))
+        x = f_hz / self.cutoff_hz
+        if math.isfinite(self.rate_hz):
+            x = _folded_tan(f_hz / self.rate_hz) / math.tan(math.pi * min(self.cutoff_hz / self.rate_hz, MOST))
+        if self.zeta is not None:
+            return np.asarray(1.0 / (1.0 - x**2 + 2j * self.zeta * x))
+        return np.asarray(1.0 / np.prod(1.0 - 1j * x[:, None] / self.poles, axis=1))
 
 
-def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, theta: Theta) -> Float64[np.ndarray, "n k"]:
-    """Columns with the gain of a low-pass, of first or second order, and without its lag."""
-    gain = _Gain.of(len(x), float(theta[0]) / rate_hz, *theta[1:].tolist())
+def smoothed(x: Float64[np.ndarray, "n k"], rate_hz: float, design: Design) -> Float64[np.ndarray, "n k"]:
+    """Columns with the gain of a low-pass, and without its lag."""
+    gain = _Gain.of(len(x), rate_hz, design)
     return np.stack([gain.on(column) for column in x.T], axis=1)
 
 
-def without_lag(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """Motion with the gain of a low-pass, and without its lag."""
-    gain = _Gain.of(len(motion.gyro), float(theta[0]) / motion.rate_hz, *theta[1:].tolist())
+def behind_gain(motion: IdealMotion, design: Design, *, lag: bool) -> IdealMotion:
+    """Motion behind a low-pass by its frequencies, with its lag or without."""
+    gain = _Gain.of(len(motion.gyro), motion.rate_hz, design, lag=lag)
     columns = (motion.sampler.behind.changed(x, gain, gain.on) for x in (motion.gyro, motion.accel, motion.alpha))
     gyro, accel, alpha = columns
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
+
+
+def _without_lag(motion: IdealMotion, theta: Theta) -> IdealMotion:
+    return behind_gain(motion, _design(theta), lag=False)
+
+
+def _design(theta: Theta) -> Design:
+    return Design(float(theta[0]), None, *theta[1:].tolist())
+
+
+def _folded_tan(f: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """tan(pi f), f in cycles a sample of a filter, to which whole numbers are alike."""
+    return np.asarray(np.tan(np.pi * np.clip(f - np.round(f), -MOST, MOST)))
 
 
 class _Gain(NamedTuple):
@@ -67,16 +138,17 @@ class _Gain(NamedTuple):
 
     margin: int
     length: int
-    gain: Float64[np.ndarray, " f"]
+    gain: Float64[np.ndarray, " f"] | Complex128[np.ndarray, " f"]
 
     @staticmethod
     @lru_cache(maxsize=8)
-    def of(n: int, cutoff: float, zeta: float | None = None) -> _Gain:
-        """Gain for n samples, cutoff in cycles a sample; the same object again, by which a motion knows its columns."""
-        margin = min(n - 1, math.ceil(FORGOTTEN / (cutoff * min(1.0, zeta or 1.0))))
+    def of(n: int, rate_hz: float, design: Design, *, lag: bool = False) -> _Gain:
+        """Gain for n samples; the same object again, by which a motion knows its columns."""
+        damping = design.zeta or float(np.min(-design.poles.real, initial=1.0))
+        margin = min(n - 1, math.ceil(FORGOTTEN * rate_hz / (design.cutoff_hz * min(1.0, damping))))
         length = next_fast_len(n + 2 * margin, real=True)
-        x = rfftfreq(length) / cutoff
-        return _Gain(margin, length, 1.0 / (np.hypot(1.0, x) if zeta is None else np.hypot(1.0 - x**2, 2.0 * zeta * x)))
+        answer = design.answer(rfftfreq(length) * rate_hz)
+        return _Gain(margin, length, answer if lag else np.abs(answer))
 
     def on(self, x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """The column behind the gain."""
@@ -134,15 +206,88 @@ def _taps(numerator: Complex128[np.ndarray, " w"]) -> Float64[np.ndarray, " taps
     return np.asarray(np.linalg.lstsq(both, np.concatenate([WEIGHT, np.zeros(len(OMEGA))]), rcond=None)[0])
 
 
+def digital_starts(
+    *analog: Sequence[float], order: Sequence[float] = ()
+) -> Callable[[IdealMotion, SensorSamples], Sequence[Theta]]:
+    """Starts of a digital filter that runs at the rate of the samples."""
+
+    def starts(_motion: IdealMotion, samples: SensorSamples) -> Sequence[Theta]:
+        return [np.array([*theta, 1.0 / float(np.median(np.diff(samples.stamp_s))), *order]) for theta in analog]
+
+    return starts
+
+
+def analog(effect: Effect) -> Effect:
+    """A low-pass without the rate of a digital one, of its lowest order."""
+    starts, kept = effect.starts, tuple(one for one in effect.parameters if one not in (RATE, ORDER))
+    assert starts is not None, "a low-pass has starts"
+    return replace(effect, parameters=kept, starts=lambda motion, at: [theta[: len(kept)] for theta in starts(motion, at)])
+
+
+def of_order(first: Effect, order: float) -> Effect:
+    """An analog low-pass of another order."""
+
+    def full(theta: Theta) -> Theta:
+        return np.array([theta[0], theta[1] if len(theta) > 1 else math.inf, order])
+
+    return replace(
+        first,
+        variant=f"order {order:g}",
+        constants=((ORDER, float(order)),),
+        forward=lambda motion, theta: _forward(motion, full(theta)),
+        lagless=lambda motion, theta: _without_lag(motion, full(theta)),
+    )
+
+
+def of_one(effect: Effect, sensor: Sensor) -> Effect:
+    """A low-pass of one sensor alone: many chips have a filter for each."""
+
+    def alone(change: Callable[[IdealMotion, Theta], IdealMotion]) -> Callable[[IdealMotion, Theta], IdealMotion]:
+        def changed(motion: IdealMotion, theta: Theta) -> IdealMotion:
+            x = motion.gyro if sensor == "gyro" else motion.accel
+            y = change(replace(motion, gyro=x, accel=x, alpha=x), theta).gyro  # the same array, so that it is filtered once
+            return replace(motion, gyro=y) if sensor == "gyro" else replace(motion, accel=y)
+
+        return changed
+
+    assert effect.lagless is not None, "a low-pass has a lag"
+    alone_lagless = alone(effect.lagless)
+    return replace(effect, variant=sensor, sensors=(sensor,), forward=alone(effect.forward), lagless=alone_lagless)
+
+
+def of_signal(effect: Effect, signal: str) -> Effect:
+    """A low-pass of the one sensor that a signal names; any other effect itself."""
+    sensor = next((one for one in SENSORS if one == signal), None)
+    return effect if effect.lagless is None or sensor is None else of_one(effect, sensor)
+
+
+def forms(effect: Effect, *, each_sensor: bool) -> list[Effect]:
+    """Forms of a low-pass without a rate; another effect itself.
+
+    Beside a simulation a low-pass may be of each sensor alone, or of another order.
+    """
+    if effect.lagless is None:
+        return [effect]
+    both, higher = analog(effect), HIGHER if ORDER in effect.parameters else ()
+    if not each_sensor:
+        return [both]
+    return [both, *(of_one(both, sensor) for sensor in SENSORS), *(of_order(both, order) for order in higher)]
+
+
+def digital(of_analog: Effect) -> Effect:
+    """The low-pass with the rate of a digital one."""
+    return replace(of_analog, parameters=(*of_analog.parameters, RATE))
+
+
 EFFECT = Effect(
     "low_pass",
     Stage.BANDWIDTH,
     ("gyro", "accel"),
-    "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel",
-    (Parameter("f_c", "Hz", 20.0, positive=True, null_value=math.inf),),
+    "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel (at a rate: bilinear)",
+    (Parameter("f_c", "Hz", 20.0, positive=True, null_value=math.inf), RATE, ORDER),
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,
     linear=False,
-    starts=starts_at(*([hz] for hz in START_HZ)),
-    lagless=without_lag,
+    starts=digital_starts(*([hz] for hz in START_HZ), order=[1.0]),
+    lagless=_without_lag,
 )

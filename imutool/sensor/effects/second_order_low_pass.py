@@ -13,21 +13,31 @@ from functools import lru_cache
 
 import numpy as np
 
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, starts_at
-from imutool.sensor.effects.low_pass import OMEGA, Filter, slowed, without_lag
+from imutool.sensor.effect import Effect, Parameter, Stage, Theta
+from imutool.sensor.effects.low_pass import OMEGA, RATE, Design, Filter, behind_gain, digital_starts, slowed
 from imutool.sensor.samples import IdealMotion
 
 BUTTERWORTH = 0.7  # damping, nearly
+LEAST_DAMPING = 0.2  # less rings, and passes no more of slow motion than of fast
 START_HZ = (5.0, 12.0, 30.0, 80.0)
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """f_c (Hz), zeta; the filter starts settled, and an infinite cut-off frequency lets everything pass."""
+    """f_c (Hz), zeta, and the rate of a digital filter.
+
+    The filter starts settled, and an infinite cut-off frequency lets everything pass.
+    """
     if math.isinf(theta[0]):
         return motion
+    if len(theta) > 2 and math.isfinite(theta[2]):
+        return behind_gain(motion, Design(*theta.tolist()), lag=True)
     by = _second_order(2.0 * math.pi * float(theta[0]) / motion.rate_hz, float(theta[1]))
     gyro, accel, alpha = (slowed(motion, x, by) for x in (motion.gyro, motion.accel, motion.alpha))
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
+
+
+def _without_lag(motion: IdealMotion, theta: Theta) -> IdealMotion:
+    return behind_gain(motion, Design(*theta.tolist()), lag=False)
 
 
 @lru_cache(maxsize=64)
@@ -43,14 +53,15 @@ EFFECT = Effect(
     "second_order_low_pass",
     Stage.BANDWIDTH,
     ("gyro", "accel"),
-    "d²gyro/dt² = w_c² (omega - gyro) - 2 zeta w_c dgyro/dt, w_c = 2 pi f_c, and likewise accel",
+    "d²gyro/dt² = w_c² (omega - gyro) - 2 zeta w_c dgyro/dt, w_c = 2 pi f_c, and likewise accel (at a rate: bilinear)",
     (
         Parameter("f_c", "Hz", 40.0, positive=True, null_value=math.inf),
-        Parameter("zeta", "-", BUTTERWORTH, positive=True, null_value=BUTTERWORTH),
+        Parameter("zeta", "-", BUTTERWORTH, positive=True, null_value=BUTTERWORTH, least=LEAST_DAMPING),
+        RATE,
     ),
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,
     linear=False,
-    starts=starts_at(*([hz, BUTTERWORTH] for hz in START_HZ)),
-    lagless=without_lag,
+    starts=digital_starts(*([hz, BUTTERWORTH] for hz in START_HZ)),
+    lagless=_without_lag,
 )

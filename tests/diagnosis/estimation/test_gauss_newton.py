@@ -157,8 +157,7 @@ def test_a_fit_never_ends_worse_than_it_began() -> None:
     pair = planted.pair(planted.rich(), {"mount_rotation": [0.05, 0.02, -0.03]}, 11)
     log = planted.weighed(pair)
     for name in ("low_pass", "clock_offset", "gyro_scale", "size_effect"):
-        physics = catalogue.diagnosed([name])[0]
-        start = np.array([5.0]) if name == "low_pass" else physics.null_value.astype(float)
+        ((physics, start),) = planted.acting({name: [5.0] if name == "low_pass" else catalogue.diagnosed([name])[0].null_value})
         began = fit([log], ((physics, start),), iterations=0)
         assert fit([log], ((physics, start),)).objective <= began.objective
 

@@ -61,6 +61,16 @@ def test_a_filter_beside_a_clock_of_poses_is_what_the_clock_leaves(name: str, po
     )
 
 
+@pytest.mark.parametrize(("name", "hidden"), [("mount_resonance", True), ("accel_hysteresis", True), ("clock_skew", False)])
+def test_a_small_filter_beside_a_low_pass_is_what_another_form_leaves(name: str, hidden: bool) -> None:
+    """A recording behind a filter of fourth order, or a moving average."""
+    small = 0.5 * SETTINGS.model_error_low_pass
+    for key in ("low_pass", "second_order_low_pass:accel"):
+        names = {key: key.partition(":")[0], name: name}
+        found = below_model_error({key: 1.0, name: small}, SETTINGS, denoised=False, poses=False, names=names)
+        assert found == ({name} if hidden else set())
+
+
 def test_what_does_not_follow_the_motion_is_told_however_faint() -> None:
     assert not below_model_error(
         {"timestamp_jitter": 1e9, "temperature": 300.0, "gyro_scale": 30.0}, SETTINGS, denoised=True, poses=False

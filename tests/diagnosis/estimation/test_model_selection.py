@@ -29,6 +29,7 @@ from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
 from imutool.sensor import catalogue
 from imutool.sensor.effects import clock_wander
+from imutool.sensor.samples import IdealMotion
 
 SURE = 4.0
 DURATION_S = 20.0
@@ -533,6 +534,45 @@ def test_a_lever_arm_beside_a_resonance_is_not_called_a_size_effect() -> None:
     """On level ground nine numbers do what three do, and a little more as long as nobody thinks of the resonance."""
     pair = planted.pair(planted.planar(), {"lever_arm": [-0.4, -0.9, 0.0], "mount_resonance": [3.0, 0.2, 0.3, 1.0, 0.0]})
     assert set(names(asked(pair, beyond=False))) == {"lever_arm", "mount_resonance"}
+
+
+def rattled(seed: int = 1) -> IdealMotion:
+    """A body that rattles up to half of the rate."""
+    felt, rng = planted.rich(seed), np.random.default_rng([seed, 5])
+    gyro, accel = (x + size * rng.normal(size=x.shape) for x, size in ((felt.gyro, 0.2), (felt.accel, 2.0)))
+    return replace(felt, gyro=gyro, accel=accel)
+
+
+@pytest.mark.parametrize("seed", seeds(2))
+@pytest.mark.parametrize(("name", "theta"), [("low_pass", [20.0, 100.0, 1.0]), ("second_order_low_pass", [14.0, 0.7, 100.0])])
+def test_a_digital_low_pass_is_told_with_its_rate_and_nothing_else(name: str, theta: list[float], seed: int) -> None:
+    """An analog one in its place leaves an error near half of the rate, which other effects would take."""
+    found = asked(planted.pair(rattled(seed), {name: theta}, seed), beyond=False)
+    assert names(found) == [name]
+    assert [n.name for n in found.selected[0].effect.parameters][-1] == "rate"
+    assert sure(found, name, theta[: len(found.selected[0].theta)])
+
+
+@pytest.mark.parametrize(("order", "f_c"), [(4.0, 15.0), (0.0, 0.4429 * 12.5)])
+def test_a_filter_of_fourth_order_and_a_moving_average_are_low_passes_and_no_delay_beside_one(order: float, f_c: float) -> None:
+    found = asked(planted.pair(rattled(), {"low_pass": [f_c, 100.0, order]}), beyond=False)
+    assert names(found) == [f"low_pass:order {order:g}"]
+    ((_, value),) = found.selected[0].effect.constants
+    assert value == order
+    assert sure(found, names(found)[0], [f_c, 100.0])
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_a_low_pass_of_one_sensor_is_told_on_it(sensor: str) -> None:
+    felt = rattled()
+    slow, plain = (planted.ideal(felt, planted.acting(of)) for of in ({"second_order_low_pass": [8.0, 0.7]}, {}))
+    part = slice(0, 3) if sensor == "gyro" else slice(3, 6)
+    added = np.zeros_like(plain)
+    added[:, part] = (slow - plain)[:, part]
+    found = asked(planted.pair(felt, added=added), beyond=False)
+    assert names(found) == [f"second_order_low_pass:{sensor}"]
+    assert found.selected[0].effect.sensors == (sensor,)
+    assert sure(found, f"second_order_low_pass:{sensor}", [8.0, 0.7])
 
 
 def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:

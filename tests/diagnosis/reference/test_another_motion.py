@@ -15,6 +15,7 @@ from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.summarize import finding_of
 from imutool.sensor import catalogue
+from imutool.sensor.effects import low_pass
 
 SECONDS, FILTER_HZ = 15.0, 30.0
 FILTER, OTHER_FILTER = {"low_pass": [FILTER_HZ]}, {"low_pass": [2.0 * FILTER_HZ]}
@@ -24,7 +25,8 @@ SCALE, SMALL_SCALE = {"gyro_scale": [0.02, 0.0, -0.015]}, {"gyro_scale": [1e-3, 
 def searched(effects: Mapping[str, Sequence[float]], seed: int, words: Sequence[str], *, still: bool = False) -> Selection:
     """What a search among some words of the catalogue selects for a log with some effects."""
     motion = planted.planar(SECONDS) if still else planted.rich(seed, SECONDS)
-    return select_effects([planted.weighed(planted.pair(motion, effects, seed))], catalogue.diagnosed(words))
+    candidates = [low_pass.forms(effect, each_sensor=False)[0] for effect in catalogue.diagnosed(words)]
+    return select_effects([planted.weighed(planted.pair(motion, effects, seed))], candidates)
 
 
 def differing(real: Selection, sim: Selection) -> list[str]:

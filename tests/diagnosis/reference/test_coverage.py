@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
-from imutool.diagnosis.reference.coverage import align, align_all
+from imutool.diagnosis.reference.coverage import align, align_all, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
@@ -111,3 +111,22 @@ def test_splines_through_poses_take_nothing_of_a_motion_in_their_band() -> None:
     z = np.interp(pair.ideal.t_s, t_s, sensed[:, 2])
     one, other = (sosfiltfilt(band, x - GRAVITY_M_S2)[500:-500] for x in (z, pair.ideal.accel[:, 2]))
     assert one @ other / (one @ one) == pytest.approx(1.0, abs=3.5e-3)
+
+
+def test_a_sample_that_repeats_the_one_before_does_not_count() -> None:
+    """One in fifty was late and the driver sent the last one again; digits coarser than the noise repeat by themselves."""
+    real = made(EXACT)
+    sim, rng, imu = along(real), np.random.default_rng(3), along(real, 1).imu
+    again = np.flatnonzero(rng.random(len(imu)) < 0.02)[1:]
+    gyro, accel = imu.gyro.copy(), imu.accel.copy()
+    for x in (gyro, accel):
+        x[again] = x[again - 1]
+    again = np.flatnonzero((np.diff(gyro, axis=0) == 0).all(axis=1)) + 1
+    (pair,), (remark,) = align_all([replace(real, imu=replace(imu, gyro=gyro, accel=accel))], sim, None, DiagnoseSettings())
+    assert pair.known is not None
+    np.testing.assert_array_equal(np.flatnonzero(repeats(pair.real)), again)
+    assert not pair.known[again].any()
+    assert pair.known.mean() > 0.97
+    assert f"{len(again)} samples repeat the one before" in remark
+    for digit in (0.5, 50.0):
+        assert not repeats(np.round(pair.real / digit) * digit).any()

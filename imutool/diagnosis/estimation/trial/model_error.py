@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -28,27 +29,40 @@ SLOW = 0.25  # of a cut-off frequency: below, a low-pass takes 0.2 % (second ord
 SEEN_ERROR = 2.0  # times what other effects show of a low-pass's error (made-up flights whose vibrations fold: 1.4 to 3.6)
 
 
-def below_model_error(gains: Mapping[str, float], settings: SearchSettings, *, denoised: bool, poses: bool) -> frozenset[str]:
+def below_model_error(
+    gains: Mapping[str, float],
+    settings: SearchSettings,
+    *,
+    denoised: bool,
+    poses: bool,
+    names: Mapping[str, str] = MappingProxyType({}),
+) -> frozenset[str]:
     """Effects below the model error of a far larger effect that follow the same motion.
 
     A filter and a clock say how a sensor follows its motion, and so does the error of any other model: a mass on springs moves,
     and its lever arm with it; a simulator that holds its forces for a step reads accelerations half a step early; noise that
     was filtered out of a simulation took a little of its motion along. Such an error is a share of the large effect, however
     certain against the noise. The clock of `poses` drifts and jumps against the sensor's in more ways than one, and a filter
-    takes what the clock leaves. `gains` are squares that leaving an effect out costs, by key; `denoised` says whether noise
-    was filtered out of a simulation.
+    takes what the clock leaves. A low-pass of another order leaves an error that rings. `gains` are squares that leaving an
+    effect out costs, by key; `names` are those of keys with a variant. `denoised` says whether noise was filtered out of a
+    simulation.
     """
     allowed = settings.model_error_denoised if denoised else settings.model_error
     simplified = {"mount_resonance": settings.model_error_resonance}  # models that are simpler than what they stand for
-    clocks = dict.fromkeys(CLOCKS, settings.model_error_clock) if poses else {}
+    of_filters = dict.fromkeys(LOW_PASSES, settings.model_error_low_pass)
+    of_filters |= dict.fromkeys(CLOCKS, settings.model_error_clock) if poses else {}
+
+    def name(key: str) -> str:
+        return names.get(key, key)
 
     def share(key: str, other: str) -> float:
-        return max(allowed, simplified.get(other, 0.0), clocks.get(other, 0.0) if key in FILTERS else 0.0)
+        as_filter = of_filters.get(name(other), 0.0) if name(key) in FILTERS else 0.0
+        return max(allowed, simplified.get(name(other), 0.0), as_filter)
 
     return frozenset(
         key
         for key, gain in gains.items()
-        if key in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
+        if name(key) in FOLLOWING and any(gain < share(key, other) * more for other, more in gains.items() if other != key)
     )
 
 

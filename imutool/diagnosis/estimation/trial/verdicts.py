@@ -130,15 +130,17 @@ class Trial:
             if verdict is None:
                 break
             verdicts.append(verdict)
-        gains = {verdict.effect.key: verdict.gain for verdict in verdicts}
+        gains, names = {one.effect.key: one.gain for one in verdicts}, {effect.key: effect.name for effect, _ in whole.chosen}
         left = {whole.keys[k]: k for k in range(passed.start + len(verdicts), len(whole.chosen))}
 
         def with_left(iterations: int | None) -> dict[str, float]:
-            return gains | {key: gain_of(whole, k, iterations)[0] for key, k in left.items() if FOLLOWING & gains.keys()}
+            return gains | {
+                key: gain_of(whole, k, iterations)[0] for key, k in left.items() if FOLLOWING & {names[one] for one in gains}
+            }
 
         def hidden(every: Mapping[str, float]) -> frozenset[str]:
             denoised = any(log.pair.denoised for log in self.logs)
-            return below_model_error(every, self.settings, denoised=denoised, poses=not exact) & gains.keys()
+            return below_model_error(every, self.settings, denoised=denoised, poses=not exact, names=names) & gains.keys()
 
         below = frozenset[str]()
         if hidden(with_left(0)):  # no fit of the others leaves more than its start
