@@ -106,19 +106,20 @@ def shown_bias(
     return (bias - mean) / gain, np.where(measured, 1.0 / np.where(measured, precision, 1.0), np.inf)
 
 
-def turned_axes(difference: Vector6, std: Vector6, mean: Vector6) -> list[str]:
+def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float = 1.0) -> list[str]:
     """Sentence on a log whose bias is that of the training runs in turned axes, and clearly not as it is.
 
-    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing.
+    A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing. `most_left` is
+    the share of chi-square that turned axes leave at most: little, where few logs show how much the bias changes by itself.
     """
     rotations = np.array([P for P in signed_permutations() if np.linalg.det(P) > 0.0])  # the identity first
     turned = (rotations[:, None] @ mean.reshape(2, 3, 1)).reshape(-1, 6)
     chi_square = (((mean + difference - turned) / std) ** 2).sum(axis=1)
     best = int(np.argmin(chi_square))
-    if chi_square[best] > TURNED or chi_square[0] - chi_square[best] < TURNED:
+    if chi_square[best] > min(TURNED, most_left * chi_square[0]) or chi_square[0] - chi_square[best] < TURNED:
         return []
     return [
-        f"its bias is that of the training runs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
+        f"its bias is that of the training logs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
     ]
 
 

@@ -21,16 +21,18 @@ import torch
 
 from imutool.array_types import Float64
 from imutool.bias import static
-from imutool.bias.model import BiasModel
+from imutool.bias.model import COLUMNS, BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.temperature import Scale
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
+from imutool.bias_start.prior_width import turned_axes
 from imutool.errors import DataError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Recording, nanoseconds
+from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.candidates import CANDIDATES, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.effect_selection import LINEAR, Calibration, parameter_columns
 from imutool.training.log_signals import without_nuisances
@@ -45,6 +47,9 @@ LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by wh
 CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
 LEAST_ERROR = 1e-6  # ° or m/s
 CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
+MOST_LEFT = (
+    0.02  # share of chi-square that turned axes leave; of made-up sensors that turn on 10 to 20 mrad/s apart, 1 in 5000 has it
+)
 LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
 LONGEST_S = 120.0  # of a log that is scored
 DRIFT_S = 5.0
@@ -103,7 +108,11 @@ def compare(
     """Scores of every left-out log.
 
     `trained` has the statistics of all logs without the effects of the fits, `scale` is that of their temperature.
+
+    Raises:
+        DataError: a log whose axes are turned against the others'.
     """
+    check_axes(pool, fits)
     candidates = [c for c in CANDIDATES if all(known(fit, c, sensor) for sensor, fit in fits.items())]
     if all(fit.named and set(fit.effects) == set(LINEAR[sensor]) for sensor, fit in fits.items()):
         candidates.remove("effects")  # the same as `linear`
@@ -128,6 +137,28 @@ def compare(
     for contradiction in contradictions:
         logger.warning("%s", contradiction)
     return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in fits}, contradictions)
+
+
+def check_axes(pool: Pool, fits: Mapping[Sensor, Calibration]) -> None:
+    """Refuse a log whose axes are turned against those of the others.
+
+    Gravity and poses contradict no such log, and scales are the same in axes turned by half a turn: its bias shows it.
+
+    Raises:
+        DataError: such a log.
+    """
+    if len(pool.names) < 2:
+        return
+    bias, std = np.zeros((len(pool.names), 6)), np.full(6, np.inf)
+    for sensor, fit in fits.items():
+        bias[:, COLUMNS[sensor]] = fit.own[:, :3].cpu().numpy()
+        std[COLUMNS[sensor]] = np.sqrt(2.0) * TURN_ON_STD[sensor]
+    for log, name in enumerate(pool.names):
+        others = np.delete(bias, log, axis=0)
+        mean = np.median(others, axis=0)
+        for what in turned_axes(bias[log] - mean, np.hypot(std, others.std(axis=0)), mean, MOST_LEFT):
+            fix = "Turn its axes, or leave it out" if len(others) > 1 else "Turn the axes of one of the two"
+            raise DataError(what, where=name, expected="the axes of the other logs", fix=fix)
 
 
 def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contradiction, ...]:

@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 from support.switchings_on import Switchings, log
 
 from imutool.config import load
+from imutool.errors import DataError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.training.effect_selection import LINEAR, calibrate
-from imutool.training.left_out import Contradiction, Score, beaten, contradicting, keep
+from imutool.training.left_out import Contradiction, Score, beaten, check_axes, contradicting, keep
 from imutool.training.run import train
 from imutool.training.settings import settings_of
 from imutool.training.training_windows import Pool
@@ -128,6 +129,27 @@ def test_logs_that_need_no_matrix_contradict_nothing() -> None:
     kind = msgspec.structs.replace(KIND, scale=0.001, misalignment_rad=0.0005, rest_s=4.0, duration_s=45.0)
     for first in range(0, 20, 4):
         assert not contradictions([log(seed, 0, kind) for seed in range(first, first + 4)])
+
+
+@pytest.mark.parametrize("axes", [np.diag([1.0, -1.0, -1.0]), np.eye(3)], ids=["turned", "as the others"])
+def test_a_log_in_turned_axes_is_refused_though_its_scale_agrees(axes: np.ndarray) -> None:
+    """As of a driver in FRD among logs in FLU: poses and gravity agree with each, and a scale is the same in both."""
+    bias = np.array([0.03, 0.02, -0.03, 0.6, -0.7, 0.6])
+    logs = []
+    for seed in range(3):
+        one, P = log(seed, 0, KIND), axes if seed == 1 else np.eye(3)
+        imu = replace(one.imu, gyro=(one.imu.gyro + bias[:3]) @ P, accel=(one.imu.accel + bias[3:]) @ P)
+        q_wb = Rotation.from_quat(one.truth.q_wb_wxyz, scalar_first=True) * Rotation.from_matrix(P)
+        poses = replace(one.truth, q_wb_wxyz=q_wb.as_quat(scalar_first=True))
+        logs.append(replace(one, name=f"log {seed}", imu=imu, truths={"/ground_truth/pose": poses}))
+    pool = Pool.of(logs)
+    gyro = calibrate(pool, "gyro", pool.gyro, LINEAR["gyro"])
+    fits = {"gyro": gyro, "accel": calibrate(pool, "accel", pool.gyro - gyro.own[pool.log, :3], LINEAR["accel"])}
+    if axes[1, 1] > 0.0:
+        check_axes(pool, fits)
+        return
+    with pytest.raises(DataError, match=r"^log 1: its bias is .* \+x -y -z: the axes are turned"):
+        check_axes(pool, fits)
 
 
 def test_parts_of_a_log_contradict_nothing() -> None:
