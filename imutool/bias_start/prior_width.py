@@ -107,7 +107,7 @@ def shown_bias(
 
 
 def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: float = 1.0) -> list[str]:
-    """Sentence on a log whose bias is that of the training runs in turned axes, and clearly not as it is.
+    """Sentence on a log whose bias is clearly that of the training runs in turned axes.
 
     A correction of scales is the same in axes that are turned by half a turn, so the share of it says nothing. `most_left` is
     the share of chi-square that turned axes leave at most: little, where few logs show how much the bias changes by itself.
