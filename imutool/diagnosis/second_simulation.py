@@ -79,12 +79,12 @@ def along_samples(
         DataError: the samples last for less than 2 s, or an effect lacks a channel.
     """
     found, _ = read_simulation(sim, imu=imu, truth=truth)  # of the sensor, in a world whose z is up
-    if beside is None or not same_motion(beside.imu, found.imu, settings.alignment):
-        beside = None
-    own = with_channels(found, sim).recording if beside is None and needs_channels(acting) else found
+    alone = beside is None or not same_motion(beside.imu, found.imu, settings.alignment)
+    if beside is None or alone:
+        beside = with_channels(found, sim).recording if needs_channels(acting) else found
     short = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, least_s=LEAST_S))
-    pairs = with_simulation(own if beside is None else beside, found, short, own_poses=beside is None)
-    ideals, clock_ns = [pair.ideal for pair in pairs], int(found.imu.t_ns[0]) if beside is None else int(beside.imu.t_ns[0])
+    pairs = with_simulation(beside, found, short, own_poses=alone)
+    ideals, clock_ns = [pair.ideal for pair in pairs], int(beside.imu.t_ns[0])
     sim_ns = clock_ns + nanoseconds(pairs[0].aligned_s)
     own_s = seconds(found.imu.t_ns, sim_ns)
     stamps = [even_stamps(x, rate_hz) if rate_hz else own_s[(own_s >= x.t_s[0]) & (own_s <= x.t_s[-1])] for x in ideals]
