@@ -193,11 +193,11 @@ def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
     return np.array([value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.name in names])
 
 
-def unidentified(effect: Effect, std: Theta, log_prior: float, *, curve: bool) -> Iterator[str]:
-    """Unidentified `effect.parameter`: as unsure as their prior, or fixed; none of a curve."""
+def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> Iterator[str]:
+    """Unidentified `effect.parameter`: as unsure as it is large or plausible, or fixed; none of a curve."""
     name = effect.name if effect.kind == "catalogue" else effect.key
-    for parameter, s in zip(effect.parameters, std, strict=True):
-        if s > (log_prior if parameter.positive else parameter.plausible) and not curve:
+    for parameter, value, s in zip(effect.parameters, theta, std, strict=True):
+        if s > (value if parameter.positive else parameter.plausible) and not curve:
             yield f"{name}.{parameter.name}"
     if isinstance(effect.forward, FixedParameters) and effect.sensors == effect.forward.effect.sensors:
         free = {parameter.name for parameter in effect.parameters}

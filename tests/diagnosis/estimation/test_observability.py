@@ -13,6 +13,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen
 from imutool.diagnosis.estimation.observability import (
     beyond_the_band,
+    unidentified,
     unobservable,
     with_plainer_effects,
     with_steady_clock,
@@ -21,7 +22,7 @@ from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor import catalogue
-from imutool.sensor.effects import clock_wander
+from imutool.sensor.effects import clock_wander, low_pass
 
 SETTINGS = SearchSettings()
 STEPS_HZ = 5.9  # a harmonic of a walk
@@ -185,3 +186,11 @@ def test_a_drift_that_follows_the_logs_temperature_has_that_name() -> None:
         logs = [planted.weighed(planted.pair(replace(felt, channels=channels), truth))]
         found = fit(logs, ((drift, np.array(truth["gyro_bias_drift"])),))
         assert with_plainer_effects(logs, found, (drift, temperature)).keys == (named,)
+
+
+@pytest.mark.parametrize(("std", "vague"), [(2.0, ()), (25.0, ("low_pass.f_c",))])
+def test_a_positive_number_is_unidentified_if_it_is_as_unsure_as_it_is_large(std: float, vague: tuple[str, ...]) -> None:
+    """A cut-off of 20 Hz, certain to 2 Hz, was told as one that the logs cannot show."""
+    (effect,) = catalogue.effects(["low_pass"])
+    first = low_pass.analog(effect)
+    assert tuple(unidentified(first, np.array([20.0]), np.array([std]), curve=False)) == vague

@@ -181,5 +181,5 @@ class Trial:
         if scattered is not None:
             log_p = max(log_p, scattered.log_p_value(effect.key, gain[1], len(theta)) + self.candidates.log_choices[effect.key])
         rate = min(1.0, float(np.exp(min(0.0, log_p + np.log(self.tried)))))
-        vague = tuple(unidentified(effect, std, whole.settings.log_prior_std, curve=curve))
+        vague = tuple(unidentified(effect, theta, std, curve=curve))
         return SelectedEffect(effect, theta, std, vague, float(np.exp(max(log_p, -700))), rate, gain[0]) if rate < 1.0 else None
