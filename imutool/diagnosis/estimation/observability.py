@@ -194,7 +194,7 @@ def values_of(effect: Effect, reduced: Effect, theta: Theta) -> Theta:
 
 
 def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> Iterator[str]:
-    """Unidentified `effect.parameter`: as unsure as it is large or plausible, or fixed; none of a curve."""
+    """Unidentified `effect.parameter`: as unsure as it is large, or fixed; none of a curve."""
     name = effect.name if effect.kind == "catalogue" else effect.key
     for parameter, value, s in zip(effect.parameters, theta, std, strict=True):
         if s > (value if parameter.positive else parameter.plausible) and not curve:
