@@ -1,10 +1,9 @@
 """Initial bias of a run: the rest bias at its start, with standard deviation and source.
 
 A measurement (at rest: `bias_at_rest`; from true poses: `bias_from_truth`) and the prior of the training runs are combined by
-their variances, axis by axis; a measurement along one direction is a Kalman update. The prior is that of the training session
-within hours of the log, else that of a new session. It is held against the log first: where the log shows a bias that the
-prior all but rules out, the prior becomes as wide as that difference (`widened`). A model may add a motion-dependent part
-C(u): the measurement then uses the samples without that part.
+their variances, axis by axis; a measurement along one direction is a Kalman update. The prior is about the mean of the training
+session within hours of the log, else of all sessions. The log decides on its width (`supported_std`, `widened`). A model may
+add a motion-dependent part C(u): the measurement then uses the samples without that part.
 
 With `auto` and `truth` the rest bias is tracked after the start, by every stop and by gravity in motion
 (`imutool.bias_start.bias_tracking`): the bias of a sample depends on that sample and earlier ones. One exception: samples of
@@ -164,13 +163,17 @@ def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
 
 
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
-    """Prior bias of a log that begins at a stamp: that of its session, or of a new one."""
-    mean, std, least = model.prior_mean.copy(), model.prior_std.copy(), model.card.get("turn_on_least_std")
+    """Prior bias of a log that begins at a stamp: about the mean of its session, or of all.
+
+    Within a session's hours the sensor may have been switched on again: its width is the least, that of a new one the most.
+    """
+    mean, least = model.prior_mean.copy(), model.card.get("turn_on_least_std")
     sessions = [] if first_ns is None else model.card.get("sessions", [])
     apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
     if apart and min(apart) <= SESSION_GAP_S * 1e9:
         session = sessions[apart.index(min(apart))]
-        mean, std, least = np.array(session["mean"]), np.array(session["std"]), None
+        mean, least = np.array(session["mean"]), session["std"]
+    std = model.prior_std.copy() if least is None else np.maximum(model.prior_std, least)
     return InitialBias(mean, std, "prior of the training runs", least_std=None if least is None else np.array(least))
 
 

@@ -1,11 +1,13 @@
 """How the training logs of a data set predict one another: where settings are chosen, away from every test sequence.
 
     python tests/bench/left_out.py LOG.mcap... [--set model.gyro_effects=[...]] [--start truth:5 --start auto ...]
+    python tests/bench/left_out.py LOG.mcap... --switched-on-again
     python tests/bench/left_out.py LOG.mcap... --minute
 
 For each log the effects of `hybrid` (without the neural ODE, which would take a minute each) are found on all the others, and
 the log is integrated from every start; AOE in degrees. How long a start from the truth takes, which starts are worth their
-name, and whether an effect earns its place was asked here. With `--minute` it is the other way round: `train`'s closed form
+name, and whether an effect earns its place was asked here. With `--switched-on-again` a usual turn-on bias is added to the log
+left out, within the hours of its session. With `--minute` it is the other way round: `train`'s closed form
 on the middle minute of each log alone, scored on all others beside raw samples and `static` (mean AOE of these logs). How much
 of that the minute has to cost: the last columns hold the orientation by which models differ whose parameters are drawn from the
 deviations that the minute leaves, each started in the log as its own model is (root mean square over `DRAWS`).
@@ -29,7 +31,8 @@ from imutool.errors import ModelError
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
-from imutool.recording import Poses, Recording, nanoseconds
+from imutool.recording import Imu, Poses, Recording, nanoseconds
+from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.effect_selection import PhysicsFirst
 from imutool.training.fit import Training
 from imutool.training.settings import settings_of
@@ -46,7 +49,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[])
     parser.add_argument("--start", action="append")
     parser.add_argument("--minute", action="store_true")
-    parser.add_argument("--new-session", action="store_true", help="the log left out counts as one of another switching-on")
+    parser.add_argument("--switched-on-again", action="store_true", help="the log left out gets another turn-on bias")
     options = parser.parse_args()
     starts = options.start or list(STARTS)
     recordings = [read(log) for log in options.logs]
@@ -55,15 +58,20 @@ def main() -> None:
         minutes(recordings, options.start or list(SCORED), options.set)
         return
     print(f"| left out | {' | '.join(starts)} | effects |\n|{'---|' * (len(starts) + 2)}")
-    table = []
+    table, rng = [], np.random.default_rng(5)
     for left_out in recordings:
         model = learned([r for r in recordings if r is not left_out], options.set)
-        if options.new_session:
-            model.card = {**model.card, "sessions": []}
-        table.append([aoe(model, left_out, start) for start in starts])
+        scored = replace(left_out, imu=moved(left_out.imu, rng)) if options.switched_on_again else left_out
+        table.append([aoe(model, scored, start) for start in starts])
         found = ", ".join((*(model.config.gyro_effects or ()), *(model.config.accel_effects or ())))
         print(f"| {left_out.name} | {' | '.join(f'{a:.2f}' for a in table[-1])} | {found} |", flush=True)
     print(f"| mean | {' | '.join(f'{a:.2f}' for a in np.mean(table, axis=0))} | |")
+
+
+def moved(imu: Imu, rng: np.random.Generator) -> Imu:
+    """The samples of the same motion after another switching-on."""
+    gyro, accel = (TURN_ON_STD[sensor] * rng.normal(size=3) for sensor in SENSORS)
+    return replace(imu, gyro=imu.gyro + gyro, accel=imu.accel + accel)
 
 
 def minutes(recordings: list[Recording], starts: list[str], words: list[str]) -> None:

@@ -428,7 +428,23 @@ def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
     assert prior(made, 104 * hour).rest[0] == 0.1
     assert prior(made, 128 * hour).rest[0] == 0.2
     assert prior(made, 115 * hour).rest[0] == pytest.approx(0.3)
-    np.testing.assert_array_equal(bias_prior(made, 104 * hour).std, [1e-3] * 6)
+    np.testing.assert_array_equal(bias_prior(made, 104 * hour).std, [0.2] * 6)  # it may have been switched on again
+    np.testing.assert_array_equal(bias_prior(made, 104 * hour).least_std, [1e-3] * 6)
+
+
+@pytest.mark.parametrize("moved", [0.0, 6e-3])
+def test_a_sensor_switched_on_again_within_a_sessions_hours_is_not_held_to_its_bias(moved: float) -> None:
+    settings = Flight(gyro=PERFECT, accel=PERFECT, duration_s=30.0, still_s=0.0, room_m=1.0, position_knot_s=1.5)
+    exact, noise = flight(4, settings).imu, NOISE * np.random.default_rng(4).normal(size=(6001, 6))
+    imu = Imu(exact.t_ns, exact.gyro + GYRO_BIAS + noise[:, :3], exact.accel + ACCEL_BIAS + noise[:, 3:])
+    made, first_ns = trained(prior_std=5e-3), int(imu.t_ns[0])
+    mean = np.concatenate([GYRO_BIAS + np.array([moved, -moved, moved]), ACCEL_BIAS])
+    std = [8e-4] * 3 + [1e-2] * 3
+    made.card |= {"sessions": [{"start_ns": first_ns, "end_ns": first_ns, "mean": mean.tolist(), "std": std}]}
+    found = auto(made, imu).estimator(made).estimate(*samples(imu))
+    off = found.bias[:, :3] - GYRO_BIAS
+    assert np.abs(off[-1]).max() < 2e-3
+    assert ((off / np.sqrt(found.covariance[:, range(3), range(3)])) ** 2).mean() < 2.0**2
 
 
 def test_a_model_that_says_how_rest_differs_is_believed() -> None:
