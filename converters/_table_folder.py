@@ -1,4 +1,4 @@
-"""Folder with a table for each sensor, or with one of an IMU beside one of poses.
+"""Folder of tables: of one sensor each, of an IMU and poses, or several recordings.
 
 The tables become groups: `gyro` and `accel`, or `imu` and `ground_truth`, and those of other files by their names. Poses are
 true by the name of their file, or where a motion capture wrote it; else they are the group `poses`. A table that holds a time
@@ -8,47 +8,62 @@ alone (`time.csv` of gnss-ins-sim) is the clock of those that have none and as m
 from __future__ import annotations
 
 import re
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from imutool.errors import DataError
 
-from ._source import head
+from . import Sequence
+from ._source import find_folders, head
 from ._table_files import kind_of, load
 from ._table_groups import TRUE_GROUPS, has_poses
 from ._table_mocap import is_mocap
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name, text_head
 from ._table_propose import propose
-from ._table_sensors import SENSORS, name_columns, pairs_among, sensors_among
+from ._table_sensors import SENSORS, WORD, name_columns, pairs_among, sensors_among
 from ._table_text import Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
 
-MOST_TABLES = 40
+MOST_TABLES = 40  # of one recording
+DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
+ROLE = "|".join(["imu|inertial|ground|truth|poses?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
 ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".tum", ".mat", ".npz"
 IMU_GROUP, TRUTH_GROUP, POSES_GROUP = "imu", "ground_truth", "poses"
 
 
-def is_split(folder: Path) -> bool:
-    """Whether the tables in a folder make one recording together.
+def sequences_below(source: Path) -> list[Sequence]:
+    """Recordings of tables in a folder and in those below it."""
+    found: dict[Path, list[Sequence]] = {}
+    find_folders(source, lambda folder: bool(found.setdefault(folder, _sequences_in(folder))))
+    return [*chain(*found.values())]
 
-    They are of a gyroscope and an accelerometer, of several such pairs, of no phone app, or of one IMU and of poses.
+
+def _sequences_in(folder: Path) -> list[Sequence]:
+    """Recordings of a folder: `data.hdf5`, or its tables together, in pairs or one by one.
+
+    Together are tables of a gyroscope and an accelerometer, of several such pairs, or of one IMU and of poses: all of the
+    folder, or those whose names differ in that alone (`walk_imu`, `walk_gt`). None are of a phone app.
     """
-    tables = _tables(folder)
-    return bool(_groups(tables)) and not is_phone(folder)
+    if kind_of(head(folder / DATA_FILE), folder / DATA_FILE) == "hdf5":
+        return [Sequence(folder.name, folder / DATA_FILE)]
+    found = {} if is_phone(folder) else _recordings(folder)
+    places = {name: (tables[0], "") if len(tables) == 1 else (folder, name) for name, tables in found.items()}
+    return [Sequence(folder.name if len(found) == 1 else name, *place) for name, place in places.items()]
 
 
-def load_split(folder: Path) -> Columns:
-    """Columns of all tables in a folder, each in the group of its sensor or of its file's name.
+def load_split(folder: Path, recording: str = "") -> Columns:
+    """Columns of a recording's tables, each in the group of its sensor or of its file's name.
 
     Raises:
         DataError: the table of the gyroscope, of the accelerometer or of the IMU cannot be read.
     """
-    tables, whole, clocks = _tables(folder), Columns(), _clocks(folder)
+    tables, whole, clocks = _recordings(folder)[recording], Columns(), _clocks(folder)
     groups = _groups(tables)
     for path in tables:
         group = groups.get(path, _stem(path))
@@ -77,7 +92,31 @@ def _tables(folder: Path) -> list[Path]:
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if Path(table_name(path)).suffix.lower() in ENDINGS)[:MOST_TABLES]
+    return sorted(path for path in folder.iterdir() if Path(table_name(path)).suffix.lower() in ENDINGS)
+
+
+def _recordings(folder: Path) -> dict[str, list[Path]]:
+    """Tables of each recording of a folder, by its name; the name is empty where all tables are one recording."""
+    tables = _tables(folder)
+    if _groups(tables[:MOST_TABLES]):
+        return {"": tables[:MOST_TABLES]}
+    alike: dict[str, list[Path]] = {}
+    for path in tables:
+        alike.setdefault(_without_role(_stem(path)), []).append(path)
+    found: dict[str, list[Path]] = {}
+    for name, paths in alike.items():
+        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if _shows_imu(path)}
+    return found
+
+
+def _without_role(stem: str) -> str:
+    """Name of a file without the words that say what its table holds."""
+    parts = re.split(rf"({WORD}|\d+)", stem)
+    return "".join(part for part in parts if not re.fullmatch(ROLE, part.lower())).strip("_- .")
+
+
+def _shows_imu(path: Path) -> bool:
+    return propose(_columns(path, _start(path))).entries.keys() >= {"gyro", "accel"}
 
 
 def _is_narrow(path: Path) -> bool:

@@ -20,7 +20,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
-from ._source import find_folders, head, name, with_suffix
+from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
@@ -34,12 +34,13 @@ IMAGES = r"(sensor_msgs/(msg/)?|foxglove\.)(CompressedImage|Image|RawImage)"
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is an MCAP log, or folders with the parts of one.
-
-    Other logs in folders are not looked for.
-    """
+    """The source itself, if it is an MCAP log; logs in folders that imutool did not write."""
     if source.is_dir():
-        return find_folders(source, lambda folder: bool(_parts(folder)))
+        parts = find_folders(source, lambda folder: bool(_parts(folder)))
+        taken = [sequence.path for sequence in parts]
+        logs = find_files(source, (".mcap",), lambda start: start.startswith(MAGIC))
+        alone = (log for log in logs if log.path.parent not in taken and not _is_of_bag(log.path.parent))
+        return parts + [log for log in alone if not _is_ours(log.path)]
     return [Sequence(name(source), source)] if source.is_file() and head(source, len(MAGIC)) == MAGIC else []
 
 
@@ -119,7 +120,7 @@ def _parts(folder: Path) -> list[Path]:
 
     A recorder numbers its parts from 0, and each begins where the one before it ends.
     """
-    if b"rosbag2_bagfile_information" in head(folder / METADATA):
+    if _is_of_bag(folder):
         return []
     files = [path for path in with_suffix(folder, ".mcap") if path.is_file() and path.stat().st_size]
     named = {int(match[2]): (match[1], path) for path in files if (match := re.fullmatch(PART, path.stem))}
@@ -132,15 +133,29 @@ def _parts(folder: Path) -> list[Path]:
     return parts if all(abs(gap) < MOST_PAUSE_NS for gap in gaps) else []
 
 
+def _is_of_bag(folder: Path) -> bool:
+    """Whether the logs in a folder are those of a ROS 2 bag."""
+    return b"rosbag2_bagfile_information" in head(folder / METADATA)
+
+
 def _span(path: Path) -> tuple[int, int] | None:
     """First and last log time of a finished log; None of any other."""
+    statistics = getattr(_summary(path), "statistics", None)
+    return (statistics.message_start_time, statistics.message_end_time) if statistics and statistics.message_count else None
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether imutool wrote a log."""
+    return any(index.name.startswith("imutool") for index in getattr(_summary(path), "metadata_indexes", ()))
+
+
+def _summary(path: Path) -> Any:
+    """Summary of a finished log; None of any other."""
     try:
         with _refusing(path), path.open("rb") as file:
-            summary = _reader(file).get_summary() if _is_finished(file) else None
+            return _reader(file).get_summary() if _is_finished(file) else None
     except DataError:  # said again when the log is read
         return None
-    statistics = None if summary is None else summary.statistics
-    return (statistics.message_start_time, statistics.message_end_time) if statistics and statistics.message_count else None
 
 
 def _is_finished(file: BinaryIO) -> bool:

@@ -20,9 +20,9 @@ from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
-from ._source import find_folders, head, name
+from ._source import head, name
 from ._table_files import kind_of, load
-from ._table_folder import POSES_GROUP, TRUTH_GROUP, is_split, load_split
+from ._table_folder import POSES_GROUP, TRUTH_GROUP, load_split, sequences_below
 from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
 from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
 from ._table_motion import settle_accel_unit
@@ -36,16 +36,14 @@ from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 LARGEST_NS, MOST_LOSSES = 2**63 - 1, 8  # losses in a refusal
-DATA_FILE, POSES_TOPIC = "data.hdf5", "/ground_truth/pose"
+POSES_TOPIC = "/ground_truth/pose"
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The source itself, if it is a table; folders with a table a sensor, or with `data.hdf5`."""
+    """The source itself, if it is a table; tables in folders, or `data.hdf5`."""
     if source.is_dir():
-        folders = find_folders(source, lambda path: kind_of(head(path / DATA_FILE), path / DATA_FILE) == "hdf5")
-        split = find_folders(source, is_split)
-        return [*(Sequence(folder.name, folder.path / DATA_FILE) for folder in folders), *split]
+        return sequences_below(source)
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
     return [Sequence(name(Path(table_name(source))), source)] if kind_of(head(source), source) else []
@@ -64,7 +62,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
         DataError: the file cannot be read.
     """
     path = sequence.path
-    columns = load_split(path) if path.is_dir() else load(path, kind_of(head(path), path))
+    columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path))
     remarks, place = columns.remarks, path if mapping is None else mapping
     tables = _proposed(columns, path, remarks) if mapping is None else _mapped(columns, mapping)
     tables = [_counted(columns, table, place) for table in tables]

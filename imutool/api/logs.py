@@ -122,7 +122,7 @@ def convert(
     """Convert recordings of any format to MCAP logs, one log per sequence.
 
     Args:
-        source: Bag, log, table, sequence folder, archive (.zip, .tar, .tar.gz), or a folder of bags, folders and archives.
+        source: Bag, log, table, sequence folder, archive (.zip, .tar, .tar.gz), or a folder of these.
         out: Log file for one sequence, folder for several; `logs/` is a folder for one too.
         format: Converter (`euroc`, `tum_vi`, `fetch`, ...), or `auto` to recognise it.
         sequences: Names of the sequences to convert; by default all.

@@ -146,7 +146,9 @@ def _find(source: Path, format: str) -> _Sequences:
             f"no sequence found: {what}" if what else "no sequence found",
             where=source,
             expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
-            fix="Name the file itself: single logs and tables in a folder are not looked for" if source.is_dir() else fix,
+            fix="Name the file itself, if it is a table that does not show its columns, or a log of imutool"
+            if source.is_dir()
+            else fix,
         )
     for place, jobs in claims.items():
         if len(jobs) > 1:

@@ -169,11 +169,16 @@ def test_an_unfinished_part_is_read_up_to_its_last_whole_chunk(convert, tmp_path
 
 
 @pytest.mark.parametrize("change", ["another name", "a pause"])
-def test_logs_of_several_recordings_in_a_folder_are_no_bag(convert, tmp_path, change):
+def test_logs_of_several_recordings_in_a_folder_are_logs_of_their_own(convert, tmp_path, change):
     bag = unfinished(tmp_path / "walks", "mcap", 1)
     later = write_bag(tmp_path / "later", StoragePlugin.MCAP, start=COUNT if change == "another name" else 100 * COUNT)
-    next(later.glob("*.mcap")).rename(bag / ("hall_1.mcap" if change == "another name" else "run_1.mcap"))
-    assert convert(bag, tmp_path / "out.mcap").returncode == 4
+    name = "hall_1.mcap" if change == "another name" else "run_1.mcap"
+    next(later.glob("*.mcap")).rename(bag / name)
+    assert convert(bag, bag / "ours.mcap").returncode == 3  # several do not fit into one file
+    for _ in range(2):  # what the first run wrote is no source of the second
+        assert convert(bag, bag / "logs", "--overwrite").returncode == 0
+        assert sorted(path.name for path in (bag / "logs").iterdir()) == sorted(["run_0.mcap", name])
+    assert len(messages_of(bag / "logs" / name)[0]) == len(messages_of(bag / name)[0])
 
 
 def test_what_sqlite_has_not_written_into_the_database_is_a_loss(convert, tmp_path):

@@ -82,6 +82,29 @@ def test_a_folder_with_an_imu_beside_true_poses_is_one_recording(tmp_path, names
     assert (rotation.inv() * Rotation.from_quat(poses.q_wb_wxyz[:, [1, 2, 3, 0]])).magnitude().max() < 1e-6
 
 
+def test_a_folder_with_tables_of_several_recordings_has_them_all(tmp_path):
+    header = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
+    still = np.zeros((COUNT, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
+    pose = "time [s],x [m],y [m],z [m],qw,qx,qy,qz\n" + rows(T_S, *still)
+    folders = ("walks", "pairs", "one", "walks/more")
+    for name in folders:
+        (tmp_path / name).mkdir()
+    for number in range(45):
+        (tmp_path / "walks" / f"walk_{number:02}.csv").write_text(header + rows(T_S + 1000.0 * number, GYRO, ACCEL))
+    (tmp_path / "walks" / "people.csv").write_text("walk,height,age,weight\n1,1.8,30,70\n2,1.7,31,60\n")
+    for number in range(2):
+        (tmp_path / "pairs" / f"{number}_imu.csv").write_text(header + rows(T_S + 1000.0 * number, GYRO + number, ACCEL))
+        (tmp_path / "pairs" / f"{number}_mocap.csv").write_text(pose)
+    (tmp_path / "one" / "imu.csv").write_text(header + rows(T_S, GYRO, ACCEL))
+    assert [s.name for s in table.sequences(tmp_path / "walks")] == [f"walk_{number:02}" for number in range(45)]
+    assert [s.name for s in table.sequences(tmp_path / "one")] == ["one"]
+    pairs = table.sequences(tmp_path / "pairs")
+    logs = [table.read_sequence(sequence) for sequence in pairs]
+    assert [(log.name, [*log.poses]) for log in logs] == [(str(number), ["/ground_truth/pose"]) for number in range(2)]
+    np.testing.assert_allclose([log.imus["/imu0"].gyro for log in logs], [GYRO, GYRO + 1])
+    assert len(table.sequences(tmp_path)) == 45 + 2 + 1
+
+
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_a_folder_with_a_table_a_sensor_is_one_recording(tmp_path, folder):
     gyro_name, gyro, accel_name, accel = FOLDERS[folder]
