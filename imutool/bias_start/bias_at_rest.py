@@ -108,7 +108,7 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     mean = residual.mean(axis=0)
     squares = ((residual - mean) ** 2).sum(axis=0)
     stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))
-    supported = supported_std(start.std, start.least_std, mean - start.rest, _at_rest_variance(model, residual))
+    supported = supported_std(start.std, start.least, mean - start.rest, _at_rest_variance(model, residual))
     start = replace(start, std=supported)
     return _combined(start, [stretch], int(imu.t_ns[0]))
 

@@ -68,13 +68,13 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
-    start = replace(start, std=supported_std(start.std, start.least_std, offset, variance + WORLD_TILT_STD**2))
+    start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
     how = f"truth over {length_s:.1f} s{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)
     mean, spread = _updated(start, offset, variance + WORLD_TILT_STD**2)
-    before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD), least_std=None)
+    before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD), least=None)
     ends_s = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
 

@@ -84,10 +84,10 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     prior = _prior(model)
     corrected = _without_motion(model, samples, prior)
     found = _evidence(corrected, prior)
-    supported = supported_std(prior.std, prior.least_std, found.difference, DEPENDENT**2 * found.variance)
+    supported = supported_std(prior.std, prior.least, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
-    most = np.full(6, MOST_DEVIATIONS) if prior.least_std is None else MOST_OF_GUESS
-    unknown = replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least_std=None)
+    most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
+    unknown = replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least=None)
     none = _evidence(samples, unknown)
     share = share_of_correction(none.innovations, _evidence(corrected, unknown).innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE

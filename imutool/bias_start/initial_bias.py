@@ -38,7 +38,7 @@ from imutool.bias_start.bias_tracking import (
     filter_blocks,
     smooth_blocks,
 )
-from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, shown_bias, supported_std
+from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, LeastWidth, shown_bias, supported_std
 from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import FilterSettings
@@ -48,9 +48,9 @@ from imutool.recording.columns import converted
 AT_REST_STD = np.array([1e-4] * 3 + [0.03] * 3)  # earth's rotation; local gravity and a tilt of the sensor
 LEAST_STD = np.array([1e-6] * 3 + [1e-4] * 3)  # with a prior of zero variance nothing could be estimated
 SESSION_GAP_S = 6 * 3600.0  # a longer pause is another switching-on
-TRACKED_BY = "gravity in motion and every stop"
+NOT_SWITCHED = 0.5  # probability that a sensor stayed on within these hours
+PRIOR, TRACKED_BY = "prior of the training runs", "gravity in motion and every stop"
 UNKNOWN_BODY = {"speed_m_s": 3.0}  # without training logs: with 0.7 m/s cars had three times the error of their stops alone
-
 STEP_S = 1.0  # of the covariance of a constant rest bias, whose dynamics take minutes
 
 METHODS = ("auto", "stationary", "prior", "truth")
@@ -66,7 +66,7 @@ class InitialBias:
 
     It is valid for the whole log, unless `track` or `follows` is set. `track` is the rest bias over time. `follows` is the
     prior before the first sample: the rest bias is then tracked from `hold_s` seconds after the first sample. With
-    `least_std`, the standard deviation of a prior lies between `least_std` and `std`.
+    `least`, the standard deviation of a prior lies between that and `std`.
     """
 
     rest: Vector6
@@ -76,7 +76,7 @@ class InitialBias:
     track: BiasTrajectory | None = None
     follows: BiasPrior | None = None
     hold_s: float = 0.0
-    least_std: Vector6 | None = None
+    least: LeastWidth | None = None
 
     def __post_init__(self) -> None:
         for name in ("rest", "std", "noise"):
@@ -165,16 +165,16 @@ def _transition(F: Float64[np.ndarray, "6 6"]) -> Float64[np.ndarray, "6 6"]:
 def prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias of a log that begins at a stamp: about the mean of its session, or of all.
 
-    Within a session's hours the sensor may have been switched on again: its width is the least, that of a new one the most.
+    Within a session's hours the sensor may or may not have been switched on again: then its width is the most, else the least.
     """
-    mean, least = model.prior_mean.copy(), model.card.get("turn_on_least_std")
+    mean, std, least = model.prior_mean.copy(), model.prior_std.copy(), model.card.get("turn_on_least_std")
     sessions = [] if first_ns is None else model.card.get("sessions", [])
     apart = [max(0, session["start_ns"] - first_ns, first_ns - session["end_ns"]) for session in sessions]
     if apart and min(apart) <= SESSION_GAP_S * 1e9:
         session = sessions[apart.index(min(apart))]
-        mean, least = np.array(session["mean"]), session["std"]
-    std = model.prior_std.copy() if least is None else np.maximum(model.prior_std, least)
-    return InitialBias(mean, std, "prior of the training runs", least_std=None if least is None else np.array(least))
+        mean, repeated = np.array(session["mean"]), LeastWidth(np.array(session["std"]), NOT_SWITCHED)
+        return InitialBias(mean, np.maximum(std, repeated.std), PRIOR, least=repeated)
+    return InitialBias(mean, std, PRIOR, least=None if least is None else LeastWidth(np.array(least)))
 
 
 def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
@@ -186,7 +186,7 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
     ground = np.maximum(model.rest_std, AT_REST_STD)
     walk = np.repeat(np.sqrt(np.mean(model.walk_std.reshape(2, 3) ** 2, axis=1)), 3)
     walk = np.where(walk > 0, walk, USUAL_WALK)
-    least = None if start.least_std is None else np.maximum(start.least_std, LEAST_STD)
+    least = None if start.least is None else start.least._replace(std=np.maximum(start.least.std, LEAST_STD))
     settings = FilterSettings(**model.card.get("speed", {} if "logs" in model.card else UNKNOWN_BODY))
     return BiasPrior(start.rest, np.maximum(start.std, LEAST_STD), ground, walk, least, settings)
 
@@ -215,7 +215,7 @@ def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = ""
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:
         raise NoRestError("the log never rests", where=where, expected="1.5 s or more without motion")
-    std = supported_std(before.std, before.least_std, difference, variance)
+    std = supported_std(before.std, before.least, difference, variance)
     if not np.array_equal(std, before.std):
         track, *_ = smooth_bias(model, batches, replace(before, std=std))
     std = np.median(track.std, axis=0)
@@ -244,7 +244,7 @@ def training_source(model: BiasModel) -> str:
     if "prior" in model.card:  # a model that was not trained names the source of its bias
         return str(model.card["prior"])
     logs = model.card.get("logs", ())
-    return f"prior of {len(logs)} runs" if isinstance(logs, list | tuple) and len(logs) > 1 else "prior of the training runs"
+    return f"prior of {len(logs)} runs" if isinstance(logs, list | tuple) and len(logs) > 1 else PRIOR
 
 
 def accuracy(std: Vector6) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,13 +31,20 @@ CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; 
 Rows6 = Float64[np.ndarray, "*batch 6"]
 
 
+class LeastWidth(NamedTuple):
+    """Least standard deviation that a prior may have, and the probability that it has just this."""
+
+    std: Vector6
+    probability: float = 0.0
+
+
 @dataclass(frozen=True)
 class BiasPrior:
     """Prior of a run's biases.
 
     Bias b in motion, offset at rest (mean zero), and random walk of b.
 
-    `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `least_std` the standard deviation of b
+    `walk` is in rad/s and m/s² per second^1/2, `settings` are those of its filter. With `least` the standard deviation of b
     is only known to lie between that and `std`: the log decides (`supported_std`).
     """
 
@@ -44,7 +52,7 @@ class BiasPrior:
     std: Vector6
     ground_std: Vector6
     walk: Vector6 = field(default_factory=USUAL_WALK.copy)
-    least_std: Vector6 | None = None
+    least: LeastWidth | None = None
     settings: FilterSettings = field(default_factory=FilterSettings)
 
     def supported(
@@ -56,11 +64,11 @@ class BiasPrior:
         """
         bias, ground = (np.array([getattr(state, part) for state in states]) for part in ("bias", "ground"))
         P = np.array([state.P[BIASES, BIASES] for state in states])
-        if self.least_std is not None:
+        if self.least is not None:
             walked = self.walk**2 * elapsed_s[:, None]
             wide = self.std**2 + walked
             difference, variance = shown_bias(bias, P[:, range(6), range(6)], self.mean, wide)
-            narrow = supported_std(self.std, self.least_std, difference, variance) ** 2 + walked
+            narrow = supported_std(self.std, self.least, difference, variance) ** 2 + walked
             narrow = np.minimum(narrow, wide * (1.0 - SAME_WIDTH))
             K, P = inertial_filter.gain(P, BIAS_ROWS, narrow * wide / (wide - narrow))
             moved = (K @ (bias - self.mean)[..., None])[..., 0]
@@ -77,10 +85,10 @@ class BiasPrior:
 
         Each width w shows the mean d g and the variance w^2 (1 - g) with g = w^2 / (w^2 + v).
         """
-        assert self.least_std is not None
+        assert self.least is not None
         std, out = widened(self.std, difference, variance), np.ones_like(difference)
         for columns in COLUMNS.values():
-            width, weight = _possible_widths(std, self.least_std, difference, variance, columns)
+            width, weight = _possible_widths(std, self.least, difference, variance, columns)
             square, d, v = width**2, difference[:, None, columns], variance[:, None, columns]
             usual = narrow[:, None, columns]
             gain, usual_gain = square / (square + v), usual / (usual + v)
@@ -125,37 +133,39 @@ def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: flo
 
 def supported_std(
     std: Vector6,
-    least_std: Vector6 | None,
+    least: LeastWidth | None,
     difference: Float64[np.ndarray, "*batch 6"],
     variance: Float64[np.ndarray, "*batch 6"],
 ) -> Float64[np.ndarray, "*batch 6"]:
     """Standard deviation of a prior that a log supports.
 
     `difference` and `variance` are those of `widened`. Some sensors repeat their turn-on bias to 0.1 mrad/s, some to 20 mrad/s,
-    and one session does not tell. So the logarithm of the width is uniform between `least_std` and `std`. The three axes of a
+    and one session does not tell. So the logarithm of the width is uniform between the least and `std`. The three axes of a
     sensor are switched on together and have the same share of the way: where two axes repeat, weak evidence about the third is
     not believed. The result is the mean of that logarithm, given the log.
     """
     out = widened(std, difference, variance)
-    if least_std is None:
+    if least is None:
         return out
     for columns in COLUMNS.values():
-        _, weight = _possible_widths(out, least_std, difference, variance, columns)
+        _, weight = _possible_widths(out, least, difference, variance, columns)
         most, mean_share = out[..., columns], (weight * SHARES).sum(axis=-2)
-        out[..., columns] = np.minimum(least_std[columns], most) ** (1.0 - mean_share) * most**mean_share
+        out[..., columns] = np.minimum(least.std[columns], most) ** (1.0 - mean_share) * most**mean_share
     return out
 
 
 def _possible_widths(
-    std: Rows6, least_std: Vector6, difference: Rows6, variance: Rows6, columns: slice
+    std: Rows6, least: LeastWidth, difference: Rows6, variance: Rows6, columns: slice
 ) -> tuple[Float64[np.ndarray, "*batch widths 3"], Float64[np.ndarray, "*batch widths 1"]]:
     """Widths of a sensor's prior from the least to the most, and their probabilities given what the log shows."""
     most, square, noise = std[..., None, columns], difference[..., None, columns] ** 2, variance[..., None, columns]
     shown = np.isfinite(noise)
-    width = np.minimum(least_std[columns], most) ** (1.0 - SHARES) * most**SHARES
+    width = np.minimum(least.std[columns], most) ** (1.0 - SHARES) * most**SHARES
+    before = np.full(SHARES.shape, 1.0 - least.probability)
+    before[0] += least.probability * len(SHARES)
     expected = width**2 + np.where(shown, noise, 1.0)
     log_likelihood = -0.5 * np.where(shown, square / expected + np.log(expected), 0.0).sum(axis=-1, keepdims=True)
-    weight = np.exp(log_likelihood - log_likelihood.max(axis=-2, keepdims=True))
+    weight = before * np.exp(log_likelihood - log_likelihood.max(axis=-2, keepdims=True))
     return width, weight / weight.sum(axis=-2, keepdims=True)
 
 

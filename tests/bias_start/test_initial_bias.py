@@ -26,7 +26,7 @@ from imutool.bias_start.initial_bias import (
     smoothed_start,
 )
 from imutool.bias_start.model_choice import find_initial_bias
-from imutool.bias_start.prior_width import supported_std, widened
+from imutool.bias_start.prior_width import LeastWidth, supported_std, widened
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.stationary import Blocks, block_statistics
 from imutool.inertial.strapdown import dead_reckon
@@ -391,14 +391,16 @@ def test_a_prior_that_the_log_contradicts_gives_way_and_one_that_it_bears_out_st
 
 
 def test_two_axes_that_repeat_speak_for_the_third_and_a_large_change_is_believed() -> None:
-    least, most = np.array([5e-4] * 3 + [0.02] * 3), np.array([7e-3] * 3 + [0.15] * 3)
+    least, most = LeastWidth(np.array([5e-4] * 3 + [0.02] * 3)), np.array([7e-3] * 3 + [0.15] * 3)
     variance = np.array([4e-4, 4e-4, 5e-3] + [np.inf] * 3) ** 2
     repeats = supported_std(most, least, np.array([3e-4, -2e-4, -7e-3, 0.0, 0.0, 0.0]), variance)
-    assert (repeats[:3] < 2 * least[:3]).all(), "the third axis shows 7 mrad/s with a deviation of 5"
-    np.testing.assert_allclose(repeats[3:], np.sqrt(least * most)[3:]), "nothing is shown of the accelerometer: the middle"
+    assert (repeats[:3] < 2 * least.std[:3]).all(), "the third axis shows 7 mrad/s with a deviation of 5"
+    np.testing.assert_allclose(repeats[3:], np.sqrt(least.std * most)[3:]), "nothing is shown of the accelerometer: the middle"
     changed = supported_std(most, least, np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
     assert (changed[:3] > 0.6 * most[:3]).all()
     np.testing.assert_array_equal(supported_std(most, None, np.zeros(6), variance), most)
+    same = supported_std(most, least._replace(probability=1.0), np.array([6e-3, -8e-3, -7e-3, 0.0, 0.0, 0.0]), variance)
+    np.testing.assert_allclose(same[3:], least.std[3:])
 
 
 @pytest.mark.parametrize("start", ["auto", "stationary", "smooth"])
@@ -429,7 +431,10 @@ def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
     assert prior(made, 128 * hour).rest[0] == 0.2
     assert prior(made, 115 * hour).rest[0] == pytest.approx(0.3)
     np.testing.assert_array_equal(bias_prior(made, 104 * hour).std, [0.2] * 6)  # it may have been switched on again
-    np.testing.assert_array_equal(bias_prior(made, 104 * hour).least_std, [1e-3] * 6)
+    least = bias_prior(made, 104 * hour).least
+    assert least is not None
+    np.testing.assert_array_equal(least.std, [1e-3] * 6)
+    assert 0.0 < least.probability < 1.0
 
 
 @pytest.mark.parametrize("moved", [0.0, 6e-3])
@@ -444,7 +449,7 @@ def test_a_sensor_switched_on_again_within_a_sessions_hours_is_not_held_to_its_b
     found = auto(made, imu).estimator(made).estimate(*samples(imu))
     off = found.bias[:, :3] - GYRO_BIAS
     assert np.abs(off[-1]).max() < 2e-3
-    assert ((off / np.sqrt(found.covariance[:, range(3), range(3)])) ** 2).mean() < 2.0**2
+    assert ((off / np.sqrt(found.covariance[:, range(3), range(3)])) ** 2).mean() < 3.0**2
 
 
 def test_a_model_that_says_how_rest_differs_is_believed() -> None:
