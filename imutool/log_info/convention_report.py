@@ -18,7 +18,7 @@ from imutool.cleaning.samples import BLOCK, Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
-from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings
+from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings, unlike
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
@@ -81,6 +81,26 @@ def _warnings(imu: Imu, whole: TopicSummary) -> list[str]:
     topic, turned_deg = whole.truth.topic, [] if found.turned is None else found.turned.deg.tolist()
     seen = found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg
     return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
+
+
+def check_start_poses(recording: Recording) -> None:
+    """Refuse poses that would give a wrong initial bias.
+
+    These are what `convert --fix` corrects, and poses of another motion; jumps at times are no error.
+
+    Raises:
+        DataError: such poses.
+    """
+    truth = truth_of(recording)
+    found = None if truth is None else agreement(truth, recording.imu)
+    for warning in _warnings(recording.imu, convention_summary(recording.imu, truth)):
+        if warning.endswith(CORRECTION) or (found is not None and unlike(found.explained, found.rms_rad_s)):
+            raise DataError(
+                warning.removesuffix(f"; {CORRECTION}"),
+                where=f"{recording.name} {recording.imu_topic}",
+                expected="poses and samples of one motion for a start from the truth",
+                fix=f"{CORRECTION if warning.endswith(CORRECTION) else 'See imutool info LOG'}, or give another `init`",
+            )
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
