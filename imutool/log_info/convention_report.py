@@ -13,6 +13,8 @@ from imutool.cleaning.conventions import Conventions, Reading
 from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
+from imutool.cleaning.rules.saturation import Saturation
+from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import BLOCK, Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
@@ -46,11 +48,25 @@ NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or
 def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
     """Totals for the rules about conventions; nothing is converted."""
     motion = Motion()
+    for samples in _blocks(imu):
+        motion.see(samples)
+    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+
+
+def _blocks(imu: Imu) -> Iterator[Samples]:
     for first in range(0, len(imu), BLOCK):
         s = slice(first, first + BLOCK)
         t_ns, values = imu.t_ns[s], np.concatenate([imu.gyro[s], imu.accel[s]], axis=1)
-        motion.see(Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values))
-    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+        yield Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values)
+
+
+def defect_warnings(imu: Imu, whole: TopicSummary) -> list[str]:
+    """Warning of axes that stand still or are clipped, of an IMU whose sensors both change."""
+    stuck, saturation = Stuck(), Saturation()
+    for _ in saturation(stuck(_blocks(imu))):
+        pass
+    found = [f"{finding.count} {finding.what}" for rule in (stuck, saturation) for finding in rule.findings(whole)]
+    return ["; ".join(found)] if found and not constant_sensors(imu) else []
 
 
 def convention_warnings(whole: TopicSummary) -> list[str]:
@@ -104,9 +120,9 @@ def check_start_poses(recording: Recording) -> None:
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
-    """Log the warnings about units, axes and frames of samples that are used uncorrected."""
+    """Log the warnings about units, axes, frames, and dead or clipped axes of uncorrected samples."""
     whole = convention_summary(imu, truth)
-    for warning in _warnings(imu, whole):
+    for warning in [*_warnings(imu, whole), *defect_warnings(imu, whole)]:
         logger.warning("%s: %s", where, warning)
     return whole
 
@@ -131,7 +147,7 @@ def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
 
 
 def check_conventions(recordings: Iterable[Recording]) -> None:
-    """Refuse recordings that would teach wrong units, axes or frames; log other warnings.
+    """Refuse recordings whose units, axes or frames are wrong; log other warnings.
 
     Raises:
         DataError: what `convert --fix` corrects.
@@ -141,7 +157,7 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
             where = f"{recording.name} {recording.imu_topic}"
             if warning.endswith(CORRECTION):
                 what = warning.removesuffix(f"; {CORRECTION}")
-                raise DataError(what, where=where, expected="units, axes and poses that a model may learn", fix=CORRECTION)
+                raise DataError(what, where=where, expected="units, axes and poses that agree", fix=CORRECTION)
             logger.warning("%s: %s", where, warning)
 
 
