@@ -120,7 +120,7 @@ def check_start_poses(recording: Recording) -> None:
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
-    """Log the warnings about units, axes, frames, and dead or clipped axes of uncorrected samples."""
+    """Warn of units, axes, frames, and dead or clipped axes of uncorrected samples."""
     whole = convention_summary(imu, truth)
     for warning in [*_warnings(imu, whole), *defect_warnings(imu, whole)]:
         logger.warning("%s: %s", where, warning)
