@@ -239,11 +239,10 @@ def _debias(
     check_new_topics(log, {topic: new_topics(topic) for topic in topics})
     log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
-    default = given.get("") or (None if all(topic in given for topic in topics) else model_of_log(log, topics))
     derived, starts, models, records, fits = [], {}, {}, {}, {}
     with SourceDigest(log.index, source) as digest:
         for topic in topics:
-            name, survey = given.get(topic, default), surveys.get(topic)
+            name, survey = given.get(topic) or given.get("") or model_of_log(log, topic), surveys.get(topic)
             chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
             derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))

@@ -461,6 +461,19 @@ def test_a_model_for_another_rate_is_refused(source: Path, tmp_path: Path) -> No
     assert not (tmp_path / "out.mcap").exists()
 
 
+def test_another_imu_of_a_known_log_is_not_the_known_sensor(tmp_path: Path) -> None:
+    """The metadata name the sensor of one topic; a camera's own IMU has no model that ships."""
+    log, known = (
+        tmp_path / "two.mcap",
+        {"sensor": "adis16448", "dataset": "euroc", "sequence": "MH_01_easy", "imu_topic": "/imu0"},
+    )
+    both = write_two_imus(flight(3, duration_s=6.0, still_s=3.0), log, known, other=0.01)
+    report = debias(log, tmp_path / "out.mcap", imus=both, force=True)
+    assert dict(report.models) == {"/imu0": "euroc-adis16448-hybrid", "/imu1": "static"}
+    sensors = [read(tmp_path / "out.mcap", imu=topic).metadata["imutool"].get("sensor") for topic in (*both, "/imu0/debiased")]
+    assert sensors == ["adis16448", None, "adis16448"]
+
+
 def test_several_imus_each_get_their_own(recording: Recording, tmp_path: Path, model_file: Path) -> None:
     log = tmp_path / "two.mcap"
     both = write_two_imus(recording, log)
@@ -535,17 +548,19 @@ def test_models_on_the_command_line_are_for_all_or_for_a_topic(tmp_path: Path, m
             assigned(words)
 
 
-def write_two_imus(recording: Recording, log: Path) -> tuple[str, str]:
+def write_two_imus(recording: Recording, log: Path, about: dict[str, str] | None = None, other: float = 0.1) -> tuple[str, str]:
     imu = recording.imu
     with log.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start("ros2", "test")
         kind = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
-        for topic, change in (("/imu0", 0.0), ("/imu1", 0.1)):
+        for topic, change in (("/imu0", 0.0), ("/imu1", other)):
             channel = writer.register_channel(topic, "cdr", kind)
             payloads = encode_imu(imu.t_ns, imu.gyro + change, imu.accel, "body")
             for k, (stamp, payload) in enumerate(zip(imu.t_ns.tolist(), payloads, strict=True)):
                 writer.add_message(channel, stamp, payload.tobytes(), stamp, k)
+        if about is not None:
+            writer.add_metadata("imutool", about)
         writer.finish()
     return "/imu0", "/imu1"
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias_start.bias_tracking import FilteredBlock, Samples, filter_blocks
 from imutool.bias_start.initial_bias import (
@@ -27,13 +28,14 @@ from imutool.bias_start.initial_bias import (
     tracked_from_prior,
     training_source,
 )
-from imutool.bias_start.prior_width import BiasPrior, supported_std, widened
+from imutool.bias_start.prior_width import MOST_DEVIATIONS, BiasPrior, supported_std, widened
 from imutool.errors import DataError
 from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
+MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 
@@ -147,6 +149,33 @@ def rest_differences(
         means = [residual[first:last].mean(axis=0) for first, last in rest_stretches(Imu(t_ns, gyro, accel))]
         out.append(np.array([[*m[:3], *[np.linalg.norm(m[3:]) - GRAVITY_M_S2] * 3] for m in means]).reshape(-1, 6))
     return out
+
+
+def changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
+    """Sentence on a gyro whose mean at rest moves further than the walk of the training runs."""
+    t_s, gyro, _ = samples
+    within = [gyro[slice(*np.searchsorted(t_s, stop))] for stop in stops]
+    for (stop, first), (later, last) in itertools.pairwise(zip(stops, within, strict=True)):
+        noise = sum(part.var(axis=0) / len(part) for part in (first, last))
+        apart_s = 0.5 * (sum(later) - sum(stop))
+        std = np.sqrt(prior.walk[:3] ** 2 * apart_s + 2.0 * prior.ground_std[:3] ** 2 + noise)
+        change = last.mean(axis=0) - first.mean(axis=0)
+        axis = int(np.argmax(np.abs(change) / std))
+        if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
+            yield (
+                f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
+                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
+            )
+            return
+
+
+def shown_at_rest(samples: Samples) -> tuple[Vector6, Vector6]:
+    """Bias of the gyro at stops, and its deviation: infinite for what stops do not show."""
+    (at_stops,) = rest_differences(static.Model(), [samples], np.zeros((1, 6)))
+    shown, std = np.zeros(6), np.full(6, np.inf)
+    if len(at_stops):
+        shown[:3], std[:3] = at_stops[:, :3].mean(axis=0), np.hypot(at_stops[:, :3].std(axis=0), MOST_UNKNOWN)
+    return shown, std
 
 
 class _RestStretch(NamedTuple):

@@ -24,10 +24,12 @@ from imutool.bias_start.prior_width import supported_std
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
-from imutool.recording import Recording, seconds
+from imutool.log_info.convention_report import check_start_poses
+from imutool.recording import Recording, nanoseconds, seconds
 
 TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 LEAST_TRUTH_S = 1.0
+CHECKED_S = 60.0  # of truth and gyro that are compared first: 15 s do not always show a clock
 NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses without positions
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room (docs/diagnosis.md)
 MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
@@ -46,9 +48,11 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     truth may be tilted against gravity. The tilt is a bias of the accelerometer while true poses are used, and an error later.
 
     Raises:
-        DataError: no truth, or less than a second.
+        DataError: no truth, or less than a second; another unit, clock, body or motion than the gyro's.
     """
     both = recording.overlap()
+    first_ns = int(both.imu.t_ns[0])
+    check_start_poses(both.between(first_ns, first_ns + nanoseconds(max(truth_s, CHECKED_S))))
     imu, truth = both.imu, both.truth
     poses, trusted = with_velocity(truth).at(imu.t_ns)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -27,10 +27,19 @@ import numpy as np
 from imutool.bias import static
 from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
-from imutool.bias_start import Fitness
+from imutool.bias_start import Fitness, Verdict
+from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, changed_at_rest, shown_at_rest
 from imutool.bias_start.bias_tracking import BiasFilter, Samples, innovations, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
-from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior, supported_std, turned_axes
+from imutool.bias_start.prior_width import (
+    MOST_CHANGE,
+    MOST_DEVIATIONS,
+    TELLING,
+    BiasPrior,
+    contradicted_start,
+    supported_std,
+    turned_axes,
+)
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
@@ -42,14 +51,12 @@ UNKNOWN_STD = np.array([0.1] * 3 + [1.5] * 3)  # rad/s and m/s²: bias of a sens
 MOST_SURPRISING = 0.05  # share of such innovations; training logs 0.00, other sensors at least 0.05 where bias is no evidence
 MOST_OF_GUESS = np.array([3.0] * 3 + [MOST_DEVIATIONS] * 3)  # the same where few sessions leave the prior's width to a guess
 LEAST_EVIDENCE = -40.0  # log-likelihood of the model against none
-TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
 DEPENDENT = 2.0  # ratio of the shown bias's deviation to the filter's, which takes velocities for independent; a hand circles
 MOST_NOISE = 4.0  # ratio to the residuals of the training logs; training logs up to 2.0
 MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays within 1e-4
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
-MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 
 
@@ -77,13 +84,14 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     if len(samples[0]) and (wrong := _wrong_gravity(samples, start)):
         return Fitness("unfit", (wrong,))
     if model.method == static.Model.method:
-        units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
-        return Fitness("fits", (f"it needs no training; trained models ship for {', '.join(units)}",))
+        return _untrained(start, samples)
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)
     corrected = _without_motion(model, samples, prior)
     found = _evidence(corrected, prior)
+    shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)
+    other_start, harmful = contradicted_start(start.rest, start.std, prior.mean + found.difference, shown_std)
     supported = supported_std(prior.std, prior.least, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
@@ -94,15 +102,16 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
     contradictions = [*other_axes, *other_bias, *_disagreement(found, none), *refuted]
-    if contradictions:
+    if harmful or contradictions:
         used = _started(start, prior)
         same = np.array_equal(used.mean, prior.mean)
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
-        if other_axes or worse or (other_bias and refuted):
-            return Fitness("unfit", (*contradictions, *worse))
+        if harmful or other_axes or worse or (other_bias and refuted):
+            return Fitness("unfit", (*other_start, *contradictions, *worse))
     doubts = [
+        *other_start,
         *(sentence for sentence in contradictions if not confirmed or sentence not in other_bias),
-        *_changed_at_rest(corrected, found.stops, prior),
+        *changed_at_rest(corrected, found.stops, prior),
         *_not_shown(start, found),
         *model.remarks,
         *_other_conditions(model, samples),
@@ -118,6 +127,14 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     if model.load_before is not None:
         followed.append("the sensor was in use before the log, so its drift does not start cold")
     return Fitness("fits", (agreement, *other_bias, *followed))
+
+
+def _untrained(start: InitialBias, samples: Samples) -> Fitness:
+    """Fitness of a constant bias, which needs no training, from the stops of a log."""
+    units = sorted({path.stem.rpartition("-")[0] for path in library().glob("*.safetensors")})
+    other_start, harmful = contradicted_start(start.rest, start.std, *shown_at_rest(samples))
+    verdict: Verdict = "unfit" if harmful else "doubtful" if other_start else "fits"
+    return Fitness(verdict, (*other_start, f"it needs no training; trained models ship for {', '.join(units)}"))
 
 
 def _prior(model: BiasModel) -> BiasPrior:
@@ -176,24 +193,6 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
     variance = np.where(shown, 1.0 / np.where(shown, precision, 1.0), np.inf) + prior.walk**2 * blocks[-1].end_s
     surprising = float((found.chi_square > SURPRISING).mean())
     return _Evidence(float(found.log_likelihood.sum()), surprising, difference, variance, stops_of(blocks), found)
-
-
-def _changed_at_rest(samples: Samples, stops: Sequence[tuple[float, float]], prior: BiasPrior) -> Iterator[str]:
-    """Sentence on a gyro whose mean at rest moves further from stop to stop than the walk of the training runs."""
-    t_s, gyro, _ = samples
-    within = [gyro[slice(*np.searchsorted(t_s, stop))] for stop in stops]
-    for (stop, first), (later, last) in itertools.pairwise(zip(stops, within, strict=True)):
-        noise = sum(part.var(axis=0) / len(part) for part in (first, last))
-        apart_s = 0.5 * (sum(later) - sum(stop))
-        std = np.sqrt(prior.walk[:3] ** 2 * apart_s + 2.0 * prior.ground_std[:3] ** 2 + noise)
-        change = last.mean(axis=0) - first.mean(axis=0)
-        axis = int(np.argmax(np.abs(change) / std))
-        if abs(change[axis]) > MOST_DEVIATIONS * std[axis]:
-            yield (
-                f"the gyro's bias about {'xyz'[axis]} moves by {change[axis]:+.2g} rad/s in {apart_s:.0f} s, from stop to stop,"
-                f" {abs(change[axis]) / std[axis]:.0f} standard deviations of its walk in training: it warms up, or drifts"
-            )
-            return
 
 
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:

@@ -44,6 +44,7 @@ from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.mcap_io.temperature import temperatures
+from imutool.mcap_io.write import about_imu
 from imutool.recording import Imu, Recording, nanoseconds, seconds
 
 HEAD_S = 60.0  # start of a log that the search for the initial bias reads
@@ -72,11 +73,8 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
         return prior(model, int(recording.imu.t_ns[0]))
     if init == "truth" or init.startswith("truth:"):
         return from_truth(model, recording, _truth_s(init))
-    if init == "stationary":
-        return at_rest(model, recording.imu)
-    if init == "auto":
-        return auto(model, recording.imu)
-    return from_numbers(init)
+    from_samples = {"stationary": at_rest, "auto": auto}.get(init)
+    return from_numbers(init) if from_samples is None else from_samples(model, recording.imu)
 
 
 def _truth_s(init: str) -> float:
@@ -121,10 +119,10 @@ def choose_imus(log: Log, imus: Sequence[str], given: Mapping[str, str | Path]) 
     return topics
 
 
-def model_of_log(log: Log, topics: Sequence[str]) -> str | Path | None:
-    """Model that a log's metadata name for these IMUs; it ships, as anybody may write a log."""
-    about = log.metadata().get("imutool", {})
-    name = about.get("model") if about.get("source_topic", topics[0]) in topics else None  # that of another IMU
+def model_of_log(log: Log, topic: str) -> str | Path | None:
+    """Model that a log's metadata name for an IMU; it ships, as anybody may write a log."""
+    about = about_imu(log.metadata().get("imutool", {}), topic)
+    name = about.get("model") if about.get("source_topic", topic) == topic else None  # that of another IMU
     if name == static.Model.method:
         return name
     return shipped(name, f"{log.path}, metadata imutool") if name else next(iter(shipped_for(about)), None)
@@ -188,7 +186,7 @@ def _duration_ns(log: Log, topic: str) -> int:
 
 def fitness_in_log(log: Log, topic: str, model: BiasModel, start: InitialBias, survey: Survey | None) -> Fitness:
     """Fitness of a model, started in a log, for one of its IMUs."""
-    return judge(model, start, _Batches(log, topic, survey, model), log.metadata().get("imutool", {}))
+    return judge(model, start, _Batches(log, topic, survey, model), about_imu(log.metadata().get("imutool", {}), topic))
 
 
 def smooth_in_memory(model: BiasModel, imu: Imu, where: str | Location) -> InitialBias:

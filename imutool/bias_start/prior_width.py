@@ -16,6 +16,7 @@ from imutool.inertial.inertial_filter import FilterSettings, State
 
 MOST_CHANGE = np.array([0.05] * 3 + [0.7] * 3)  # rad/s and m/s²: no switching-on changes one sensor's bias by more
 MOST_DEVIATIONS = 5.0  # between a log's bias and the prior; training logs up to 3.1, other sensors from 6.7 on
+TELLING = np.array([0.02] * 3 + [0.2] * 3)  # rad/s and m/s²: bias by which sensors differ, to be seen in the log
 USUAL_WALK = np.array([1e-4] * 3 + [2e-3] * 3)  # of a sensor whose training logs show no more
 BIASES = slice(inertial_filter.BIAS.start, inertial_filter.GROUND.stop)  # both biases in the filter's error
 BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
@@ -129,6 +130,20 @@ def turned_axes(difference: Vector6, std: Vector6, mean: Vector6, most_left: flo
     return [
         f"its bias is that of the training logs if its x, y, z are their {axis_names(rotations[best])}: the axes are turned"
     ]
+
+
+def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: Vector6) -> tuple[list[str], bool]:
+    """Sentences on a start that contradicts a log's bias, and whether no correction is nearer."""
+    off, total = np.abs(rest - shown), np.sqrt(std**2 + shown_std**2)
+    sentences = []
+    for sensor, unit, columns in (("gyro", "rad/s", slice(0, 3)), ("accelerometer", "m/s²", slice(3, 6))):
+        axis = int(np.argmax(off[columns] / total[columns])) + columns.start
+        if off[axis] > MOST_DEVIATIONS * total[axis]:
+            seen = f"{shown[axis]:+.2g} ± {shown_std[axis]:.1g} {unit}"
+            sentences.append(
+                f"the start's bias of the {sensor} about {'xyz'[axis % 3]} is {rest[axis]:+.2g}, the log shows {seen}"
+            )
+    return sentences, bool((off - np.abs(shown) > TELLING + MOST_DEVIATIONS * total).any())
 
 
 def supported_std(

@@ -47,6 +47,9 @@ def main() -> None:
     gc.set_threshold(100_000)  # imports make objects that stay: the collector took a twelfth of a command's start
     atexit.register(gc.freeze)  # and at the end it would look at all of them again, which takes 45 ms of CPU
     words = sys.argv[1:]
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started us; an output file would get its number
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     try:
         if words in ([], ["--help"]) and COMPLETION not in os.environ:
             show()

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from imutool.viewing.stream.samples import Sample
 
 FROM_HELP = "stdin (JSON lines), udp://HOST:PORT, zenoh://[HOST:PORT]/KEY, rosbridge://HOST:PORT/TOPIC, or a log."
+FORCE_HELP = "Use a model although it does not fit the stream; a warning says why it does not."
 MODEL_HELP = "Model file, a name that ships, or static: the bias at rest in the first two seconds."
 
 
@@ -48,6 +49,7 @@ def live(
     save: Annotated[Path | None, typer.Option(metavar="F.rrd", help="Save what is shown to a file."), RRD] = None,
     no_view: Annotated[bool, typer.Option("--no-view", help="Show nothing; with --print, for another program.")] = False,
     to_stdout: Annotated[bool, typer.Option("--print", help="Print each debiased sample as a line of JSON.")] = False,
+    force: Annotated[bool, typer.Option("--force", help=FORCE_HELP)] = False,
     common: Common = COMMON,
 ) -> None:
     """Debias a stream of samples as it comes, show it, and measure the delay.
@@ -70,7 +72,7 @@ def live(
     channel = scale_of(found).channel if found.temperature_parameters() else None
     samples = open_source(origin, malformed, imu=imu, speed=speed, temperature=channel)
     with _view(connect, save, common.overwrite) if not no_view else nullcontext() as show:
-        stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds)
+        stream = run(samples, found, malformed, show=show, each=_print if to_stdout else None, seconds=seconds, force=force)
     shown = [] if show is None else show.shown
     if malformed.count:
         tell_warning(f"messages without a sample: {malformed.count}, the first: {malformed.first}")
@@ -95,6 +97,7 @@ def _print(found: Sample, rate: np.ndarray, force: np.ndarray) -> None:
 def _lines(stream: StreamStatistics, shown: list[Output]) -> list[str]:
     """Summary of a stream."""
     lines = [f"{stream.samples} samples in {stream.seconds:.1f} s ({stream.rate_hz:.0f} Hz); start: {stream.start}"]
+    lines += [stream.fit.sentence("the model")] if stream.fit is not None else []
     if stream.delay_ms is not None:
         delay = stream.delay_ms
         lines.append(

@@ -16,10 +16,10 @@ from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.target import SIGNATURE, FolderTarget, writing
-from imutool.mcap_io.topics import VELOCITY_KEY
+from imutool.mcap_io.topics import DERIVED_KEY, VELOCITY_KEY
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
-from imutool.recording import Frames, Poses, Recording, Scalars, unit_quaternions
+from imutool.recording import Frames, Poses, Recording, Scalars, seconds, unit_quaternions
 
 BLOCK_ROWS = 10_000
 FEWEST = 2  # samples
@@ -64,13 +64,14 @@ def write(
     with Log(log) as opened:
         topic = imu or _best_imu(opened)
         topics = list(opened.topics)
+        source = opened.topics[topic].metadata.get(DERIVED_KEY) if topic in opened.topics else None
         velocities = {name: t.metadata[VELOCITY_KEY] for name, t in opened.topics.items() if VELOCITY_KEY in t.metadata}
     with FolderTarget(out, log, signed="mav0/imu0/sensor.yaml", holds="mav0", overwrite=overwrite) as folder:
         recording = read(log, imu=topic)
         if len(recording.imu) < FEWEST:
             raise LogError(f"{topic} has {len(recording.imu)} samples", where=log, expected=f"{FEWEST} or more, for a rate")
         with writing(out):
-            writer = _Asl(folder / "mav0", recording, tell)
+            writer = _Asl(folder / "mav0", recording, source, tell)
             writer.imu(given)
             writer.truths()
             writer.cameras()
@@ -97,8 +98,9 @@ def _best_imu(log: Log) -> str:
 class _Asl:
     """Writes the parts of a `mav0` folder and counts their rows."""
 
-    def __init__(self, root: Path, recording: Recording, tell: Progress) -> None:
-        self.root, self.recording, self.tell = root, recording, tell
+    def __init__(self, root: Path, recording: Recording, source: str | None, tell: Progress) -> None:
+        """`source` is the topic from which the samples were computed, None for raw ones."""
+        self.root, self.recording, self.tell, self._source = root, recording, tell, source
         self.written: dict[str, int] = {}
         self.used: set[str] = {recording.imu_topic}
         self.root.mkdir()
@@ -122,14 +124,26 @@ class _Asl:
             self._table(folder, TRUTH_COLUMNS, poses.t_ns, values)
 
     def _bias(self, topic: str, poses: Poses, end: str) -> Float64[np.ndarray, "n 3"]:
-        """True bias on the stamps of the poses, NaN where unknown or between the stamps."""
-        rows = np.full((len(poses), 3), np.nan)
-        name = f"{topic.removesuffix('/pose')}/bias/{end}"
+        """True bias of the samples on the stamps of the poses, NaN where unknown or between the stamps.
+
+        The true bias of a debiased IMU is that of the sensor minus what was subtracted.
+        """
+        rows, name = np.full((len(poses), 3), np.nan), f"{topic.removesuffix('/pose')}/bias/{end}"
         known: Scalars | None = self.recording.scalars.get(name)
         if known is not None and known.values.shape[1] == 3 and np.isin(known.t_ns, poses.t_ns).all():
-            rows[np.searchsorted(poses.t_ns, known.t_ns)] = known.values
+            rows[np.searchsorted(poses.t_ns, known.t_ns)] = known.values - self._subtracted(known.t_ns, end)
             self.used.add(name)
         return rows
+
+    def _subtracted(self, t_ns: Int64[np.ndarray, " n"], end: str) -> Float64[np.ndarray, "n 3"]:
+        """Bias that `debias` subtracted from the samples: zero of a raw IMU, NaN where it is not known."""
+        if self._source is None:
+            return np.zeros((len(t_ns), 3))
+        bias = self.recording.scalars.get(f"{self._source}/bias/{end}")
+        if bias is None or bias.values.shape[1] != 3 or not len(bias.t_ns):
+            return np.full((len(t_ns), 3), np.nan)
+        at, knots = (seconds(stamps, int(bias.t_ns[0])) for stamps in (t_ns, bias.t_ns))
+        return np.stack([np.interp(at, knots, column, left=np.nan, right=np.nan) for column in bias.values.T], axis=1)
 
     def cameras(self) -> None:
         """Writes one folder per camera, images byte for byte, one in memory at a time."""

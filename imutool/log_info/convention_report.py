@@ -13,12 +13,14 @@ from imutool.cleaning.conventions import Conventions, Reading
 from imutool.cleaning.pose_delay import LONGEST_DELAY_S
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import Axes
+from imutool.cleaning.rules.saturation import Saturation
+from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import BLOCK, Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
-from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings
+from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings, unlike
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
@@ -46,11 +48,25 @@ NO_GRAVITY = "gravity does not turn clearly in the body: rest, planar motion, or
 def convention_summary(imu: Imu, truth: Truth | None) -> TopicSummary:
     """Totals for the rules about conventions; nothing is converted."""
     motion = Motion()
+    for samples in _blocks(imu):
+        motion.see(samples)
+    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+
+
+def _blocks(imu: Imu) -> Iterator[Samples]:
     for first in range(0, len(imu), BLOCK):
         s = slice(first, first + BLOCK)
         t_ns, values = imu.t_ns[s], np.concatenate([imu.gyro[s], imu.accel[s]], axis=1)
-        motion.see(Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values))
-    return TopicSummary(CleaningSettings(convert_units=False), len(imu), motion, truth)
+        yield Samples(first + np.arange(len(t_ns)), t_ns, t_ns, values)
+
+
+def defect_warnings(imu: Imu, whole: TopicSummary) -> list[str]:
+    """Warning of axes that stand still or are clipped, of an IMU whose sensors both change."""
+    stuck, saturation = Stuck(), Saturation()
+    for _ in saturation(stuck(_blocks(imu))):
+        pass
+    found = [f"{finding.count} {finding.what}" for rule in (stuck, saturation) for finding in rule.findings(whole)]
+    return ["; ".join(found)] if found and not constant_sensors(imu) else []
 
 
 def convention_warnings(whole: TopicSummary) -> list[str]:
@@ -83,10 +99,30 @@ def _warnings(imu: Imu, whole: TopicSummary) -> list[str]:
     return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
 
 
+def check_start_poses(recording: Recording) -> None:
+    """Refuse poses that would give a wrong initial bias.
+
+    These are what `convert --fix` corrects, and poses of another motion; jumps at times are no error.
+
+    Raises:
+        DataError: such poses.
+    """
+    truth = truth_of(recording)
+    found = None if truth is None else agreement(truth, recording.imu)
+    for warning in _warnings(recording.imu, convention_summary(recording.imu, truth)):
+        if warning.endswith(CORRECTION) or (found is not None and unlike(found.explained, found.rms_rad_s)):
+            raise DataError(
+                warning.removesuffix(f"; {CORRECTION}"),
+                where=f"{recording.name} {recording.imu_topic}",
+                expected="poses and samples of one motion for a start from the truth",
+                fix=f"{CORRECTION if warning.endswith(CORRECTION) else 'See imutool info LOG'}, or give another `init`",
+            )
+
+
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
-    """Log the warnings about units, axes and frames of samples that are used uncorrected."""
+    """Warn of units, axes, frames, and dead or clipped axes of uncorrected samples."""
     whole = convention_summary(imu, truth)
-    for warning in _warnings(imu, whole):
+    for warning in [*_warnings(imu, whole), *defect_warnings(imu, whole)]:
         logger.warning("%s: %s", where, warning)
     return whole
 
@@ -111,7 +147,7 @@ def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
 
 
 def check_conventions(recordings: Iterable[Recording]) -> None:
-    """Refuse recordings that would teach wrong units, axes or frames; log other warnings.
+    """Refuse recordings whose units, axes or frames are wrong; log other warnings.
 
     Raises:
         DataError: what `convert --fix` corrects.
@@ -121,7 +157,7 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
             where = f"{recording.name} {recording.imu_topic}"
             if warning.endswith(CORRECTION):
                 what = warning.removesuffix(f"; {CORRECTION}")
-                raise DataError(what, where=where, expected="units, axes and poses that a model may learn", fix=CORRECTION)
+                raise DataError(what, where=where, expected="units, axes and poses that agree", fix=CORRECTION)
             logger.warning("%s: %s", where, warning)
 
 

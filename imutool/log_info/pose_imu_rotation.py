@@ -104,9 +104,14 @@ def body_warnings(topic: str, turned_deg: Sequence[float]) -> list[str]:
     return [what] if deg > TURNED_DEG else []
 
 
+def unlike(explained: float, rms_rad_s: float) -> bool:
+    """Whether poses leave most of the gyro's motion unexplained."""
+    return explained <= LEAST_EXPLAINED and rms_rad_s >= UNLIKE_RAD_S
+
+
 def motion_warnings(topic: str, explained: float, rms_rad_s: float, jumps: int, largest_deg: float) -> list[str]:
     """Warning of poses that do not turn as the gyro does, or at times jump."""
-    if explained <= LEAST_EXPLAINED and rms_rad_s >= UNLIKE_RAD_S:
+    if unlike(explained, rms_rad_s):
         causes = (
             "clocks that differ, a gyro in another unit, poses of another recording or body, jumps or noise, or quaternions"
             " inverted or in another order"

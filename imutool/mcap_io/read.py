@@ -85,7 +85,7 @@ def read_recordings(
         LogError: as `read`.
     """
     imu_topic = imu if imu and samples is not None else log.topic(imu or log.only_imu(), (schemas.IMU,)).name
-    own, metadata = own_and_user_metadata(log.metadata_records())
+    own, metadata = own_and_user_metadata(log.metadata_records(), imu_topic)
     truths = _choose_truths(log, truth)
     velocities = {t.name: t.metadata[VELOCITY_KEY] for t in log.topics.values() if VELOCITY_KEY in t.metadata}
     numbers = [t for t in log.with_schema(SCALARS) if t.message_encoding in ENCODINGS and (derived or not t.is_derived)]

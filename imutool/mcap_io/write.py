@@ -205,8 +205,15 @@ def _image_chunks(channel: int, buffer: MessageBuffer, topic: str, frames: Frame
         yield buffer.pop()
 
 
+def about_imu(entries: Mapping[str, str], topic: str, own_topic: str | None = None) -> dict[str, str]:
+    """What a log's record `imutool` says of one of its IMUs: the sensor is that of `imu_topic`."""
+    own = own_topic or entries.get("imu_topic") or topic
+    named = topic == own or topic.startswith(f"{own}/")  # what is computed from an IMU lies below it
+    return {key: value for key, value in entries.items() if named or key != "sensor"}
+
+
 def own_and_user_metadata(
-    records: Iterable[tuple[str, Mapping[str, str]]],
+    records: Iterable[tuple[str, Mapping[str, str]]], topic: str
 ) -> tuple[Mapping[str, str], dict[str, dict[str, str]]]:
     """The writer's notes on a recording and its own metadata, from the records of a log.
 
@@ -222,6 +229,8 @@ def own_and_user_metadata(
             if not entries and shadowed is None:
                 continue
         found.setdefault(name, {}).update(entries)
+    if RECORD in found:
+        found[RECORD] = about_imu(found[RECORD], topic, own.get("imu_topic"))
     return own, found
 
 

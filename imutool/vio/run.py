@@ -23,6 +23,7 @@ from imutool.errors import DataError, NumericsError
 from imutool.evaluation import runs
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import StartPose, with_velocity
+from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.vio import camera, smoother
@@ -77,12 +78,13 @@ def vio(
 
     Raises:
         ConfigError: GTSAM is not installed.
-        LogError, DataError: no IMU, no truth, or the two share no time.
+        LogError, DataError: no IMU, no truth, the two share no time, or contradict each other (`check_conventions`).
         ModelError: a model that cannot be used with this log.
     """
     smoother.load()
     chosen = settings or VioSettings()
     recording = read(log, imu=imu, truth=truth)
+    check_conventions([recording])
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
     course = plan(recording, chosen)

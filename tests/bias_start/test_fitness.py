@@ -150,9 +150,21 @@ def test_a_small_correction_of_another_unit_fits_but_the_reason_says_what_the_lo
 @pytest.mark.parametrize(("bias", "verdict"), [(1.5, "fits"), (9.7, "unfit"), (-8.8, "unfit")])
 def test_a_bias_at_rest_as_large_as_gravity_is_none(bias: float, verdict: str, recording: Recording) -> None:
     """It is what rest shows of accelerations without gravity, and of those in g, however strong the motion later is."""
-    found = judge(static.Model(), from_numbers(f"0,0,0,0,0,{bias}"), [relative_samples(recording.imu)], {})
+    x, y, z = imutool.debias(recording, "static").start.rest[:3]
+    found = judge(static.Model(), from_numbers(f"{x},{y},{z},0,0,{bias}"), [relative_samples(recording.imu)], {})
     assert found.verdict == verdict
     assert ("does not measure gravity, or its unit is not m/s²" in found.reasons[0]) == (verdict == "unfit")
+
+
+@pytest.mark.parametrize("untrained", [False, True])
+def test_a_start_that_the_log_contradicts_is_named(untrained: bool, model: BiasModel, recording: Recording) -> None:
+    """Doubtful where it is no worse than no correction, else unfit."""
+    own = imutool.debias(recording, "static").start.rest
+    for off, verdict in ((np.zeros(6), "fits"), (-own, "doubtful"), (np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]), "unfit")):
+        start = from_numbers(",".join(str(x) for x in own + off))
+        found = judge(static.Model() if untrained else model, start, [relative_samples(recording.imu)], MADE_FOR)
+        assert found.verdict == verdict
+        assert ("the start's bias of the gyro about " in found.reasons[0]) == (verdict != "fits")
 
 
 def test_another_switching_on_is_no_doubt_where_gravity_confirms_the_correction(model: BiasModel, scaled: Imu) -> None:

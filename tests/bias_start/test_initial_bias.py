@@ -196,7 +196,7 @@ def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
     assert start.how == "truth over 12.0 s, ±1e-06 rad/s"
 
 
-@pytest.mark.parametrize("turn", [0.05, -0.1])
+@pytest.mark.parametrize("turn", [0.05, -0.06])
 def test_a_body_of_poses_that_is_turned_against_the_sensor_is_no_bias_of_the_gyro(biased: Recording, turn: float) -> None:
     """Markers are meant to be straight, and are off by some degrees; a trained model has their mean."""
     truth = biased.truth
@@ -207,6 +207,29 @@ def test_a_body_of_poses_that_is_turned_against_the_sensor_is_no_bias_of_the_gyr
     card = sees_everything()
     card.card = {"logs": [{}]}
     assert np.abs(from_truth(card, mounted).rest[:3] - GYRO_BIAS).max() > 5e-3
+
+
+SPOILED = {
+    "late": ("late|explain", lambda poses: replace(poses, t_ns=poses.t_ns + 300_000_000)),
+    "frozen": ("explain 0%", lambda poses: replace(poses, q_wb_wxyz=np.repeat(poses.q_wb_wxyz[:1], len(poses), axis=0))),
+    "turned": (
+        "is turned by 20°",
+        lambda poses: replace(
+            poses,
+            q_wb_wxyz=(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec([0.35, 0, 0])).as_quat(
+                scalar_first=True
+            ),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("how", SPOILED)
+def test_poses_that_contradict_the_gyro_give_no_start(how: str, biased: Recording) -> None:
+    """Their bias would be wrong by some degrees a second, with a deviation of 0.02°/s."""
+    said, spoil = SPOILED[how]
+    with pytest.raises(DataError, match=said):
+        from_truth(sees_everything(), replace(biased, truths={"/truth": spoil(biased.truth)}))
 
 
 def test_after_the_truth_the_rest_bias_is_followed_from_what_it_showed() -> None:

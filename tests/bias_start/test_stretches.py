@@ -20,7 +20,7 @@ from imutool.bias_start.correction import OnlineDebiaser, apply_with_std
 from imutool.bias_start.initial_bias import tracked_from_prior
 from imutool.bias_start.stretches import Sieve, StretchClock, measured, measured_recording, read_stretches
 from imutool.debiasing import DebiasedBlock, DebiasReport, debias
-from imutool.errors import ConfigError, ImutoolError, LogError
+from imutool.errors import ConfigError, DataError, ImutoolError, LogError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
@@ -253,7 +253,9 @@ def test_a_log_whose_clock_was_set_back_is_read_as_its_longest_stretch(
     found = read(path)
     assert found.imu == max(first, second, key=lambda part: len(part.imu)).imu
     assert "only the longest stretch of its clock is read" in caplog.text
-    debias(path, tmp_path / "out.mcap", model="euroc-adis16448-hybrid", init="truth", force=True)
+    debias(path, tmp_path / "out.mcap", model="euroc-adis16448-hybrid", force=True)
+    with pytest.raises(DataError, match="explain 0% of the gyro's motion"):  # poses on the clock that was set
+        debias(path, tmp_path / "out.mcap", model="euroc-adis16448-hybrid", init="truth", force=True, overwrite=True)
     train([path], tmp_path / "m.safetensors", method="linear")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -186,6 +187,15 @@ def test_a_reader_that_has_left_is_no_error(logs: Path, command: str, words: lis
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_command_without_standard_output_does_its_work(logs: Path, tmp_path: Path) -> None:
+    """As a service may start it; it ended in a traceback."""
+    log, out = sorted(logs.glob("*.mcap"))[0], tmp_path / "out.mcap"
+    words = shlex.join([sys.executable, "-m", "imutool", "debias", str(log), str(out), "--model", "static"])
+    done = subprocess.run(["sh", "-c", f"{words} >&-"], capture_output=True, text=True, check=False)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    assert out.stat().st_size > 0
 
 
 def test_names_of_files_are_shown_as_they_are(tmp_path: Path, logs: Path, imutool: Run) -> None:

@@ -75,6 +75,24 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / "log.mcap"
 
 
+def test_the_true_bias_of_a_debiased_imu_is_what_debias_left(log: Path, tmp_path: Path) -> None:
+    """An estimator that starts from the truth would subtract the sensor's bias again."""
+    out = tmp_path / "debiased.mcap"
+    debias(log, out, model="static", init="0.01,0.02,0.03,0.1,0.2,0.3", force=True)
+    export(out, tmp_path / "folder", format="euroc")
+    (raw,), (left,) = (euroc.read(place) for place in (_exported(log, tmp_path / "raw"), tmp_path / "folder"))
+    for end, subtracted in (("gyro", [0.01, 0.02, 0.03]), ("accel", [0.1, 0.2, 0.3])):
+        known, remains = (r.scalars[f"/ground_truth/bias/{end}"] for r in (raw, left))
+        both = np.isin(known.t_ns, remains.t_ns)  # unknown before the first sample and after the last
+        assert both.sum() == len(remains.t_ns) > 50
+        np.testing.assert_allclose(known.values[both] - remains.values, np.tile(subtracted, (both.sum(), 1)), atol=1e-12)
+
+
+def _exported(log: Path, out: Path) -> Path:
+    export(log, out, format="euroc")
+    return out
+
+
 def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,6 +91,30 @@ def test_wrong_units_axes_and_frames_are_warned_of(
     told: str, made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     warned(told, "evaluate", made, tmp_path / "log.mcap", caplog)
+
+
+@pytest.mark.parametrize(
+    ("told", "spoil"),
+    [
+        ("gyro.y unchanged", lambda gyro: np.where([False, True, False], 0.0123, gyro)),
+        ("gyro.x at the end of its range", lambda gyro: np.clip(gyro, -0.3, 0.3)),
+    ],
+)
+def test_a_dead_or_clipped_axis_is_warned_of_where_samples_are_used(
+    told: str, spoil: Callable[[Any], Any], made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for use in ("debias", "evaluate"):
+        caplog.clear()
+        changed = replace(made, imu=Imu(made.imu.t_ns, spoil(made.imu.gyro), made.imu.accel))
+        write(changed, tmp_path / f"{use}.mcap")
+        with suppress(ImutoolError, StopError):
+            USES[use](tmp_path / f"{use}.mcap")
+        assert told in caplog.text
+    caplog.clear()
+    write(made, tmp_path / "sound.mcap")
+    with suppress(ImutoolError, StopError):
+        USES["evaluate"](tmp_path / "sound.mcap")
+    assert "samples with" not in caplog.text
 
 
 @pytest.mark.parametrize("name", ["debias", "diagnose"])

@@ -45,7 +45,8 @@ class Ends:
         levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
         self._samples += int(counts.sum())
         if len(self._few) < FINE_LEVELS:
-            self._few = np.union1d(self._few, levels)[:FINE_LEVELS]
+            # with counts `np.unique` does not import numpy.ma, which takes longer than a short log
+            self._few = np.unique(np.concatenate([self._few, levels]), return_counts=True)[0][:FINE_LEVELS]
         for side, (known, times) in self._ends.items():
             near = slice(None, KEPT) if side < 0 else slice(-KEPT, None)
             both, which = np.unique(np.concatenate([known, levels[near]]), return_inverse=True)
@@ -87,7 +88,10 @@ class Plateau:
         step = np.nan_to_num(np.abs(np.diff(values, prepend=self._last)), nan=np.inf)
         self._last, self._samples = values[-1] if len(values) else self._last, self._samples + len(values)
         whole = len(values) // BLOCK * BLOCK
-        blocks = (np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), np.median(step[:whole].reshape(-1, BLOCK), axis=1))
+        middle = np.sort(step[:whole].reshape(-1, BLOCK), axis=1)[
+            :, BLOCK // 2 - 1 : BLOCK // 2 + 1
+        ]  # np.median imports numpy.ma
+        blocks = (np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), middle.mean(axis=1))
         self._blocks.append(np.stack(blocks))
         for side, near in self._near.items():
             self._extreme[side] = float(np.max(side * values, where=finite, initial=self._extreme[side]))

@@ -69,8 +69,8 @@ def load(
     if asked is not None:
         with contents.opened(log) as opened:
             aids = find_aids(opened, recording, asked)
-    with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids) if models else ([], [], {})
     events, notes = survey_events(contents.survey)
+    with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids, notes)
     if findings is not None:
         start_ns, end_ns = int(recording.imu.t_ns[0]), int(recording.imu.t_ns[-1])
         more_events, more_notes = finding_events(findings, log.name, start_ns, end_ns)
@@ -97,16 +97,33 @@ def load(
 
 
 def _with_models(
-    recording: Recording, models: Sequence[str | Path], init: str, log: str, smooth: bool, aids: Aids | None
+    recording: Recording,
+    models: Sequence[str | Path],
+    init: str,
+    log: str,
+    smooth: bool,
+    aids: Aids | None,
+    notes: list[str],
 ) -> tuple[list[Run], list[Run], dict[str, str]]:
-    """Run of each model, the same with aids, and by its name its file digest, method and initial bias."""
+    """Run of each model, the same with aids, and by its name its file digest, method and initial bias.
+
+    A model that does not fit is named in `notes` and warned of.
+    """
+    if not models:
+        return [], [], {}
     from imutool.bias_start.bias_from_truth import TRUTH_S
     from imutool.bias_start.correction import apply_with_std
+    from imutool.bias_start.fitness import judge
+    from imutool.bias_start.initial_bias import model_samples
     from imutool.evaluation import started
+    from imutool.log_info.convention_report import warn_of_recordings
 
     method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
-    runs, aided, origins = list[Run](), list[Run](), {}
+    runs, aided, origins, about = list[Run](), list[Run](), {}, recording.metadata.get("imutool", {})
+    warn_of_recordings([recording])
     for name, model, start in started(recording, models, init, log, smooth=smooth):
+        fit = judge(model, start, [model_samples(model, recording.imu)], about).report(name, recording.name, force=True)
+        notes += [] if fit.verdict == "fits" else [fit.sentence(f"The model {name}")]
         debiased, std = apply_with_std(model, start, recording.imu)
         runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))
         aided += [] if aids is None else [runs[-1].aided(aids, residual_prior(start, std))]

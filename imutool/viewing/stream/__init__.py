@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from imutool.bias_start import Fitness
 from imutool.report import Section
 
 
@@ -14,13 +15,17 @@ class Delay(Section, frozen=True):
 
 
 class StreamStatistics(Section, frozen=True):
-    """Statistics of a live stream; `start` says where the initial bias comes from."""
+    """Statistics of a live stream.
+
+    `start` says where the initial bias comes from, `fit` whether the model fits.
+    """
 
     samples: int
     seconds: float
     rate_hz: float
     delay_ms: Delay | None
     start: str
+    fit: Fitness | None
     gaps: int
     out_of_order: int
     not_measured: int

@@ -16,24 +16,22 @@ import numpy as np
 
 from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.temperature_drift import started_at, without_drift
+from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.correction import OnlineDebiaser
 from imutool.bias_start.earlier_load import after_load, with_earlier_load
 from imutool.bias_start.initial_bias import model_samples
-from imutool.bias_start.stretches import measured
 from imutool.debiasing import DebiasedBlock
 from imutool.errors import DataError
 from imutool.mcap_io.codec.decode import ImuBatch
-from imutool.recording import Imu
 from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.viewing.stream import Delay, StreamStatistics
 from imutool.viewing.stream.samples import Malformed, Sample
-from imutool.viewing.stream.sources import Samples
+from imutool.viewing.stream.sources import Samples, timely
+from imutool.viewing.stream.stream_fit import STREAM, SWITCH_S, StreamFit, check_first, imu_of
 
 START_S = 2.0  # of the stream, from which the initial bias is taken
 BATCH_S = 0.1  # shown together
-SWITCH_S = 0.0005  # that the viewer's thread may keep the interpreter: Python's own 5 ms are the whole delay allowed
-SILENT_S = 5.0  # without a sample, before a warning
 MAX_WAITING = 256  # batches: a viewer that does not keep up loses some rather than fill the memory
 MOST_FIRST = 1 << 16  # samples before the start, where the clock jumps again and again
 MAX_DELAYS = 1 << 20  # of which percentiles are taken: 17 minutes at 1 kHz, then a random choice
@@ -51,6 +49,7 @@ def run(
     show: Show | None = None,
     each: Corrected | None = None,
     seconds: float | None = None,
+    force: bool = False,
 ) -> StreamStatistics:
     """Debias a stream until it ends, `seconds` have passed or Ctrl-C is pressed.
 
@@ -59,11 +58,12 @@ def run(
 
     Raises:
         DataError: an untrained model and no rest at the start, or no samples.
+        ModelError: a model that does not fit the first samples, without `force`, or was trained at another rate.
     """
-    session = _Session(model, each)
+    session = _Session(model, each, force)
     with _showing(show) as batches:
         try:
-            for found in _timely(source, seconds):
+            for found in timely(source, seconds):
                 session.add(found, batches)
         except KeyboardInterrupt:
             pass
@@ -71,27 +71,13 @@ def run(
     return session.statistics(malformed, batches.lost)
 
 
-def _timely(source: Samples, seconds: float | None) -> Iterator[Sample]:
-    """Samples until the time is up; warns of a silent source once."""
-    began = last = time.perf_counter()
-    warned = False
-    for found in source:
-        now = time.perf_counter()
-        if seconds is not None and now - began > seconds:
-            return
-        if found is not None:
-            last = now
-            yield found
-        elif not warned and now - last > SILENT_S:
-            warned = True
-            logger.warning("The source has sent nothing for %.0f s; still waiting. Ctrl-C ends it", now - last)
-
-
 class _Session:
     """State of a stream."""
 
-    def __init__(self, model: BiasModel, each: Corrected | None) -> None:
-        self._model, self._each = model, each
+    def __init__(self, model: BiasModel, each: Corrected | None, force: bool) -> None:
+        self._model, self._each, self._force = model, each, force
+        self._fit: StreamFit | None = None
+        self._fitness: Fitness | None = None
         self._online: OnlineDebiaser | None = None
         self._how, self._std = "", np.zeros(6)
         self._first: list[Sample] = []
@@ -131,6 +117,7 @@ class _Session:
         if self._online is None and self._first:
             self._start(batches)
         batches.put(self._block())
+        self._fitness = None if self._fit is None else self._fit.end()
 
     def statistics(self, malformed: Malformed, lost: int) -> StreamStatistics:
         """Statistics so far.
@@ -140,7 +127,7 @@ class _Session:
         """
         if not self._samples:
             why = f"; the first of {malformed.count} messages: {malformed.first}" if malformed.count else ""
-            raise DataError(f"it sent no samples{why}", where="the stream", expected='{"t_ns": …, "gyro": […], "accel": […]}')
+            raise DataError(f"it sent no samples{why}", where=STREAM, expected='{"t_ns": …, "gyro": […], "accel": […]}')
         seconds = (self._last_ns - self._begin_ns) * 1e-9
         return StreamStatistics(
             samples=self._samples,
@@ -148,6 +135,7 @@ class _Session:
             rate_hz=(self._samples - 1) / seconds if seconds > 0.0 else 0.0,
             delay_ms=self._delay(),
             start=self._how,
+            fit=self._fitness,
             gaps=self._gaps,
             out_of_order=self._out_of_order,
             not_measured=self._not_measured,
@@ -190,18 +178,20 @@ class _Session:
         run = max(
             (slice(*ends) for ends in pairwise([*self._stretches, len(self._first)])), key=lambda run: run.stop - run.start
         )
-        ordered = sorted({sample.stamp_ns: sample for sample in self._first[run]}.values())
-        t_ns = np.array([sample.stamp_ns for sample in ordered], dtype=np.int64)
-        gyro, accel = (np.array([getattr(sample, name) for sample in ordered]) for name in ("gyro", "accel"))
-        good = measured(gyro, accel)
-        warm = [(sample.stamp_ns, float(sample.temperature)) for sample in ordered if sample.temperature is not None]
-        model, seen = started_at(self._model, warm, int(t_ns[0]), int(t_ns[-1])), Imu(t_ns[good], gyro[good], accel[good])
-        model = with_earlier_load(model, [model_samples(model, seen)], int(t_ns[0]))
+        seen = imu_of(self._first[run])
+        check_first(seen, self._model)
+        warm = [
+            (found.stamp_ns, float(found.temperature)) for found in sorted(self._first[run]) if found.temperature is not None
+        ]
+        first_ns, last_ns = int(seen.t_ns[0]), int(seen.t_ns[-1])
+        model = started_at(self._model, warm, first_ns, last_ns)
+        model = with_earlier_load(model, [model_samples(model, seen)], first_ns)
         try:
             start = auto(model, without_drift(model, seen))
         except DataError as error:
             fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
-            raise DataError("it does not start at rest", where="the stream", fix=fix) from error
+            raise DataError("it does not start at rest", where=STREAM, fix=fix) from error
+        self._fit = StreamFit(model, start, seen, self._force)
         self._how, self._std = start.how, start.std
         self._online = OnlineDebiaser(after_load(self._model, model.load_before), start)
         for sample in self._first:
@@ -214,6 +204,8 @@ class _Session:
         u = np.array([found.gyro, found.accel])
         rate, force, bias = self._online(found.stamp_ns, u[0], u[1], found.temperature)
         self._bias = bias
+        assert self._fit is not None
+        self._fit.add(found)
         if not np.isfinite(u).all():
             self._not_measured += 1
         if self._each is not None:

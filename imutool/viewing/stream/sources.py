@@ -30,6 +30,7 @@ from imutool.viewing.stream.samples import Malformed, Sample, decoded
 logger = logging.getLogger("imutool")
 EXPECTED = "a log, stdin, udp://HOST:PORT, zenoh://[HOST:PORT]/KEY or rosbridge://HOST:PORT/TOPIC"
 ROSBRIDGE_PORT = 9090
+SILENT_S = 5.0  # without a sample, before a warning
 WAIT_S = 0.5  # for data, between looks at the time
 CONNECT_TIMEOUT_S = 5.0
 MOST_WAITING = 10_000  # messages between two looks
@@ -53,6 +54,22 @@ def open_source(
     samples = _source(name, malformed, imu, speed, temperature)
     next(samples)  # it is open: whoever drops the iterator closes it
     return samples
+
+
+def timely(source: Samples, seconds: float | None) -> Iterator[Sample]:
+    """Samples until the time is up; warns of a silent source once."""
+    began = last = time.perf_counter()
+    warned = False
+    for found in source:
+        now = time.perf_counter()
+        if seconds is not None and now - began > seconds:
+            return
+        if found is not None:
+            last = now
+            yield found
+        elif not warned and now - last > SILENT_S:
+            warned = True
+            logger.warning("The source has sent nothing for %.0f s; still waiting. Ctrl-C ends it", now - last)
 
 
 def _source(name: str, malformed: Malformed, imu: str | None, speed: float, temperature: str | None) -> Samples:

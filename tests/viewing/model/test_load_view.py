@@ -168,6 +168,18 @@ def test_models_come_with_their_certainty_and_say_how_they_started(made: Recordi
     assert start.how in data.provenance["model static"]
 
 
+def test_a_model_that_does_not_fit_is_named_beside_its_figures(
+    made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A page on an accelerometer in g told by how much its model cuts the errors, and nothing else."""
+    path = tmp_path / "g.mcap"
+    write(replace(made, imu=Imu(made.imu.t_ns, made.imu.gyro, made.imu.accel / 9.80665)), path)
+    found = load(path, models=["static"])
+    assert any("The model static is unfit: the specific force has a median of" in note for note in found.notes)
+    assert "accel looks like g" in caplog.text
+    assert "is unfit" in caplog.text
+
+
 def test_smooth_reaches_the_models_and_is_refused_with_another_start(log: Path) -> None:
     assert load(log, models=["static"], smooth=True).provenance["smooth"] == "yes"
     with pytest.raises(ConfigError, match="smooth"):

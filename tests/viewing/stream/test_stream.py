@@ -22,10 +22,10 @@ from support.report_schema import assert_valid
 
 import imutool as api
 from imutool.bias_start.bias_at_rest import auto
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError, DataError, ModelError
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.recording import Imu
-from imutool.viewing.stream import session, sources
+from imutool.viewing.stream import session, sources, stream_fit
 from imutool.viewing.stream.samples import Malformed, Sample, decoded, sample
 from imutool.viewing.stream.session import run
 from imutool.viewing.stream.sources import open_source
@@ -117,6 +117,59 @@ def test_gaps_order_and_missing_values_are_counted_and_do_no_harm(imu: Imu) -> N
     assert len(stamps) == len(imu) - 2
     assert (np.diff(stamps) > 0).all()
     assert np.isfinite(done.gyro_bias).all()
+
+
+def altered(imu: Imu, gyro: float = 1.0, accel: float = 1.0, step: float = 1.0) -> Iterator[Sample]:
+    t_ns = imu.t_ns[0] + np.round((imu.t_ns - imu.t_ns[0]) * step).astype(np.int64)
+    return stream(Imu(t_ns, gyro * imu.gyro, accel * imu.accel))
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "said"),
+    [
+        ({"accel": 1.0 / 9.80665}, ModelError, "median of 1.* m/s², expected about 9.81"),
+        ({"accel": 0.0}, DataError, "none of the first samples is a measurement"),
+        ({"step": 1e-3}, DataError, "not in nanoseconds"),
+        ({"step": 2.0}, ModelError, "expected 200.0 Hz"),
+    ],
+)
+def test_units_and_a_rate_that_no_model_may_correct_are_refused(
+    how: dict[str, float], error: type[Exception], said: str, imu: Imu
+) -> None:
+    """Of an accelerometer in g the bias at rest was 8.8 m/s², without a word."""
+    with pytest.raises(error, match=said):
+        run(altered(imu, **how), api.load_model("euroc-adis16448-linear"), Malformed())
+    if "accel" in how:
+        with pytest.raises(error, match=said):
+            run(altered(imu, **how), api.load_model("static"), Malformed())
+
+
+def test_a_model_that_turns_out_to_be_unfit_is_named_while_the_stream_goes_on(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(stream_fit, "JUDGED_S", (9.5,))
+    moving = api.example_recording(duration_s=14.0).imu
+    moving = moving.rows(slice(800, None))
+    model = api.load_model("euroc-adis16448-linear")
+    rest = model.prior_mean
+    own = Imu(moving.t_ns, moving.gyro + rest[:3], moving.accel + rest[3:])
+    wrong = list(stream(Imu(own.t_ns, np.degrees(own.gyro), own.accel)))
+    last_ns, waited = wrong[-1].stamp_ns, time.perf_counter()
+
+    def until_said(found: Sample, *_: object) -> None:
+        while found.stamp_ns == last_ns and not caplog.records and time.perf_counter() - waited < 60.0:
+            time.sleep(0.01)
+        if found.stamp_ns == last_ns:
+            assert "is unfit" in caplog.text
+
+    done = run(iter(wrong), model, Malformed(), each=until_said, force=True)
+    assert done.fit is not None
+    assert done.fit.verdict == "unfit"
+    caplog.clear()
+    fits = run(stream(own), model, Malformed())
+    assert fits.fit is not None
+    assert fits.fit.verdict != "unfit"
+    assert not caplog.records
 
 
 @pytest.mark.parametrize("stray_ns", [0, 1 << 62])
