@@ -73,6 +73,11 @@ class Job:
         return f"{self.data_set}-{self.method}-{self.seed}{'-swapped' if self.swap else ''}"
 
     @property
+    def figures(self) -> Path:
+        """File of the figures."""
+        return self.folder / f"{self.name}.json"
+
+    @property
     def sequences(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """To train on, and to test on."""
         learn, test = (TEST, TRAIN) if self.swap else (TRAIN, TEST)
@@ -102,9 +107,11 @@ def main() -> None:
         for seed in range(options.seeds if method in SEEDED else 1)
         for name in sets
     ]
-    os.environ["OMP_NUM_THREADS"] = "1"  # one training a processor: their threads would only wait for each other
-    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
-        rows = [row for rows in pool.map(figures, jobs) for row in rows]
+    if not_made := [job for job in jobs if not job.figures.exists()]:
+        os.environ["OMP_NUM_THREADS"] = "1"  # one training a processor: their threads would only wait for each other
+        with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+            list(pool.map(make_figures, not_made))
+    rows = [row for job in jobs for row in json.loads(job.figures.read_text(encoding="utf-8"))]
     text = "\n\n".join(table(rows, methods, start) for start in STARTS)
     print(text)
     page = options.out / f"tables{'-swapped' if options.swap else ''}.html"
@@ -112,12 +119,8 @@ def main() -> None:
     print(f"\n{page}")
 
 
-def figures(job: Job) -> list[dict[str, Any]]:
-    """What a method makes of the test sequences, from every start; trained if its model is not there yet."""
-    kept = job.folder / f"{job.name}.json"
-    if kept.exists():
-        rows: list[dict[str, Any]] = json.loads(kept.read_text(encoding="utf-8"))
-        return rows
+def make_figures(job: Job) -> None:
+    """Writes what a method makes of the test sequences, from every start; trained if its model is not there yet."""
     learn, test = job.sequences
     model, logs = job.folder / f"{job.name}.safetensors", job.folder / job.data_set
     began, paper = time.process_time(), job.method == "paper"
@@ -127,7 +130,8 @@ def figures(job: Job) -> list[dict[str, Any]]:
             settings |= {"scheme": "paper", "paper": {"accel_steps": 0, "smoothed_samples": SMOOTHED[job.data_set]}}
         method = "neural_ode" if paper else job.method
         imutool.train([logs / f"{name}.mcap" for name in learn], model, method=method, settings=settings)
-    trained_s, rows = time.process_time() - began, []
+    trained_s = time.process_time() - began
+    rows: list[dict[str, Any]] = []
     for sequence in test:
         for start in STARTS[:1] if paper else STARTS:
             begun: dict[str, Any] = {"smooth": True} if start == "smooth" else {"init": _init(job.method, start)}
@@ -136,8 +140,7 @@ def figures(job: Job) -> list[dict[str, Any]]:
                 of_job = {"method": method, "start": start, "seed": job.seed, "trained_cpu_s": trained_s}
                 gyro_alone = {"ape_m": None} if method == "paper" else {}
                 rows.append({**result, **of_job, **gyro_alone})
-    kept.write_text(json.dumps(rows), encoding="utf-8")
-    return rows
+    job.figures.write_text(json.dumps(rows), encoding="utf-8")
 
 
 def _init(method: str, start: str) -> str:

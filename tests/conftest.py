@@ -83,7 +83,11 @@ def pytest_collection_finish() -> None:
     """Leaves what is collected and imported out of every later collection of garbage."""
     from support.outlines import draw_outlines
 
+    from imutool.processes import forked
+
     draw_outlines()
+    if "PYTEST_XDIST_WORKER" in os.environ:  # the other processors are the other workers'
+        pytest.MonkeyPatch().setattr(forked, "processors", lambda: 1)
     gc.freeze()
 
 

@@ -24,13 +24,15 @@ from imutool.sensor.made_up_flight import flight
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SAMPLES = 4001  # 20 s at 200 Hz, both ends included
 
-APART = {"reproduce_tables.py", "read_debiased.py"}  # the first starts processes of its own, the second is without imutool
+APART = {"read_debiased.py"}  # it is without imutool
 
 Example = Callable[..., str]
 
 
 @pytest.fixture
-def example(tmp_path: Path) -> Example:
+def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Example:
+    monkeypatch.setenv("PYTHONWARNINGS", "error")  # for the processes that an example starts
+
     def run(name: str, *words: str | Path) -> str:
         line = [str(EXAMPLES / name), *map(str, words)]
         if name in APART:

@@ -1,6 +1,6 @@
 """Broken inputs of every kind: `python tests/bench/fuzz.py [KIND...] [--seconds 3600] [--seed S] [--case N]`, problems found.
 
-The kinds are the modules of `tests/fuzz`. Without a seed it is the date of the day. With `--cases` so many of each kind run,
+The kinds are the modules of `tests/fuzz`. Without a seed it is the date of the day. With `KIND:CASES` so many of a kind run,
 however long that takes; with `--case` that case alone runs again.
 Exit code 1 if a promise was broken.
 """
@@ -22,19 +22,18 @@ MAX_PROBLEMS = 20  # of one kind, then the search for it ends
 def main() -> int:
     """Runs the cases and prints what is wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kinds", nargs="*", help=", ".join(fuzz.kinds()))
+    parser.add_argument("kinds", nargs="*", metavar="KIND[:CASES]", help=", ".join(fuzz.kinds()))
     parser.add_argument("--seconds", type=float, default=60.0, help="in all, divided over the kinds")
     parser.add_argument("--seed", default=datetime.datetime.now(datetime.UTC).date().isoformat())
-    parser.add_argument("--cases", type=int, help="of each kind, instead of seconds")
     parser.add_argument("--case", type=int, help="run this case alone")
     given = parser.parse_args()
     broken = 0
     chosen = given.kinds or fuzz.kinds()
-    for kind in chosen:
+    for kind, _, count in (word.partition(":") for word in chosen):
         if given.case is not None:
             each = iter([fuzz.run_case(kind, given.seed, given.case)])
-        elif given.cases is not None:
-            each = (fuzz.run_case(kind, given.seed, number) for number in range(given.cases))
+        elif count:
+            each = (fuzz.run_case(kind, given.seed, number) for number in range(int(count)))
         else:
             each = fuzz.hunt(kind, given.seed, given.seconds / len(chosen))
         cases = problems = 0

@@ -16,6 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SEEDED = (
     "tests/diagnosis/signals/test_signal_diagnosis.py",
+    "tests/diagnosis/estimation/test_model_error.py",
     "tests/diagnosis/estimation/test_model_selection.py",
     "tests/diagnosis/audit/test_audit.py",
 )

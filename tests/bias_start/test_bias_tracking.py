@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +28,7 @@ from imutool.bias_start.prior_width import BiasPrior, LeastWidth, shown_bias, su
 from imutool.recording import Imu, seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
+Filtered = Callable[[int, float], list[FilteredBlock]]
 RATE_HZ = 200.0
 PRIOR = np.array([3e-3] * 3 + [0.1] * 3)
 GROUND = np.array([1e-3] * 3 + [0.03] * 3)
@@ -73,13 +76,19 @@ def forward(imu: Imu, known: BiasPrior = KNOWN) -> list[FilteredBlock]:
     return list(filter_blocks(model(), [samples(imu)], known))
 
 
+@pytest.fixture(scope="module")
+def filtered() -> Filtered:
+    """Blocks of the flight of a seed with planted biases, still for some seconds at its start; each is filtered once."""
+    return functools.cache(lambda seed, still_s: forward(biased(seed, still_s=still_s)))
+
+
 # ── what it finds ────────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("still_s", [0.0, 5.0])
-def test_planted_biases_are_found_within_three_of_its_standard_deviations(still_s: float) -> None:
+def test_planted_biases_are_found_within_three_of_its_standard_deviations(filtered: Filtered, still_s: float) -> None:
     for seed in (1, 2, 3):
-        last = forward(biased(seed, still_s=still_s))[-1].step.after
+        last = filtered(seed, still_s)[-1].step.after
         bias, _ = planted(seed)
         std = np.sqrt(np.diag(last.P)[9:15])
         assert (np.abs(last.bias - bias) < 3 * std).all()
@@ -88,11 +97,11 @@ def test_planted_biases_are_found_within_three_of_its_standard_deviations(still_
 
 @pytest.mark.parametrize("still_s", [0.0, 5.0])
 @pytest.mark.parametrize("way", ["forward", "smooth"])
-def test_it_is_as_sure_as_it_should_be(still_s: float, way: str) -> None:
+def test_it_is_as_sure_as_it_should_be(filtered: Filtered, still_s: float, way: str) -> None:
     """Never overconfident. The biases planted do not walk, so that it may be surer than it says."""
     errors, covariances = [], []
     for seed in SEEDS:
-        blocks = forward(biased(seed, still_s=still_s))
+        blocks = filtered(seed, still_s)
         state = blocks[-1].step.after if way == "forward" else [s for _, s in smooth_blocks(blocks)][len(blocks) // 2]
         errors.append((state.bias - planted(seed)[0])[:3])
         covariances.append(state.P[9:12, 9:12])
@@ -128,9 +137,9 @@ def test_a_width_that_the_log_does_not_show_is_counted() -> None:
     assert (np.diag(P) > 1.5 * 1e-2 * 1e-3).all(), "more than that of the middle width"
 
 
-def test_a_stop_tells_the_bias_at_rest_from_that_in_motion() -> None:
+def test_a_stop_tells_the_bias_at_rest_from_that_in_motion(filtered: Filtered) -> None:
     for seed in (1, 2, 3):
-        blocks = forward(biased(seed, still_s=5.0))
+        blocks = filtered(seed, 5.0)
         bias, ground = planted(seed)
         at_rest = [block for block in blocks if block.resting and block.end_s < 5.0][-1].step.after  # then it moves, slowly
         np.testing.assert_allclose(at_rest.rest_bias(True)[:3], (bias + ground)[:3], rtol=0, atol=3e-4)

@@ -31,6 +31,7 @@ from imutool.diagnosis_output import FILES
 from imutool.errors import ConfigError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
+from imutool.processes import forked
 from imutool.report import json_values
 from imutool.sensor import physics_file
 from imutool.sensor.made_up_flight import flight
@@ -76,11 +77,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def diagnosed(folder: Path, imutool: Command) -> tuple[Path, Done]:
-    """The folder that the installed command wrote about the lever arm, and what it said."""
+    """The folder that the command wrote about the lever arm, with a process beside it, and what it said."""
     (folder / "bytes.py").write_text("import pathlib, sys\nprint(len(pathlib.Path(sys.argv[2]).read_bytes()))\n")
     closed = ("--close", "--metric", folder / "bytes.py", "--sim", folder / "ideal.mcap")
     words = ("-o", folder / "diagnosis", "--json", folder / "said.json", *closed)
-    said = imutool("diagnose", folder / "arm.mcap", *words, cwd=folder)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(forked, "processors", lambda: 2)
+        said = imutool("diagnose", folder / "arm.mcap", *words, cwd=folder)
     assert said.returncode == 0, said.stderr
     return folder / "diagnosis", said
 

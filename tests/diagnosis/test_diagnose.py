@@ -246,14 +246,14 @@ def test_impacts_and_noise_of_both_are_no_mismatch(tmp_path: Path) -> None:
     assert effects(diagnose(logs[:1], logs[1])) == []
 
 
-@pytest.mark.parametrize(("seed", "cutoff_hz"), [(9, None), (1, 15.0)])
+@pytest.mark.parametrize(("seed", "cutoff_hz"), [(0, None), (1, 15.0)])
 def test_a_low_pass_is_more_than_what_smooths_a_simulations_noise(seed: int, cutoff_hz: float | None, tmp_path: Path) -> None:
-    """Clocks without a common epoch hide its lag; the noise of a simulation of 240 Hz looked like one of 76 Hz."""
-    rng, t_s = np.random.default_rng(seed), planted.clock(40.0, 240.0)
-    path, own_s, noise = planted.moving(seed, 40.0), t_s[10:-10], np.repeat([2e-3, 2e-2], 3)
+    """Clocks without a common epoch hide its lag; the noise of a simulation of 240 Hz looked like one."""
+    rng, t_s = np.random.default_rng(seed), planted.clock(20.0, 240.0)
+    path, own_s, noise = planted.moving(seed, 20.0), t_s[10:-10], np.repeat([2e-3, 2e-2], 3)
     imu = path.imu(path.start_ns + np.round(t_s * 1e9).astype(np.int64))
     slow = planted.acting({} if cutoff_hz is None else {"low_pass": [cutoff_hz]})
-    real, sim = planted.ideal(planted.rich(seed, 40.0), slow, own_s), np.concatenate([imu.gyro, imu.accel], axis=1)
+    real, sim = planted.ideal(planted.rich(seed, 20.0), slow, own_s), np.concatenate([imu.gyro, imu.accel], axis=1)
     real, sim = (samples + noise * rng.normal(size=samples.shape) for samples in (real, sim))
     write(planted.recording("real", own_s, real), tmp_path / "real.mcap")
     write(planted.recording("sim", t_s, sim, 0), tmp_path / "sim.mcap")

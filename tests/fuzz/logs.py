@@ -333,7 +333,7 @@ def no_crc(raw: bytes, a: Original, b: Original, rng: random.Random) -> bytes:
 
 def bomb(raw: bytes, a: Original, b: Original, rng: random.Random) -> bytes:
     """A chunk of few bytes says that it unpacks to many."""
-    size = rng.choice((1 << 20, 50 << 20, 1 << 30, 1 << 40, 2**63))
+    size = rng.choice((1 << 20, HEAD.size + (50 << 20), 1 << 30, 1 << 40, 2**63))
     packed = _bomb() if size < 1 << 30 else rng.randbytes(50)
     body = CHUNK.pack(0, 1, size, rng.choice((0, 1)), 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
     start, _ = rng.choice(a.records)
@@ -342,7 +342,8 @@ def bomb(raw: bytes, a: Original, b: Original, rng: random.Random) -> bytes:
 
 @cache
 def _bomb() -> bytes:
-    return zstandard.ZstdCompressor(level=1).compress(bytes(50 << 20))
+    one = HEAD.pack(0, 50 << 20) + bytes(50 << 20)  # record: of millions another library would make an object each
+    return zstandard.ZstdCompressor(level=1).compress(one)
 
 
 DAMAGES: tuple[Damage, ...] = (
