@@ -38,7 +38,7 @@ from imutool.bias_start.bias_tracking import (
     filter_blocks,
     smooth_blocks,
 )
-from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, LeastWidth, shown_bias, supported_std
+from imutool.bias_start.prior_width import USUAL_WALK, BiasPrior, LeastWidth, shown_bias, std_before, supported_std
 from imutool.bias_start.stretches import MOST, StretchClock, measured
 from imutool.errors import ConfigError, DataError
 from imutool.inertial.inertial_filter import FilterSettings
@@ -108,10 +108,7 @@ class InitialBias:
 
 
 class ConstantBiasStream:
-    """Bias stream with a constant rest bias.
-
-    Its covariance grows by random walk and the model's drift.
-    """
+    """Constant rest bias; its covariance grows by random walk and the model's drift."""
 
     def __init__(self, model: BiasModel, rest: Vector6, std: Vector6) -> None:
         self._stream = model.stream(rest)
@@ -194,8 +191,9 @@ def bias_prior(model: BiasModel, first_ns: int | None = None) -> BiasPrior:
 def tracked_from_prior(model: BiasModel, first_ns: int | None = None) -> InitialBias:
     """Prior bias, tracked from the first sample on: for a live node, which cannot look ahead."""
     start = prior(model, first_ns)
-    how = f"{training_source(model)}, {accuracy(start.std)}, then {TRACKED_BY}"
-    return InitialBias(start.rest, start.std, how, follows=bias_prior(model, first_ns))
+    std = std_before(start.std, start.least)
+    how = f"{training_source(model)}, {accuracy(std)}, then {TRACKED_BY}"
+    return InitialBias(start.rest, std, how, follows=bias_prior(model, first_ns))
 
 
 def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = "", first_ns: int | None = None) -> InitialBias:

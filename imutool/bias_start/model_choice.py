@@ -24,12 +24,13 @@ from imutool.bias_start.bias_tracking import Samples
 from imutool.bias_start.earlier_load import with_earlier_load
 from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import (
+    PRIOR,
     InitialBias,
     NoRestError,
     from_numbers,
     model_samples,
-    prior,
     smoothed_start,
+    tracked_from_prior,
 )
 from imutool.bias_start.stretches import Sieve, measured
 from imutool.cleaning import Survey, cleaned
@@ -70,7 +71,7 @@ def find_initial_bias(init: str, model: BiasModel, recording: Recording) -> Init
     """
     recording = replace(recording, imu=without_drift(model, recording.imu))
     if init == "prior":
-        return prior(model, int(recording.imu.t_ns[0]))
+        return replace(tracked_from_prior(model, int(recording.imu.t_ns[0])), how=PRIOR, follows=None)
     if init == "truth" or init.startswith("truth:"):
         return from_truth(model, recording, _truth_s(init))
     from_samples = {"stationary": at_rest, "auto": auto}.get(init)

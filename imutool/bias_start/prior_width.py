@@ -169,6 +169,20 @@ def supported_std(
     return out
 
 
+def std_before(std: Vector6, least: LeastWidth | None) -> Vector6:
+    """Standard deviation of a bias of which a log shows nothing: over all widths of its prior.
+
+    It is the most where nothing says how probable the least is.
+    """
+    if least is None or not least.probability:
+        return std
+    out, nothing = std.copy(), (np.zeros(6), np.full(6, np.inf))
+    for columns in COLUMNS.values():
+        width, weight = _possible_widths(std, least, *nothing, columns)
+        out[columns] = np.sqrt((weight * width**2).sum(axis=-2))
+    return out
+
+
 def _possible_widths(
     std: Rows6, least: LeastWidth, difference: Rows6, variance: Rows6, columns: slice
 ) -> tuple[Float64[np.ndarray, "*batch widths 3"], Float64[np.ndarray, "*batch widths 1"]]:

@@ -24,6 +24,7 @@ from imutool.bias_start.initial_bias import (
     from_numbers,
     prior,
     smoothed_start,
+    tracked_from_prior,
 )
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.bias_start.prior_width import LeastWidth, supported_std, widened
@@ -458,6 +459,8 @@ def test_a_log_of_a_session_that_training_saw_starts_from_its_prior() -> None:
     assert least is not None
     np.testing.assert_array_equal(least.std, [1e-3] * 6)
     assert 0.0 < least.probability < 1.0
+    assert 1e-3 < tracked_from_prior(made, 104 * hour).std[0] < 0.1, "before the log shows anything: over all widths"
+    assert tracked_from_prior(made, 115 * hour).std[0] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("moved", [0.0, 6e-3])
