@@ -196,10 +196,10 @@ def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
 
 
 def _not_shown(start: InitialBias, found: _Evidence) -> Iterator[str]:
-    """Sentence on a bias of the gyro that the log shows less well than its start, and whose deviation exceeds it."""
+    """Sentence on a bias that the log shows less well than its start, and whose deviation exceeds the gyro's bias."""
     before, shown = start.std[:3], DEPENDENT * np.sqrt(found.variance[:3])
     std = 1.0 / np.sqrt(1.0 / np.maximum(before, LEAST_STD[:3]) ** 2 + 1.0 / shown**2)
-    unknown = np.where((shown > before) & (std > np.abs(start.rest[:3])), std, 0.0)
+    unknown = np.where((shown > before) & (std > np.linalg.norm(start.rest[:3])), std, 0.0)
     axis = int(np.argmax(unknown))
     if unknown[axis] > MOST_UNKNOWN:
         bias = f"the start's {start.rest[axis]:+.2g} ± {std[axis]:.2g} rad/s"
