@@ -140,13 +140,15 @@ def _is_of_bag(folder: Path) -> bool:
 
 def _span(path: Path) -> tuple[int, int] | None:
     """First and last log time of a finished log; None of any other."""
-    statistics = getattr(_summary(path), "statistics", None)
+    summary = _summary(path)
+    statistics = None if summary is None else summary.statistics
     return (statistics.message_start_time, statistics.message_end_time) if statistics and statistics.message_count else None
 
 
 def _is_ours(path: Path) -> bool:
     """Whether imutool wrote a log."""
-    return any(index.name.startswith("imutool") for index in getattr(_summary(path), "metadata_indexes", ()))
+    summary = _summary(path)
+    return summary is not None and any(index.name.startswith("imutool") for index in summary.metadata_indexes)
 
 
 def _summary(path: Path) -> Any:

@@ -23,9 +23,7 @@ BIAS_ROWS = np.eye(12)[:6]  # d(bias)/d(error of both biases)
 LEAST_SHOWN = 0.2  # precision from the log, of that of the prior, below which the log says nothing about the prior
 SAME_WIDTH = 1e-6  # share of a variance by which a narrower prior differs at least
 SHARES = np.linspace(0.0, 1.0, 25)[:, None]  # of the way from the least width of a prior to the most, in equal ratios
-TURNED = (
-    20.0  # chi-square that turned axes leave at most, and by which they are better; own logs of other turn-ons have up to 7
-)
+TURNED = 20.0  # chi-square that turned axes leave at most, and by which they are better
 MOST_LEFT = 0.2  # share of chi-square that turned axes leave; of sensors that were turned up to 0.16, by chance 0.28
 CONTRADICTED = (np.inf, 10.8, 13.8, 16.3)  # chi-square of as many differences; a true prior exceeds it once in a thousand logs
 

@@ -26,6 +26,7 @@ from imutool.recording.message_log import MessageLog
 
 AUTO = "auto"
 SUFFIX = ".mcap"
+OF_FOLDER = "Name the file itself: in a folder, tables whose columns show no IMU and logs that imutool wrote are left out"
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
@@ -146,9 +147,7 @@ def _find(source: Path, format: str) -> _Sequences:
             f"no sequence found: {what}" if what else "no sequence found",
             where=source,
             expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
-            fix="Name the file itself, if it is a table that does not show its columns, or a log of imutool"
-            if source.is_dir()
-            else fix,
+            fix=OF_FOLDER if source.is_dir() else fix,
         )
     for place, jobs in claims.items():
         if len(jobs) > 1:

@@ -88,10 +88,9 @@ class Plateau:
         step = np.nan_to_num(np.abs(np.diff(values, prepend=self._last)), nan=np.inf)
         self._last, self._samples = values[-1] if len(values) else self._last, self._samples + len(values)
         whole = len(values) // BLOCK * BLOCK
-        middle = np.sort(step[:whole].reshape(-1, BLOCK), axis=1)[
-            :, BLOCK // 2 - 1 : BLOCK // 2 + 1
-        ]  # np.median imports numpy.ma
-        blocks = (np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), middle.mean(axis=1))
+        ordered = np.sort(step[:whole].reshape(-1, BLOCK), axis=1)
+        middle = ordered[:, BLOCK // 2 - 1 : BLOCK // 2 + 1].mean(axis=1)  # np.median imports numpy.ma
+        blocks = (np.abs(values[:whole]).reshape(-1, BLOCK).max(axis=1), middle)
         self._blocks.append(np.stack(blocks))
         for side, near in self._near.items():
             self._extreme[side] = float(np.max(side * values, where=finite, initial=self._extreme[side]))
