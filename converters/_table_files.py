@@ -1,4 +1,4 @@
-"""Table files: CSV, TSV, JSON, Parquet, .npz, MATLAB .mat and HDF5, by their first bytes."""
+"""Table files: text, JSON, Parquet, .npy, .npz, .mat and HDF5, by their first bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ._table_mocap import is_mocap, read_mocap
 from ._table_packed import opener, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
 from ._table_sensors import read_rows
-from ._table_text import Columns, is_text_table, read_csv, text_of
+from ._table_text import WIDEST, Columns, is_text_table, read_csv, text_of
 from ._table_times import join_gps_weeks
 
 LIMIT = 4 << 30  # bytes of numbers in one file
@@ -30,6 +30,7 @@ MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own
     "mat": b"MATLAB 5.0 MAT-file",
     "hdf5": b"\x89HDF\r\n\x1a\n",
     "parquet": b"PAR1",
+    "npy": b"\x93NUMPY",
     "sheet": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
 }
 MAT_HEADER, MAT_COMPRESSED, MAT_STEP = 128, 15, 1 << 20  # bytes before the first element, type of a packed one, bytes at once
@@ -135,6 +136,22 @@ def _load_npz(path: Path, columns: Columns) -> None:
             columns.add(name, arrays[name])
 
 
+def _load_npy(path: Path, columns: Columns) -> None:
+    """One array, whose columns have no names unless its type states them."""
+    with path.open("rb") as file:
+        _check_size(path, 8 * int(np.prod(_npy_shape(file), dtype=float)))
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.names:
+        for name in array.dtype.names:
+            columns.add(name, array[name])
+        return
+    if array.ndim == 2 and array.shape[0] < array.shape[1]:
+        array = array.T
+    for number, column in enumerate(array.T if array.ndim == 2 and array.shape[1] <= WIDEST else [], 1):
+        columns.add(f"column {number}", column)
+    name_headerless(columns)
+
+
 def _npy_shape(member: Any) -> tuple[int, ...]:
     version = np.lib.format.read_magic(member)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -158,7 +175,12 @@ def _load_mat(path: Path, columns: Columns) -> None:
             raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
         content = {}
     for name, value in _flat(content):
-        columns.add(name, value)
+        labels = [str(label) for label in np.ravel(content.get(f"{name}_label", []))]  # as Mission Planner writes a log
+        if np.ndim(value) == 2 and len(labels) == value.shape[1]:
+            for label, column in zip(labels, value.T, strict=True):
+                columns.add(f"{name}/{label}", column)
+        else:
+            columns.add(name, value)
     if has_objects:
         fix = "Save arrays from MATLAB (of an object struct(...), of a table table2array), or a table with writetable as CSV"
         if not columns.values:
@@ -253,6 +275,7 @@ LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "json": load_json,
     "parquet": _load_parquet,
     "npz": _load_npz,
+    "npy": _load_npy,
     "mat": _load_mat,
     "hdf5": _load_hdf5,
     "sheet": _refuse_sheet,

@@ -1,4 +1,4 @@
-"""Folder of tables: of one sensor each, of an IMU and poses, or several recordings.
+"""Folder of tables: of one sensor each, of IMUs and poses, or several recordings.
 
 The tables become groups: `gyro` and `accel`, or `imu` and `ground_truth`, and those of other files by their names. Poses are
 true by the name of their file, or where a motion capture wrote it; else they are the group `poses`. A table that holds a time
@@ -19,6 +19,7 @@ from . import Sequence
 from ._source import find_folders, head
 from ._table_files import kind_of, load
 from ._table_groups import TRUE_GROUPS, has_poses
+from ._table_headerless import name_headerless
 from ._table_mocap import is_mocap
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name, text_head
@@ -29,8 +30,10 @@ from ._table_times import rises
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
+MOST_LARGER = 1.2  # ratio of the sizes of files of IMUs that were recorded together
 DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
+IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
 ROLE = "|".join(["imu|inertial|ground|truth|poses?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
 ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".tum", ".mat", ".npz"
@@ -170,7 +173,7 @@ def _load(path: Path) -> Columns:
 
 
 def _groups(tables: list[Path]) -> dict[Path, str]:
-    """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or one IMU and poses; else none."""
+    """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or IMUs and poses; else none."""
     sensors = sensors_among(_stem(path) for path in tables)
     if {*sensors.values()} == {*SENSORS}:
         return {path: sensors[_stem(path)] for path in tables if _stem(path) in sensors}
@@ -183,8 +186,19 @@ def _groups(tables: list[Path]) -> dict[Path, str]:
     shown = [path for path, found in columns.items() if propose(found).entries.keys() >= {"gyro", "accel"}]
     imus = [path for path in columns if re.fullmatch(IMU, _stem(path).lower())] or shown
     poses = true or [path for path, found in columns.items() if path not in shown and has_poses(found)]
-    both = len(imus) == len(poses) == 1 and imus != poses
-    return {imus[0]: IMU_GROUP, poses[0]: TRUTH_GROUP if true else POSES_GROUP} if both else {}
+    if len(poses) != 1 or poses[0] in imus:
+        return {}
+    beside = {poses[0]: TRUTH_GROUP if true else POSES_GROUP}
+    together = [path for path in shown if re.fullmatch(IMUS, _stem(path).lower())]
+    if len(together) > 1 and _of_one_size(together):
+        return {path: re.sub(r"[ -]", "_", _stem(path).lower()) for path in together} | beside
+    return {imus[0]: IMU_GROUP} | beside if len(imus) == 1 else {}
+
+
+def _of_one_size(paths: list[Path]) -> bool:
+    """Whether files have about as many bytes, as those of IMUs that were recorded together have."""
+    sizes = [path.stat().st_size for path in paths]
+    return max(sizes) < MOST_LARGER * min(sizes)
 
 
 def _stem(path: Path) -> str:
@@ -203,5 +217,6 @@ def _columns(path: Path, start: str) -> Columns:
     columns = Columns()
     if start:
         read_csv(start, columns, path)
+        name_headerless(columns)
         name_columns(columns, "")
     return columns

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ._table_map import IMU_TOPIC, Entries, Proposal
 from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
-from ._table_rotations import order_by_motion
+from ._table_rotations import angles_by_motion, order_by_motion
 from ._table_text import Columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
@@ -15,7 +16,22 @@ from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
 QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
+ANGLES = (
+    (
+        r"(?!(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_)(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?",
+        ("roll", "pitch", "yaw"),
+    ),
+    (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
+)
+HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
 POSITION = r"((t|p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
+POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
+    (POSITION, "xyz"),
+    (r"(p(os(ition)?)?_?)?(?P<axis>north|east|down)", ("north", "east", "down")),
+    (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
+    (r"p_?(?P<axis>[ned])", "ned"),
+)
+TURNS = {"quaternion_wxyz", "roll_pitch_yaw"}
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
@@ -64,9 +80,13 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
     if len(gyros) < 2 or gyros.keys() != accels.keys():
         return {}
     of = {owner: {*gyros[owner].values(), *accels[owner].values()} for owner in gyros}
+    groups = {owner: group_of(gyros[owner]["x"]) for owner in gyros}
     apart = {}
     for owner, own in of.items():
-        values = {c: v for c, v in columns.values.items() if c in own or not any(c in other for other in of.values())}
+        others = {group for group in groups.values() if group and group != groups[owner]}
+        beside = {c for c in columns.values if group_of(c) in others and not is_time(c)}  # an orientation of theirs
+        taken = set().union(*of.values(), beside) - own
+        values = {c: v for c, v in columns.values.items() if c not in taken}
         apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
     return apart
 
@@ -95,29 +115,25 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         beside = time_beside(columns, column, time, unit)
         if beside is None and len(values) == len(columns.values[time]):
             beside = time, unit
-        if beside is not None and "quaternion_wxyz" not in entries:
+        if beside is not None and not entries.keys() & TURNS:
             leaf = split_name(column.removeprefix(group_of(column)))[0]
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
             groups.setdefault((beside, is_true(column) or name != leaf), {})[name] = column
     poses = []
     for (clock, named_true), leaves in groups.items():
-        arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
-        q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
-        if (
-            not q
-            and (four := _axes(QUATERNION_ARRAY, leaves, "0123"))
-            and (q := order_by_motion(columns, entries, four, clock))
-        ):
-            reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
-        position = _axes(POSITION, leaves, "xyz")
-        if q and (position or named_true or clock[0] != time):
-            poses.append((not named_true, clock, q, position))
+        position = _position(leaves)
+        turns = _turns(columns, entries, leaves, clock, reasons) if position or named_true or clock[0] != time else {}
+        if turns:
+            poses.append((not named_true, clock, turns, position))
         elif clock[0] == time:
             continue
         elif array := next((c for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), ""):
             reasons.append(f"{array[:-3]} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them")
-    for is_estimate, clock, q_wxyz, position in sorted(poses)[:1]:
-        found |= {"truth_time": clock[0], "truth_time_unit": clock[1], "quaternion_wxyz": q_wxyz}
+        elif three := next(iter(_angles(leaves)), []):
+            said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
+            reasons.append(f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them")
+    for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
+        found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
         found["pose_kind"] = "estimate" if is_estimate else "truth"
         if position:
             stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
@@ -126,33 +142,62 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
 
 
 def turned(columns: Columns, entries: Entries) -> Entries:
-    """Entries with the orientations beside a sensor's rates, where they name no poses."""
-    if "quaternion_wxyz" in entries:
-        return entries
+    """Entries with the orientations beside a sensor's rates, in place of poses."""
+    entries = {name: value for name, value in entries.items() if name not in TURNS}
     group, length = group_of(entries["gyro"][0]), len(columns.values[str(entries["time"])])
     beside = [c for c, values in columns.values.items() if group_of(c) == group and len(values) == length]
     leaves = {split_name(column.removeprefix(group))[0]: column for column in beside}
-    four = _axes(QUATERNION_ARRAY, leaves, "0123")
     clock = str(entries["time"]), str(entries["time_unit"])
-    found = _axes(QUATERNION, leaves, "wxyz") or (order_by_motion(columns, entries, four, clock) if four else [])
-    return entries | ({"quaternion_wxyz": found, "truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
+    found = _turns(columns, entries, leaves, clock, [])
+    return entries | (found | {"truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
 
 
 def has_poses(columns: Columns) -> bool:
-    """Whether a table has positions and quaternions, in whatever order."""
+    """Whether a table has positions and quaternions or angles, in whatever order."""
     leaves = {split_name(column)[0]: column for column in columns.values}
-    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123")
-    return bool(turns and _axes(POSITION, leaves, "xyz"))
+    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123") or _angles(leaves)
+    return bool(turns and _position(leaves))
 
 
-def _axes(pattern: str, leaves: dict[str, str], axes: str) -> list[str]:
+def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tuple[str, str], reasons: list[str]) -> Entries:
+    """Entries of the rotations of a group: quaternions, or angles that turn as the gyro does."""
+    arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
+    q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
+    if not q and (four := _axes(QUATERNION_ARRAY, leaves, "0123")) and (q := order_by_motion(columns, entries, four, clock)):
+        reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
+    if q:
+        return {"quaternion_wxyz": q}
+    found = next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in _angles(leaves))), {})
+    if found:
+        reasons.append(f"{', '.join(found['roll_pitch_yaw'])} turn as the gyro does, as roll, pitch and yaw")
+    return found
+
+
+def _position(leaves: dict[str, str]) -> list[str]:
+    """Columns x, y, z of a position, or north, east, down, or east, north, up."""
+    found = (_axes(pattern, leaves, axes) for pattern, axes in POSITIONS)
+    return next(filter(None, found), [])
+
+
+def _angles(leaves: dict[str, str]) -> list[list[str]]:
+    """Columns of each roll, pitch and yaw."""
+    yaws = {re.sub(HEADING, "yaw", leaf): column for leaf, column in leaves.items()}
+    return [three for pattern, axes in ANGLES for three in _every(pattern, yaws | leaves, axes)]
+
+
+def _axes(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[str]:
     """Columns of all axes of the first name that has them; `leaves` are columns by their names."""
+    return next(iter(_every(pattern, leaves, axes)), [])
+
+
+def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[list[str]]:
+    """Columns of all axes of each name that has them."""
     found: dict[str, dict[str, str]] = {}
     for leaf, column in leaves.items():
         if match := re.fullmatch(pattern, leaf):
             axis = match["axis"] if "0" in axes else match["axis"].translate(DIGITS)
             found.setdefault(leaf[: match.start("axis")], {})[axis] = column
-    return next(([columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}), [])
+    return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
 
 
 def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[str, str] | None:
@@ -165,8 +210,7 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     group, other = group_of(column), ""
     while group and not other:
         for wanted, values in columns.values.items():
-            is_time = group_of(wanted) == group and re.fullmatch(TIME_WORDS, split_name(wanted.removeprefix(group))[0])
-            if is_time and len(values) == len(columns.values[column]) and goes_on(values):
+            if group_of(wanted) == group and is_time(wanted) and len(values) == len(columns.values[column]) and goes_on(values):
                 other = other or wanted
         group = group_of(group)
     if other in ("", time):
@@ -181,6 +225,11 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
         overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
     best = max(overlap, key=lambda each: overlap[each])
     return (other, best) if overlap[best] > LEAST_OVERLAP else None
+
+
+def is_time(column: str) -> bool:
+    """Whether a column is named as a time."""
+    return re.fullmatch(TIME_WORDS, split_name(column.removeprefix(group_of(column)))[0]) is not None
 
 
 def is_true(column: str) -> bool:

@@ -99,22 +99,30 @@ def name_headerless(columns: Columns) -> None:
     numbered = [f"column {number}" for number in range(1, width + 1)]
     if not width or not columns.values.keys() <= {*numbered}:
         return
+    if (
+        width > 7
+        and rises(first := columns.values.get("column 1", np.zeros(0)))
+        and np.array_equal(first, columns.values.get("column 2", first[:0]))
+    ):  # the same time twice, as tools of MATLAB write it
+        del columns.values["column 2"], numbered[1]
+        columns.texts.pop("column 2", None)
+        columns.remarks.notes.append("column 2 repeats column 1 and is left out")
     if width == len(ROS_IMU) and [*columns.values] == [*numbered[:2], *numbered[3:]]:
         new, why = ROS_IMU, "it has the columns of `ros2 topic echo --csv` of sensor_msgs/Imu"
     elif [*columns.values] == numbered and (halves := _halves(columns, numbered[_place_of_time(columns) :])):
-        count = width - len(halves.time) - 6
+        count = len(numbered) - len(halves.time) - 6
         if count != _place_of_time(columns):
             return
         new = [*["count"] * count, *["time"] * len(halves.time)]
         new += [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
-        place = width - 5 if halves.sensors[0] == "accel" else width - 2
-        why = f"it has no header: columns {place} to {place + 2} show gravity and count as the accel"
+        shown = halves.columns[:3] if halves.sensors[0] == "accel" else halves.columns[3:]
+        why = f"it has no header: {shown[0]} to {shown[2].removeprefix('column ')} show gravity and count as the accel"
     else:
         return
     name = dict(zip(numbered, new, strict=True))
     columns.values = {name[column]: values for column, values in columns.values.items()}
     columns.texts = {name[column]: texts for column, texts in columns.texts.items()}
-    columns.units = {name[column]: unit for column, unit in columns.units.items()}
+    columns.units = {name[column]: unit for column, unit in columns.units.items() if column in name}
     columns.remarks.notes.append(why)
 
 

@@ -7,18 +7,22 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from imutool.errors import ConfigError
+from imutool.array_types import Float64, Int64
+from imutool.errors import ConfigError, DataError
 from imutool.recording.message_log import KINDS
 
-from ._table_units import UNITS_OF
+from ._table_text import Columns
+from ._table_units import TIME_NS, UNITS_OF
 
 IMU_TOPIC = "/imu0"
+LARGEST_NS = 2**63 - 1
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
 Entries = dict[str, str | list[str]]  # of a map
@@ -51,6 +55,8 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     position_unit: str = "m"
     quaternion_wxyz: list[str] = []
     rotation_matrix: str | list[str] = ""  # an array, or nine columns, row by row
+    roll_pitch_yaw: list[str] = []  # body to world is Rz(yaw) Ry(pitch) Rx(roll)
+    roll_pitch_yaw_unit: str = "deg"
     pose_kind: str = "truth"
 
 
@@ -81,9 +87,11 @@ def read_map(path: Path) -> TableMap:
         raise ConfigError(
             f"rotation_matrix names {len(table.rotation_matrix)} columns", where=path, expected="nine, row by row"
         )
-    for name in ("gyro", "accel") if table.gyro or table.accel else ():
-        if len(getattr(table, name)) != 3:
-            raise ConfigError(f"{name} names {len(getattr(table, name))} columns", where=path, expected="three: x, y, z")
+    needed = {"gyro": table.gyro or table.accel, "accel": table.gyro or table.accel, "roll_pitch_yaw": table.roll_pitch_yaw}
+    for name in filter(needed.get, needed):
+        if len(names := getattr(table, name)) != 3:
+            of = "roll, pitch, yaw" if name == "roll_pitch_yaw" else "x, y, z"
+            raise ConfigError(f"{name} names {len(names)} columns", where=path, expected=f"three: {of}")
     return table
 
 
@@ -127,7 +135,75 @@ class Proposal(msgspec.Struct):
             "# raw counts: gyro_offset, gyro_scale, accel_offset, accel_scale give (count - offset) * scale in the unit"
         )
         lines.append(
-            "# poses: truth_time, position = [x, y, z] (m), quaternion_wxyz = [w, x, y, z] or rotation_matrix = [nine columns,"
-            ' row by row], pose_kind = "truth" or "estimate"; truth_file if they are in another table'
+            "# poses: truth_time, position = [x, y, z] (m), quaternion_wxyz = [w, x, y, z], rotation_matrix = [nine columns,"
+            " row by row] or roll_pitch_yaw = [roll, pitch, yaw] (deg, Rz(yaw) Ry(pitch) Rx(roll)),"
+            ' pose_kind = "truth" or "estimate"; truth_file if they are in another table'
         )
         return "\n".join(lines)
+
+
+def share_units(proposals: Iterable[Proposal]) -> None:
+    """Enter an open unit of the gyro that other IMUs with columns of the same names have."""
+    found: dict[tuple[str, ...], set[str]] = {}
+    for proposal in proposals:
+        if "gyro_unit" not in proposal.open and "gyro_unit" in proposal.entries:
+            found.setdefault(_leaves(proposal), set()).add(str(proposal.entries["gyro_unit"]))
+    for proposal in proposals:
+        if proposal.open == ["gyro_unit"] and len(units := found.get(_leaves(proposal), set())) == 1:
+            (unit,) = units
+            proposal.settle_unit("gyro", unit, f"the other IMUs, whose columns have the same names, are in {unit}")
+
+
+def _leaves(proposal: Proposal) -> tuple[str, ...]:
+    """Names of an IMU's columns without their groups."""
+    return tuple(name.rpartition("/")[2] for name in (*proposal.entries.get("gyro", []), *proposal.entries.get("accel", [])))
+
+
+def column_named(columns: Columns, wanted: str, where: Path) -> np.ndarray:
+    """Values of a column.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    if wanted not in columns.values:
+        raise ConfigError(f"no column {wanted!r}", where=where, expected=f"one of {', '.join(columns.values)}")
+    return columns.values[wanted]
+
+
+def times_named(columns: Columns, wanted: str, unit: str, where: Path) -> Int64[np.ndarray, " n"]:
+    """Stamps in nanoseconds; decimals of a text file are exact.
+
+    Raises:
+        ConfigError: there is no such column.
+        DataError: no numbers, or beyond the year 2262.
+    """
+    values = column_named(columns, wanted, where)
+    size = TIME_NS[unit]
+    if values.dtype.kind in "iu":
+        if len(values) and int(values.max()) > LARGEST_NS // int(size):
+            raise DataError(f"{wanted} reaches {values.max()} {unit}", where=where, expected="a time before the year 2262")
+        return values.astype(np.int64) * int(size)
+    if (texts := columns.texts.get(wanted)) is not None:
+        try:
+            return np.array([int((Decimal(text) * int(size)).to_integral_value()) for text in texts], np.int64)
+        except (InvalidOperation, OverflowError, ValueError):
+            pass
+    if not np.isfinite(values).all() or np.abs(values).max() * size > LARGEST_NS:
+        raise DataError(f"{wanted} holds times that are no numbers, or beyond the year 2262", where=where)
+    return np.rint(values.astype(np.float64) * size).astype(np.int64)
+
+
+def vectors_named(
+    columns: Columns, wanted: list[str], scale: float | list[float], offset: float | list[float], where: Path
+) -> Float64[np.ndarray, "n k"]:
+    """Columns side by side, (value - offset) * scale; a minus before a name turns its sign.
+
+    Raises:
+        ConfigError: there is no such column, or they have different numbers of rows.
+    """
+    signs = np.array([-1.0 if name.startswith("-") and name not in columns.values else 1.0 for name in wanted])
+    parts = [column_named(columns, n if n in columns.values else n.removeprefix("-"), where).astype(np.float64) for n in wanted]
+    if len({len(part) for part in parts}) > 1:
+        raise ConfigError(f"{', '.join(wanted)} have different numbers of rows", where=where)
+    values: Float64[np.ndarray, "n k"] = (np.stack(parts, axis=1) - np.asarray(offset)) * np.asarray(scale) * signs
+    return values

@@ -1,7 +1,10 @@
-"""Rotations of a table: from matrices, the order of their columns, the unit of a gyro."""
+"""Rotations of a table: from matrices and angles, their order, the unit of a gyro."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from imutool.geometry import quaternion
 
 from ._table_map import Entries
 from ._table_text import Columns
-from ._table_units import GYRO_SI, TIME_NS
+from ._table_units import ANGLE_SI, GYRO_SI, TIME_NS
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
 MOST_SPANS, LEAST_S = 5.0, 10.0  # multiple of a span that has a gap in it, and the least time to compare
@@ -21,6 +24,9 @@ LIKELY, MOST_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns
 ORTHOGONAL = 0.02  # what two printed decimals leave of R R^T = 1
 NOT_UNIT, MOST_NOT_UNIT = 0.01, 0.1  # error of a quaternion's length, and the share of them that may have it
 ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
+MOST_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
+SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, which are often rounded to 0.1 degrees
+DELAYS_S = (*(sign * tenth / 10.0 for tenth in range(11) for sign in (1, -1)),)  # of a clock of the angles' own, none first
 
 
 def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path) -> Float64[np.ndarray, "n 4"]:
@@ -46,6 +52,13 @@ def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path) -> Float64[
     return q_wxyz
 
 
+def of_angles(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of Rz(yaw) Ry(pitch) Rx(roll), in rad; zeros where one is missing."""
+    about = [quaternion.exp(axis * angle[:, None]) for axis, angle in zip(np.eye(3), np.nan_to_num(angles).T, strict=True)]
+    q_wxyz = quaternion.multiply(about[2], quaternion.multiply(about[1], about[0]))
+    return np.where(np.isfinite(angles).all(axis=1)[:, None], q_wxyz, 0.0)
+
+
 def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Bool[np.ndarray, " n"], list[str]]:
     """Rows that hold a rotation, and notes on those without one or of another length."""
     length = np.linalg.norm(q_wxyz, axis=1)
@@ -63,7 +76,7 @@ def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Boo
 
 def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> list[str]:
     """Columns w, x, y, z of an array that turns as the gyro does; empty where not certain."""
-    values = np.stack([columns.values[column] for column in array], axis=1).astype(float)
+    values = _side_by_side(columns, array)
     found = [_turns_alike(columns, entries, values[:, order], clock)[0] for order in ORDERS]
     best = int(np.argmax(found))
     return (
@@ -73,11 +86,43 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
     )
 
 
+def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock: tuple[str, str]) -> Entries:
+    """Entries of roll, pitch and yaw that turn as the gyro does; empty where not certain.
+
+    A yaw that counts the other way has a minus. Two signs that change together are another body and world, no other turn.
+    """
+    for unit in _angle_units(columns, entries, three, clock):
+        ways: dict[str, Entries] = {
+            yaw: {"roll_pitch_yaw": [*three[:2], yaw + three[2]], "roll_pitch_yaw_unit": unit} for yaw in ("", "-")
+        }
+        turns = {yaw: _rotations(columns, way) for yaw, way in ways.items()}
+        size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
+        for span_s, delay_s in product(SPANS_S, DELAYS_S if clock[0] != entries["time"] else (0.0,)):
+            found = {yaw: _turns_alike(columns, entries, q, clock, span_s, delay_s) for yaw, q in turns.items()}
+            best = max(found, key=lambda yaw: found[yaw])
+            if found[best][0] < SURE or (size and not 1.0 / MOST_OFF < found[best][0] * found[best][1] / size < MOST_OFF):
+                continue
+            return ways["-" if 1.0 - found["-"][0] < CLEARLY * (1.0 - found[""][0]) else ""]
+    return {}
+
+
+def _angle_units(columns: Columns, entries: Entries, three: list[str], clock: tuple[str, str]) -> list[str]:
+    """Units that angles may have: the stated one, degrees beyond a turn, else either if the gyro's unit can tell."""
+    texts = [column.rpartition("/")[2].lower() + columns.units.get(column, "").lower() for column in three]
+    stated = {unit for unit, word in (("deg", "deg|°"), ("rad", "rad")) if all(re.search(word, text) for text in texts)}
+    if len(stated) == 1:
+        return [*stated]
+    values = _side_by_side(columns, three)
+    if not np.isfinite(values).any() or np.nanmax(np.abs(values)) > MOST_RAD:
+        return ["deg"]
+    return ["rad", "deg"] if "gyro_unit" in entries else []
+
+
 def unit_by_poses(columns: Columns, entries: Entries) -> str:
     """Unit in which the gyro turns as far as the poses; empty where none does."""
-    if "quaternion_wxyz" not in entries:
+    if not entries.keys() & {"quaternion_wxyz", "roll_pitch_yaw"}:
         return ""
-    q_wxyz = np.stack([columns.values[column] for column in entries["quaternion_wxyz"]], axis=1).astype(float)
+    q_wxyz = _rotations(columns, entries)
     clock = str(entries["truth_time"]), str(entries["truth_time_unit"])
     for span_s in (SPAN_S, LONG_SPAN_S):
         correlation, ratio = _turns_alike(columns, entries, q_wxyz, clock, span_s)
@@ -88,8 +133,27 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     return ""
 
 
+def _rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of the columns that the entries name."""
+    if "roll_pitch_yaw" in entries:
+        angles = _side_by_side(columns, entries["roll_pitch_yaw"])
+        return of_angles(angles * ANGLE_SI[str(entries["roll_pitch_yaw_unit"])])
+    return _side_by_side(columns, entries["quaternion_wxyz"])
+
+
+def _side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
+    """Columns as one array; one named with a minus counts the other way."""
+    signed = ((-1.0, name[1:]) if name.startswith("-") else (1.0, name) for name in names)
+    return np.stack([sign * columns.values[name].astype(float) for sign, name in signed], axis=1)
+
+
 def _turns_alike(
-    columns: Columns, entries: Entries, q_wxyz: Float64[np.ndarray, "n 4"], clock: tuple[str, str], span_s: float = SPAN_S
+    columns: Columns,
+    entries: Entries,
+    q_wxyz: Float64[np.ndarray, "n 4"],
+    clock: tuple[str, str],
+    span_s: float = SPAN_S,
+    delay_s: float = 0.0,
 ) -> tuple[float, float]:
     """Correlation of the poses' turns with the gyro's under the best rotation between them, and the ratio of their sizes."""
     names = [str(entries["time"]), *entries["gyro"]]
@@ -97,6 +161,7 @@ def _turns_alike(
         return 0.0, 0.0
     t, *gyro = (columns.values[name].astype(float) for name in names)
     t, at = t * TIME_NS[str(entries["time_unit"])] * 1e-9, columns.values[clock[0]].astype(float) * TIME_NS[clock[1]] * 1e-9
+    at = at - delay_s
     t, rates = t[np.isfinite(t)], np.nan_to_num(np.stack(gyro, axis=1))[np.isfinite(t)]
     size = np.sqrt((q_wxyz**2).sum(axis=1))
     whole = np.isfinite(size) & (np.abs(size - 1.0) < 0.01) & (at >= t[0]) & (at <= t[-1])

@@ -21,12 +21,14 @@ GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01}
 POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+ANGLE_SI = {"deg": np.pi / 180.0, "rad": 1.0}
 UNITS_OF: dict[str, dict[str, float]] = {
     "time_unit": TIME_NS,
     "gyro_unit": GYRO_SI,
     "accel_unit": ACCEL_SI,
     "truth_time_unit": TIME_NS,
     "position_unit": POSITION_SI,
+    "roll_pitch_yaw_unit": ANGLE_SI,
 }
 GRAVITY_BAND = 0.15  # share by which the median acceleration may differ from gravity
 # of the median length: a tenth of the lengths and the mean vector lie below both in 9 tables of user or linear acceleration,

@@ -38,10 +38,18 @@ def sequences(source: Path) -> list[Sequence]:
     if source.is_dir():
         parts = find_folders(source, lambda folder: bool(_parts(folder)))
         taken = [sequence.path for sequence in parts]
-        logs = find_files(source, (".mcap",), lambda start: start.startswith(MAGIC))
-        alone = (log for log in logs if log.path.parent not in taken and not _is_of_bag(log.path.parent))
+        alone = (log for log in _logs(source) if log.path.parent not in taken and not _is_of_bag(log.path.parent))
         return parts + [log for log in alone if not _is_ours(log.path)]
     return [Sequence(name(source), source)] if source.is_file() and head(source, len(MAGIC)) == MAGIC else []
+
+
+def own_logs(source: Path) -> list[Sequence]:
+    """Logs of a folder that imutool wrote: its sources where nothing else is in it."""
+    return [log for log in _logs(source) if _is_ours(log.path)]
+
+
+def _logs(folder: Path) -> list[Sequence]:
+    return find_files(folder, (".mcap",), lambda start: start.startswith(MAGIC))
 
 
 def recognises(sequence: Sequence) -> bool:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Int64
 from imutool.errors import ConfigError, DataError
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import in_order, joined
@@ -24,18 +23,18 @@ from ._source import head, name
 from ._table_files import kind_of, load
 from ._table_folder import POSES_GROUP, TRUTH_GROUP, load_split, sequences_below
 from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
-from ._table_map import IMU_TOPIC, Proposal, TableMap, read_map
+from ._table_map import IMU_TOPIC, Proposal, TableMap, column_named, read_map, share_units, times_named, vectors_named
 from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
 from ._table_propose import propose
-from ._table_rotations import known_rotations, of_matrices, unit_by_poses
+from ._table_rotations import known_rotations, of_angles, of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times
-from ._table_units import ACCEL_SI, GYRO_SI, POSITION_SI, TIME_NS, unit_doubts
+from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
-LARGEST_NS, MOST_LOSSES = 2**63 - 1, 8  # losses in a refusal
+MOST_LOSSES = 8  # in a refusal
 POSES_TOPIC = "/ground_truth/pose"
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
@@ -72,9 +71,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     poses = _truth(columns, table, path, place, remarks)
     if not poses and path.is_dir() and (file := columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)):
         what = f"{file} gives no poses: no time with positions and a certain order of quaternions was found in it"
-        remarks.losses.append(f"{what}; a map names its columns (truth_time, position, quaternion_wxyz or rotation_matrix)")
+        remarks.losses.append(f"{what}; a map names its columns (truth_time, position, quaternion_wxyz)")
     if poses and not table.truth_file:
-        used |= {table.truth_time, *table.position, *table.quaternion_wxyz}
+        used |= {table.truth_time, *table.position, *table.quaternion_wxyz, *table.roll_pitch_yaw}
     scalars, constants = _further(columns, tables, used, place)
     log = MessageLog(
         sequence.name,
@@ -106,6 +105,7 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
     """
     apart = {} if known_layout(columns) else imus_apart(columns)
     proposals = {topic: _proposal(part) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
+    share_units(proposals.values())
     own_times = len({str(proposal.entries.get("time", "")) for proposal in proposals.values()}) > 1
     maps = []
     for topic, proposal in proposals.items():
@@ -155,8 +155,11 @@ def _proposal(columns: Columns) -> Proposal:
     proposal = known_layout(columns) or propose(columns)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
-        if "gyro_unit" in proposal.open and (unit := unit_by_poses(columns, turned(columns, proposal.entries))):
-            kind = "poses" if "quaternion_wxyz" in proposal.entries else "orientations"
+        tries = {"poses": proposal.entries, "orientations": turned(columns, proposal.entries)}
+        units = (
+            {kind: unit_by_poses(columns, entries) for kind, entries in tries.items()} if "gyro_unit" in proposal.open else {}
+        )
+        for kind, unit in [*filter(lambda each: each[1], units.items())][:1]:
             proposal.settle_unit("gyro", unit, f"the {kind} turn as far as a gyro in {unit} says")
     settle_accel_unit(proposal, columns)
     return proposal
@@ -166,17 +169,17 @@ def _counted(columns: Columns, table: TableMap, place: Path) -> TableMap:
     """The map with a column of counted times, where it has a rate in place of a time."""
     if not table.rate_hz:
         return table
-    length = len(_column(columns, table.gyro[0].removeprefix("-"), place))
+    length = len(column_named(columns, table.gyro[0].removeprefix("-"), place))
     time = count_times(columns, table.rate_hz, length, table.counter)
     return msgspec.structs.replace(table, time=time, time_unit="s")
 
 
 def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
     """IMU of a map, on the gyro's stamps."""
-    gyro_ns = _times(columns, table.time, table.time_unit, place)
-    accel_ns = _times(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
-    gyro = _vectors(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
-    accel = _vectors(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
+    gyro_ns = times_named(columns, table.time, table.time_unit, place)
+    accel_ns = times_named(columns, table.accel_time, table.time_unit, place) if table.accel_time else gyro_ns
+    gyro = vectors_named(columns, table.gyro, table.gyro_scale, table.gyro_offset, place) * GYRO_SI[table.gyro_unit]
+    accel = vectors_named(columns, table.accel, table.accel_scale, table.accel_offset, place) * ACCEL_SI[table.accel_unit]
     for label, t_ns, values in (("gyro", gyro_ns, gyro), ("accel", accel_ns, accel)):
         if len(t_ns) != len(values):
             raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
@@ -190,56 +193,22 @@ def _described(table: TableMap) -> dict[str, str]:
     return {key: str(getattr(table, key)) for key in table.__struct_fields__}
 
 
-def _column(columns: Columns, wanted: str, where: Path) -> np.ndarray:
-    if wanted not in columns.values:
-        raise ConfigError(f"no column {wanted!r}", where=where, expected=f"one of {', '.join(columns.values)}")
-    return columns.values[wanted]
-
-
-def _times(columns: Columns, wanted: str, unit: str, where: Path) -> Int64[np.ndarray, " n"]:
-    """Stamps in nanoseconds; decimals of a text file are exact."""
-    values = _column(columns, wanted, where)
-    size = TIME_NS[unit]
-    if values.dtype.kind in "iu":
-        if len(values) and int(values.max()) > LARGEST_NS // int(size):
-            raise DataError(f"{wanted} reaches {values.max()} {unit}", where=where, expected="a time before the year 2262")
-        return values.astype(np.int64) * int(size)
-    if (texts := columns.texts.get(wanted)) is not None:
-        try:
-            return np.array([int((Decimal(text) * int(size)).to_integral_value()) for text in texts], np.int64)
-        except (InvalidOperation, OverflowError, ValueError):
-            pass
-    if not np.isfinite(values).all() or np.abs(values).max() * size > LARGEST_NS:
-        raise DataError(f"{wanted} holds times that are no numbers, or beyond the year 2262", where=where)
-    return np.rint(values.astype(np.float64) * size).astype(np.int64)
-
-
-def _vectors(
-    columns: Columns, wanted: list[str], scale: float | list[float], offset: float | list[float], where: Path
-) -> Float64[np.ndarray, "n k"]:
-    """Columns side by side, (value - offset) * scale; a name with a minus counts with the opposite sign."""
-    signs = np.array([-1.0 if name.startswith("-") and name not in columns.values else 1.0 for name in wanted])
-    parts = [_column(columns, n if n in columns.values else n.removeprefix("-"), where).astype(np.float64) for n in wanted]
-    if len({len(part) for part in parts}) > 1:
-        raise ConfigError(f"{', '.join(wanted)} have different numbers of rows", where=where)
-    values: Float64[np.ndarray, "n k"] = (np.stack(parts, axis=1) - np.asarray(offset)) * np.asarray(scale) * signs
-    return values
-
-
 def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:
     """True poses, where the map names them: in the table, or in a file beside it."""
-    if not (table.quaternion_wxyz or table.rotation_matrix):
+    if not (table.quaternion_wxyz or table.rotation_matrix or table.roll_pitch_yaw):
         return {}
     if table.truth_file:
         other = path.parent / table.truth_file
         if not other.is_file():
             raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
         columns = load(other, kind_of(head(other), other))
-    t_ns = _times(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
+    t_ns = times_named(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
     if table.quaternion_wxyz:
-        q_wxyz = _vectors(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+        q_wxyz = vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+    elif table.roll_pitch_yaw:
+        q_wxyz = of_angles(vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where))
     elif isinstance(table.rotation_matrix, list):
-        q_wxyz = of_matrices(_vectors(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3), where)
+        q_wxyz = of_matrices(vectors_named(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3), where)
     elif table.rotation_matrix in columns.matrices:
         q_wxyz = of_matrices(columns.matrices[table.rotation_matrix], where)
     else:
@@ -247,7 +216,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
     p = np.zeros((len(q_wxyz), 3))
     if table.position:
-        p = _vectors(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
+        p = vectors_named(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
     known, notes = known_rotations(q_wxyz, POSES_TOPIC)
@@ -265,7 +234,7 @@ def _further(
     columns: Columns, tables: list[TableMap], used: set[str], where: Path
 ) -> tuple[dict[str, Scalars], dict[str, str]]:
     """Further columns as topics, on the clock of their group or on an IMU's, and short ones without time as texts."""
-    times = [(each, _times(columns, each.time, each.time_unit, where)) for each in tables]
+    times = [(each, times_named(columns, each.time, each.time_unit, where)) for each in tables]
     clocks: dict[str, Int64[np.ndarray, " n"]] = {}
     constants, left = {}, []
     for column in [c for c in columns.values if c not in used]:
@@ -273,7 +242,7 @@ def _further(
         beside = time_beside(columns, column, table.time, table.time_unit)
         if beside is not None:
             if beside[0] != column:
-                clocks[column] = _times(columns, *beside, where)
+                clocks[column] = times_named(columns, *beside, where)
         elif len(columns.values[column]) == len(t_ns):
             clocks[column] = t_ns
         elif len(columns.values[column]) <= MOST_CONSTANTS:

@@ -6,6 +6,7 @@ Sequences convert in worker processes, one log a sequence; a sequence that fails
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
@@ -26,7 +27,7 @@ from imutool.recording.message_log import MessageLog
 
 AUTO = "auto"
 SUFFIX = ".mcap"
-OF_FOLDER = "Name the file itself: in a folder, tables whose columns show no IMU and logs that imutool wrote are left out"
+OF_FOLDER = "Name the file itself: in a folder, tables whose columns show no IMU are left out"
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
@@ -91,7 +92,7 @@ def convert(
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)
-    source_sequences = _find(source, format)
+    source_sequences = _find(source, format, Path(out))
     if sequences:
         source_sequences = _only(source_sequences, sequences)
     names = source_sequences.names()
@@ -119,8 +120,8 @@ def convert(
     return report
 
 
-def _find(source: Path, format: str) -> _Sequences:
-    """Find every sequence of the source, with its converter.
+def _find(source: Path, format: str, out: Path) -> _Sequences:
+    """Find every sequence of the source, with its converter; of its own logs none below `out`.
 
     Raises:
         DataError: there is none.
@@ -141,6 +142,10 @@ def _find(source: Path, format: str) -> _Sequences:
                     errors.setdefault(str(sequence), (sequence.name, reason))
             except ImutoolError as error:
                 errors[str(sequence)] = (sequence.name, error)
+    if not claims and source.is_dir():  # logs of its own are sources where nothing else is, as for `correct`
+        found = ((key, m.own_logs(source)) for key, m in _converters(format) if hasattr(m, "own_logs"))
+        apart = ((key, log) for key, own in found for log in own if not log.path.resolve().is_relative_to(out.resolve()))
+        claims = {str(log): [Job(key, log)] for key, log in apart}
     if not claims:
         what, fix = ("", "") if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
         raise DataError(
@@ -154,9 +159,22 @@ def _find(source: Path, format: str) -> _Sequences:
             keys = " and ".join(job.converter for job in jobs)
             raise ConfigError(f"is recognised as {keys}", where=place, fix="Choose one with `format`")
     return _Sequences(
-        [job for jobs in claims.values() for job in jobs],
+        _told_apart([job for jobs in claims.values() for job in jobs], source),
         [error for place, error in errors.items() if not claims[place]],
     )
+
+
+def _told_apart(jobs: list[Job], source: Path) -> list[Job]:
+    """The jobs, whose sequences have their folders in front of a name that several have: `path_1_IMU`, `path_2_IMU`."""
+    count = Counter(job.sequence.name for job in jobs)
+    return [job if count[job.sequence.name] == 1 else _with_folders(job, source) for job in jobs]
+
+
+def _with_folders(job: Job, source: Path) -> Job:
+    path, inside = job.sequence.path, job.sequence.inside
+    below = path.relative_to(source).parts if path.is_relative_to(source) else ()
+    folders = [*below[:-1], *([Path(below[-1]).stem] if below and inside else [])]
+    return replace(job, sequence=replace(job.sequence, name="_".join([*folders, job.sequence.name])))
 
 
 def _converters(format: str) -> list[tuple[str, ModuleType]]:

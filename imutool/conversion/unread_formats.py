@@ -24,6 +24,10 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is an ASCII log of a NovAtel receiver, whose RAWIMU holds counts of a scale that depends on the IMU",
         "Make a CSV of it in rad/s and m/s^2 with the scale that NovAtel's manual states for the IMU, and convert that",
     ),
+    rb"PK\x03\x04|.{257}ustar": (
+        "it is an archive without a mav0 folder, a bag or a single table",
+        "Unpack it, and convert the folder that is in it",
+    ),
     rb"\x75\x65": (
         "it looks like a binary log of a MicroStrain sensor",
         "Export it as CSV with SensorConnect, and convert that",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tarfile
 import types
 import zipfile
 from pathlib import Path
@@ -171,10 +172,25 @@ def test_several_sequences_do_not_go_into_one_file(source, tmp_path, suffix):
         convert(source, tmp_path / f"out.{suffix}")
 
 
-def test_two_sequences_of_one_name_are_refused(source, tmp_path):
+def test_sequences_of_one_name_have_their_folders_in_front_of_it(source, tmp_path):
     sequence(source / "copy" / "a")
-    with pytest.raises(ConfigError, match="two sequences are named a"):
+    sequence(source / "copy" / "older" / "a")
+    convert(source, tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "a.mcap",
+        "b.mcap",
+        "c.mcap",
+        "copy_a.mcap",
+        "copy_older_a.mcap",
+    }
+
+
+def test_two_sequences_that_still_have_one_name_are_refused(source, tmp_path):
+    sequence(source / "copy" / "older" / "a")
+    sequence(source / "copy_older" / "a")
+    with pytest.raises(ConfigError, match="two sequences are named copy_older_a"):
         convert(source, tmp_path / "out")
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 
 def test_a_source_is_never_the_target(tmp_path):
@@ -292,3 +308,29 @@ def test_a_format_that_is_known_but_not_read_says_what_to_do(start: bytes, said:
     (tmp_path / "flight.dat").write_bytes(start + bytes(3000))
     with pytest.raises(DataError, match=said):
         convert(tmp_path / "flight.dat", tmp_path / "out.mcap")
+
+
+def test_a_folder_of_own_logs_alone_can_be_converted_again_but_never_what_it_wrote_itself(source, tmp_path):
+    logs = tmp_path / "logs"
+    assert len(convert(source, logs).written) == 3
+    for overwrite in (False, True):
+        again = convert(logs, logs / "again", overwrite=overwrite)
+        assert sorted(path.name for path in again.written) == ["a.mcap", "b.mcap", "c.mcap"]
+    sequence(logs / "raw")
+    (written,) = convert(logs, tmp_path / "beside").written  # own logs beside a source are none
+    assert read(written).name == "raw"
+
+
+@pytest.mark.parametrize("ending", ["zip", "tar"])
+def test_an_archive_of_several_tables_says_to_unpack_it(tmp_path, ending):
+    for name in ("IMU.txt", "GPS.txt"):
+        (tmp_path / name).write_text("1 2 3 4 5 6 7\n" * 9)
+    archive = tmp_path / f"log.{ending}"
+    if ending == "zip":
+        with zipfile.ZipFile(archive, "w") as file:
+            [file.write(tmp_path / name, name) for name in ("IMU.txt", "GPS.txt")]
+    else:
+        with tarfile.open(archive, "w") as file:
+            [file.add(tmp_path / name, name) for name in ("IMU.txt", "GPS.txt")]
+    with pytest.raises(DataError, match=r"it is an archive without a mav0 folder.*Unpack it, and convert the folder"):
+        convert(archive, tmp_path / "log.mcap")

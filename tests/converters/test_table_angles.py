@@ -1,0 +1,189 @@
+"""Roll, pitch and yaw in tables: the unit of the gyro by them, true angles beside IMUs, and what is no orientation."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from scipy.spatial.transform import Rotation
+
+from imutool.converters import table
+from imutool.errors import ConfigError
+from imutool.recording.message_log import MessageLog
+
+COUNT = 3000
+T_S = np.arange(COUNT) / 100.0
+RNG = np.random.default_rng(5)
+
+
+def motion(t_s: np.ndarray) -> Rotation:
+    """Turns about all axes, by Rz(yaw) Ry(pitch) Rx(roll)."""
+    return Rotation.from_euler("ZYX", np.stack([2.0 + np.sin(0.7 * t_s), 0.6 * np.sin(1.3 * t_s), 0.5 * np.sin(0.9 * t_s)], 1))
+
+
+TURN = motion(T_S)
+GYRO = (motion(T_S - 0.005).inv() * motion(T_S + 0.005)).as_rotvec() * 100.0
+ACCEL = np.array([0.0, 0.0, 9.80665]) + RNG.normal(size=(COUNT, 3))  # of a flight without slip: gravity does not turn in it
+RPY = TURN.as_euler("ZYX")[:, ::-1]
+P_M = np.sin(T_S[:, None] * [0.5, 0.8, 1.1])
+SENSOR = "time [s],Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n"  # as Xsens' DOT writes it
+TRUTH = "time,compass_heading(degrees),pitch(degrees),roll(degrees),North,East,Down\n"  # as of a drone's flight log
+
+
+def rows(*columns: np.ndarray) -> str:
+    return "".join(",".join(f"{value:.7g}" for value in row) + "\n" for row in np.column_stack(columns).tolist())
+
+
+def sensor(angles: np.ndarray, gyro_size: float = np.rad2deg(1.0), header: str = SENSOR) -> str:
+    return header + rows(T_S, angles, ACCEL, gyro_size * GYRO)
+
+
+def truth(t_s: np.ndarray, late_s: float = 0.0, yaw: float = 1.0) -> str:
+    roll, pitch, heading = np.rad2deg(motion(t_s).as_euler("ZYX")[:, ::-1]).round(1).T
+    return TRUTH + rows(t_s + late_s, yaw * heading, pitch, roll, np.sin(t_s[:, None] * [0.5, 0.8, 1.1]))
+
+
+def read(source: Path) -> MessageLog:
+    (sequence,) = table.sequences(source)
+    return table.read_sequence(sequence)
+
+
+@pytest.mark.parametrize(("angle_size", "unit"), [(np.rad2deg(1.0), ""), (1.0, " [rad]")])
+@pytest.mark.parametrize("gyro_size", [1.0, np.rad2deg(1.0)])
+def test_the_angles_that_a_sensor_gives_beside_its_rates_show_their_unit(tmp_path, angle_size, unit, gyro_size):
+    header = re.sub(r"(Euler_[XYZ])", rf"\1{unit}", SENSOR)
+    (tmp_path / "dot.csv").write_text(sensor(angle_size * RPY, gyro_size, header))
+    log = read(tmp_path / "dot.csv")
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-5)
+    assert log.poses == {}  # an orientation alone is the sensor's own
+
+
+@pytest.mark.parametrize("names", ["Euler_X,Euler_Y,Euler_Z", "des_roll,des_pitch,des_yaw"])
+def test_angles_of_another_motion_or_of_a_command_show_no_unit(tmp_path, names):
+    header = SENSOR.replace("Euler_X,Euler_Y,Euler_Z", names)
+    angles = RPY[::-1] if "Euler" in names else RPY
+    (tmp_path / "dot.csv").write_text(sensor(np.rad2deg(angles), 20.0, header))
+    with pytest.raises(ConfigError, match="state no unit of the gyro"):
+        read(tmp_path / "dot.csv")
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.4, -0.6])
+@pytest.mark.parametrize("yaw", [1.0, -1.0])
+def test_true_angles_beside_an_imu_are_poses_also_where_yaw_counts_the_other_way(tmp_path, late_s, yaw):
+    (tmp_path / "imu.csv").write_text(sensor(np.rad2deg(RPY)))
+    t_s = 1.0 + np.arange(280) / 10.0
+    (tmp_path / "GT.csv").write_text(truth(t_s, late_s, yaw))
+    log = read(tmp_path)
+    poses = log.poses["/ground_truth/pose"]
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    seen = Rotation.from_quat(poses.q_wb_wxyz[:, [1, 2, 3, 0]])
+    assert np.rad2deg((motion(t_s).inv() * seen).magnitude()).max() < 0.15  # by the rounded degrees
+    np.testing.assert_allclose(poses.p_wb[:, 0], np.sin(0.5 * t_s), atol=1e-6)
+    np.testing.assert_allclose(poses.t_ns, 1e9 * (t_s + late_s), atol=1e3)  # the clock is for `--fix`
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-5)
+
+
+def test_true_angles_of_another_motion_are_no_poses_and_the_reason_says_so(tmp_path):
+    (tmp_path / "imu.csv").write_text(sensor(np.rad2deg(RPY)))
+    (tmp_path / "GT.csv").write_text(truth(np.arange(300)[::-1] / 10.0).replace("\n", "\n", 1))
+    text = truth(np.arange(300) / 10.0).splitlines()
+    shuffled = [
+        line.split(",")[0] + "," + ",".join(other.split(",")[1:]) for line, other in zip(text[1:], text[:0:-1], strict=True)
+    ]
+    (tmp_path / "GT.csv").write_text("\n".join([text[0], *shuffled]) + "\n")
+    log = read(tmp_path)
+    assert log.poses == {}
+    assert any("do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)" in note for note in log.remarks.notes)
+    assert any("GT.csv gives no poses" in loss for loss in log.remarks.losses)
+
+
+def test_a_map_names_roll_pitch_and_yaw_in_either_unit_and_sense(tmp_path):
+    (tmp_path / "imu.csv").write_text(sensor(RPY * [1.0, 1.0, -1.0]))
+    stated = [
+        'time = "time [s]"',
+        'time_unit = "s"',
+        'gyro_unit = "deg/s"',
+        'accel_unit = "m/s^2"',
+        'roll_pitch_yaw_unit = "rad"',
+    ]
+    stated += ['gyro = ["Gyr_X", "Gyr_Y", "Gyr_Z"]', 'accel = ["Acc_X", "Acc_Y", "Acc_Z"]']
+    mapping = tmp_path / "map.toml"
+    mapping.write_text("\n".join([*stated, 'roll_pitch_yaw = ["Euler_X", "Euler_Y", "-Euler_Z"]']))
+    (sequence,) = table.sequences(tmp_path / "imu.csv")
+    poses = table.read_sequence(sequence, mapping=mapping).poses["/ground_truth/pose"]
+    seen = Rotation.from_quat(poses.q_wb_wxyz[:, [1, 2, 3, 0]])
+    assert (TURN.inv() * seen).magnitude().max() < 1e-6
+    mapping.write_text("\n".join([*stated, 'roll_pitch_yaw = ["Euler_X", "Euler_Y"]']))
+    with pytest.raises(ConfigError, match="roll_pitch_yaw names 2 columns"):
+        table.read_sequence(sequence, mapping=mapping)
+
+
+def test_several_imus_beside_one_truth_are_one_recording(tmp_path):
+    for number in (1, 2):
+        (tmp_path / f"IMU_{number}.csv").write_text(sensor(np.rad2deg(RPY) + number))
+    turning = RNG.permutation(np.rad2deg(RPY))  # angles of no motion: the unit is that of the others
+    (tmp_path / "IMU_avg.csv").write_text(sensor(turning))
+    (tmp_path / "GT.csv").write_text(truth(np.arange(300) / 10.0, late_s=1.0))
+    log = read(tmp_path)
+    assert {*log.imus} == {"/imu_1/imu", "/imu_2/imu", "/imu_avg/imu"}
+    assert [*log.poses] == ["/ground_truth/pose"]
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    for imu in log.imus.values():
+        np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-5)
+    assert any("/imu_avg/imu: the other IMUs" in note for note in log.remarks.notes)
+
+
+def test_imus_of_another_length_are_recordings_of_their_own(tmp_path):
+    whole = sensor(np.rad2deg(RPY))
+    (tmp_path / "IMU_1.csv").write_text(whole)
+    (tmp_path / "IMU_2.csv").write_text("".join(whole.splitlines(keepends=True)[: COUNT // 2]))
+    (tmp_path / "GT.csv").write_text(truth(np.arange(300) / 10.0))
+    assert [sequence.name for sequence in table.sequences(tmp_path)] == ["IMU_1", "IMU_2"]
+
+
+def test_a_log_that_mission_planner_wrote_for_matlab_names_its_columns_beside_them(tmp_path):
+    imu, attitude = (
+        ["LineNo", "TimeMS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"],
+        ["LineNo", "TimeMS", "Roll", "Pitch", "Yaw"],
+    )
+    line, t_ms = np.arange(COUNT)[:, None], 1000.0 * T_S[:, None] + 13178.0
+    content = {
+        "IMU": np.hstack([line, t_ms, GYRO, ACCEL]),
+        "ATT": np.hstack([line, t_ms, np.rad2deg(RPY)])[::4],
+        **{f"{name}_label": np.array(labels, dtype=object)[:, None] for name, labels in (("IMU", imu), ("ATT", attitude))},
+    }
+    scipy.io.savemat(tmp_path / "flight.mat", content)
+    log = read(tmp_path / "flight.mat")
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
+    assert log.imus["/imu0"].t_ns[0] == 13_178_000_000
+    assert log.kinds == {"/estimate/pose": "estimate"}
+    seen = Rotation.from_quat(log.poses["/estimate/pose"].q_wb_wxyz[:, [1, 2, 3, 0]])
+    assert (TURN[::4].inv() * seen).magnitude().max() < 1e-6
+
+
+@pytest.mark.parametrize("form", ["npy", "named npy", "text with the time twice"])
+def test_an_array_or_text_without_names_has_an_imu_that_gravity_shows(tmp_path, form):
+    source = tmp_path / ("imu.txt" if "text" in form else "imu.npy")
+    accel = TURN.inv().apply([0.0, 0.0, 9.80665])
+    table_of_all = np.column_stack([T_S, GYRO, accel])
+    if form == "npy":
+        np.save(source, table_of_all)
+    elif form == "named npy":
+        names = ["t", *(f"gyro_{a}" for a in "xyz"), *(f"acc_{a}" for a in "xyz")]
+        np.save(source, np.rec.fromarrays(table_of_all.T, names=names))
+    else:
+        source.write_text(rows(1000.0 * T_S, 1000.0 * T_S, GYRO, accel).replace(",", " "))
+    log = read(source)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-6)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, accel, atol=1e-5)
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns, 1e9 * T_S, atol=1e3)
+
+
+def test_an_array_of_objects_is_refused(tmp_path):
+    np.save(tmp_path / "imu.npy", np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
+    with pytest.raises(Exception, match="allow_pickle"):
+        read(tmp_path / "imu.npy")
