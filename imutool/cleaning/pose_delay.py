@@ -19,7 +19,7 @@ SLOW_S = 1.0  # length of the turns that find the delay: in steps of 0.1 s a fas
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
-DELAY_PARTS, FEWEST = 8, 40  # parts whose own lags show how sure the delay is, and poses in each
+DELAY_PARTS, FEWEST_PARTS, FEWEST = 8, 4, 40  # parts whose own lags show how sure the delay is, and poses in each
 
 
 class Delay(NamedTuple):
@@ -75,20 +75,21 @@ def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) ->
     """Delay of at most `LONGEST_DELAY_S`: turns over a second find it, and turns between neighbouring poses refine it."""
     period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
     slow, fast = (_Turns.of(motion, truth, n, period_ns, bias) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
-    if min(len(slow.size) + FEWEST, len(fast.size)) < DELAY_PARTS * FEWEST:  # of the slow ones a log holds fewer
+    count = min(DELAY_PARTS, min(len(slow.size) + FEWEST, len(fast.size)) // FEWEST)  # of the slow ones a log holds fewer
+    if count < FEWEST_PARTS:
         return None
     coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
-    whole = slow.correlations(coarse)[:, 0]
+    whole = slow.correlations(coarse, count)[:, 0]
     at = int(np.argmax(whole))
     if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
         return None
     lags = coarse[at] + np.arange(-12, 13) * FINE_S
-    fine = fast.correlations(lags)
+    fine = fast.correlations(lags, count)
     if fine[:, 0].max() < LEAST_CORRELATION:
         return None
     peaks = np.array([_peak(lags, column) for column in fine.T])
     parts = peaks[1:][np.isfinite(peaks[1:])]
-    if not np.isfinite(peaks[0]) or len(parts) < DELAY_PARTS // 2:
+    if not np.isfinite(peaks[0]) or len(parts) < FEWEST_PARTS:
         return None
     return Delay(float(peaks[0]), float(np.std(parts, ddof=1)) / len(parts) ** 0.5)
 
@@ -115,12 +116,12 @@ class _Turns(NamedTuple):
         gyro = mean[:, :3] - bias
         return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], step, gyro)
 
-    def correlations(self, lags: Float64[np.ndarray, " l"]) -> Float64[np.ndarray, "l p"]:
-        """Correlations with the gyro at each lag: of all turns, and of each part of the log."""
+    def correlations(self, lags: Float64[np.ndarray, " l"], count: int) -> Float64[np.ndarray, "l p"]:
+        """Correlations with the gyro at each lag: of all turns, and of each of `count` parts of the log."""
         rows = []
         for lag in lags:
             measured = np.linalg.norm(between(self.step, self.gyro, self.first_s - lag, self.last_s - lag), axis=1)
-            parts = zip(np.array_split(self.size, DELAY_PARTS), np.array_split(measured, DELAY_PARTS), strict=True)
+            parts = zip(np.array_split(self.size, count), np.array_split(measured, count), strict=True)
             rows.append([_correlation(self.size, measured), *(_correlation(*part) for part in parts)])
         return np.array(rows)
 
