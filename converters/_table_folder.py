@@ -8,17 +8,20 @@ alone (`time.csv` of gnss-ins-sim) is the clock of those that have none and as m
 from __future__ import annotations
 
 import re
+from contextlib import suppress
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 
 from . import Sequence
 from ._source import find_folders, head
 from ._table_files import kind_of, load
-from ._table_groups import TRUE_GROUPS, has_poses
+from ._table_groups import TRUE_GROUPS, has_poses, known_layout
 from ._table_headerless import name_headerless
 from ._table_mocap import is_mocap
 from ._table_names import TIME_WORDS, name_and_unit, split_name
@@ -30,13 +33,14 @@ from ._table_times import rises
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
+MOST_LOOKED = 64 << 20  # bytes of a table that is no text
 MOST_LARGER = 1.2  # ratio of the sizes of files of IMUs that were recorded together
 DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
 ROLE = "|".join(["imu|inertial|ground|truth|poses?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
-ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".tum", ".mat", ".npz"
+ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".tum", ".json", ".mat", ".npz", ".npy", ".parquet", ".h5", ".hdf5"
 IMU_GROUP, TRUTH_GROUP, POSES_GROUP = "imu", "ground_truth", "poses"
 
 
@@ -108,7 +112,7 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
         alike.setdefault(_without_role(_stem(path)), []).append(path)
     found: dict[str, list[Path]] = {}
     for name, paths in alike.items():
-        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if _shows_imu(path)}
+        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if _look(path).is_imu}
     return found
 
 
@@ -116,10 +120,6 @@ def _without_role(stem: str) -> str:
     """Name of a file without the words that say what its table holds."""
     parts = re.split(rf"({WORD}|\d+)", stem)
     return "".join(part for part in parts if not re.fullmatch(ROLE, part.lower())).strip("_- .")
-
-
-def _shows_imu(path: Path) -> bool:
-    return propose(_columns(path, _start(path))).entries.keys() >= {"gyro", "accel"}
 
 
 def _is_narrow(path: Path) -> bool:
@@ -179,13 +179,12 @@ def _groups(tables: list[Path]) -> dict[Path, str]:
         return {path: sensors[_stem(path)] for path in tables if _stem(path) in sensors}
     if several := pairs_among(_stem(path) for path in tables):
         return {path: several[_stem(path)] for path in tables if _stem(path) in several}
-    starts = {path: _start(path) for path in tables}
-    captured = [path for path in tables if is_mocap(starts[path])]
+    seen = {path: _look(path) for path in tables}
+    captured = [path for path in tables if seen[path].is_mocap]
     true = captured or [path for path in tables if re.fullmatch(POSES, _stem(path).lower())]
-    columns = {path: _columns(path, starts[path]) for path in tables if path not in true}
-    shown = [path for path, found in columns.items() if propose(found).entries.keys() >= {"gyro", "accel"}]
-    imus = [path for path in columns if re.fullmatch(IMU, _stem(path).lower())] or shown
-    poses = true or [path for path, found in columns.items() if path not in shown and has_poses(found)]
+    shown = [path for path in tables if seen[path].is_imu and path not in true]
+    imus = [path for path in tables if re.fullmatch(IMU, _stem(path).lower()) and path not in true] or shown
+    poses = true or [path for path in tables if seen[path].has_poses and path not in shown]
     if len(poses) != 1 or poses[0] in imus:
         return {}
     beside = {poses[0]: TRUTH_GROUP if true else POSES_GROUP}
@@ -212,11 +211,29 @@ def _start(path: Path) -> str:
     return text_of(text_head(path) or head(path)).rpartition("\n")[0]
 
 
-def _columns(path: Path, start: str) -> Columns:
-    """Columns that the first rows of a text have."""
-    columns = Columns()
+class _Seen(NamedTuple):
+    """What the columns of a table show."""
+
+    is_imu: bool
+    has_poses: bool
+    is_mocap: bool
+
+
+def _look(path: Path) -> _Seen:
+    """What the first rows of a text show, or another table of up to `MOST_LOOKED` bytes; kept until the file changes."""
+    status = path.stat()
+    return _looked(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _looked(path: Path, mtime_ns: int, size: int) -> _Seen:  # the key notices a changed file
+    columns, start, kind = Columns(), _start(path), kind_of(head(path), path)
     if start:
         read_csv(start, columns, path)
         name_headerless(columns)
-        name_columns(columns, "")
-    return columns
+    elif kind not in ("csv", "") and size <= MOST_LOOKED:
+        with suppress(DataError, ConfigError):  # said when the file itself is named
+            columns = load(path, kind)
+    name_columns(columns, "")
+    entries = (known_layout(columns) or propose(columns)).entries if columns.values else {}
+    return _Seen(entries.keys() >= {"gyro", "accel"}, has_poses(columns), is_mocap(start))

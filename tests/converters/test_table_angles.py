@@ -187,3 +187,22 @@ def test_an_array_of_objects_is_refused(tmp_path):
     np.save(tmp_path / "imu.npy", np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
     with pytest.raises(Exception, match="allow_pickle"):
         read(tmp_path / "imu.npy")
+
+
+@pytest.mark.parametrize("ending", ["mat", "npz", "npy"])
+def test_a_folder_of_tables_that_are_no_text_has_a_recording_for_each(tmp_path, ending):
+    accel = TURN.inv().apply([0.0, 0.0, 9.80665])
+    for name in ("walk_1", "walk_2"):
+        path, arrays = tmp_path / f"{name}.{ending}", {"t": T_S, "gyr": GYRO, "acc": accel}
+        if ending == "mat":
+            scipy.io.savemat(path, arrays)
+        elif ending == "npz":
+            np.savez(path, **arrays)
+        else:
+            np.save(path, np.column_stack([T_S, GYRO, accel]))
+    np.savez(tmp_path / "features.npz", weights=RNG.normal(size=(50, 20)))
+    (tmp_path / "settings.json").write_text('{"rate": 100}')
+    sequences = table.sequences(tmp_path)
+    assert [sequence.name for sequence in sequences] == ["walk_1", "walk_2"]
+    for sequence in sequences:
+        np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].gyro, GYRO)
