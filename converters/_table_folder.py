@@ -234,6 +234,8 @@ def _looked(path: Path, mtime_ns: int, size: int) -> _Seen:  # the key notices a
     elif kind not in ("csv", "") and size <= MOST_LOOKED:
         with suppress(DataError, ConfigError):  # said when the file itself is named
             columns = load(path, kind)
+    if not columns.values:
+        return _Seen(False, False, is_mocap(start))
     name_columns(columns, "")
-    entries = (known_layout(columns) or propose(columns)).entries if columns.values else {}
+    entries = (known_layout(columns) or propose(columns)).entries
     return _Seen(entries.keys() >= {"gyro", "accel"}, has_poses(columns), is_mocap(start))
