@@ -282,6 +282,7 @@ def _truths_follow(pool: Pool, first: Tensor, n: int) -> None:
     R_true = windows.R_start.mT @ windows.R_end
     e, _ = rotation_residual(windows.segment.gyro, windows.dt, R_true)
     turned = so3.log(R_true).norm(dim=1)
+    wrong = {}
     for log, name in enumerate(pool.names):
         of_log = windows.log == log
         if not bool(of_log.any()):
@@ -289,9 +290,11 @@ def _truths_follow(pool: Pool, first: Tensor, n: int) -> None:
         missed = float((e[of_log] - e[of_log].median(0).values).norm(dim=1).median())
         largest = float(turned[of_log].quantile(0.9))
         if missed > WORST_MISS * max(largest, LEAST_TURN_RAD_S * WINDOW_S):
-            raise DataError(
-                f"the true poses do not follow the gyro: they miss turns by {missed:.2f} rad a second, of {largest:.2f}",
-                where=name,
-                expected="poses of the IMU's own frame, on its clock",
-                fix="Look at the frame and the time offset of the truth, or leave the log out",
-            )
+            wrong[name] = f"{missed:.2f} rad a second, of {largest:.2f}"
+    if wrong:
+        raise DataError(
+            f"the true poses do not follow the gyro: they miss turns by {'; '.join(wrong.values())}",
+            where=", ".join(wrong),
+            expected="poses of the IMU's own frame, on its clock",
+            fix="Look at the frame and the time offset of the truth with imutool info, or leave these logs out",
+        )

@@ -52,13 +52,16 @@ def test_a_sensor_on_a_table_is_refused(flown: Recording) -> None:
         checked(with_gyro(flown, still))
 
 
-def test_a_truth_of_another_flight_is_refused_by_name(flown: Recording) -> None:
+def test_truths_of_other_flights_are_refused_by_their_names(flown: Recording) -> None:
     other = flight(2, duration_s=20.0)
     t_ns = flown.truth.t_ns
     swapped = replace(other.truth, t_ns=t_ns) if len(other.truth) == len(t_ns) else None
     assert swapped is not None, "made-up flights have one clock"
-    with pytest.raises(DataError, match=r"worthless: .*do not follow the gyro"):
-        checked(flown, replace(flown, name="worthless", truths={"/ground_truth/pose": swapped}))
+    wrong = {"/ground_truth/pose": swapped}
+    with pytest.raises(
+        DataError, match=r"worthless, spoilt: .*do not follow the gyro: .* rad a second, of .*; .* leave these logs out"
+    ):
+        checked(replace(flown, name="worthless", truths=wrong), flown, replace(flown, name="spoilt", truths=wrong))
 
 
 def test_a_truth_of_another_frame_is_refused(flown: Recording) -> None:
