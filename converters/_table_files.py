@@ -30,6 +30,7 @@ MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own
     "mat": b"MATLAB 5.0 MAT-file",
     "hdf5": b"\x89HDF\r\n\x1a\n",
     "parquet": b"PAR1",
+    "feather": b"ARROW1\0\0",  # also Arrow's own
     "npy": b"\x93NUMPY",
     "sheet": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
 }
@@ -102,20 +103,33 @@ def _load_csv(path: Path, columns: Columns) -> None:
 
 
 def _load_parquet(path: Path, columns: Columns) -> None:
-    parquet = _module("pyarrow.parquet", path)
-    file = parquet.ParquetFile(path)
-    numbers = [
-        field.name
-        for field in file.schema_arrow
-        if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(field.type))
-    ]
-    _check_size(path, file.metadata.num_rows * len(numbers) * 8)
-    columns.remarks.losses.extend(
-        f"{field.name} is left out: it is of type {field.type}, no number"
-        for field in file.schema_arrow
-        if field.name not in numbers
-    )
-    table = file.read(columns=numbers)  # a text of a few bytes may unpack to gigabytes
+    file = _module("pyarrow.parquet", path).ParquetFile(path)
+    names = _numbers_of(file.schema_arrow, columns)
+    _check_size(path, file.metadata.num_rows * len(names) * 8)
+    _add_arrow(file.read(columns=names), columns)  # a text of a few bytes may unpack to gigabytes
+
+
+def _load_feather(path: Path, columns: Columns) -> None:
+    with path.open("rb") as source:
+        file, batches, size = _module("pyarrow.ipc", path).open_file(source), [], 0
+        names = _numbers_of(file.schema, columns)
+        for number in range(file.num_record_batches):
+            batches.append(file.get_batch(number).select(names))
+            size += batches[-1].nbytes
+            _check_size(path, size)
+    if batches:
+        _add_arrow(_module("pyarrow", path).Table.from_batches(batches), columns)
+
+
+def _numbers_of(schema: Any, columns: Columns) -> list[str]:
+    """Names of the fields that hold numbers or times; the others are losses."""
+    numbers = [f.name for f in schema if re.match(r"u?int|float|double|halffloat|bool|timestamp|dict", str(f.type))]
+    others = [field for field in schema if field.name not in numbers]
+    columns.remarks.losses.extend(f"{field.name} is left out: it is of type {field.type}, no number" for field in others)
+    return numbers
+
+
+def _add_arrow(table: Any, columns: Columns) -> None:
     for name in table.column_names:
         column = table.column(name)
         if str(column.type).startswith("timestamp"):
@@ -128,7 +142,7 @@ def _load_npz(path: Path, columns: Columns) -> None:
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
             with archive.open(info) as member:  # the size that the array states, whatever the archive says
-                shape = _npy_shape(member) if info.filename.endswith(".npy") else ()
+                shape = npy_shape(member) if info.filename.endswith(".npy") else ()
             _check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
         _check_size(path, sum(info.file_size for info in archive.infolist()))
     with np.load(path, allow_pickle=False) as arrays:
@@ -139,7 +153,7 @@ def _load_npz(path: Path, columns: Columns) -> None:
 def _load_npy(path: Path, columns: Columns) -> None:
     """One array, whose columns have no names unless its type states them."""
     with path.open("rb") as file:
-        _check_size(path, 8 * int(np.prod(_npy_shape(file), dtype=float)))
+        _check_size(path, 8 * int(np.prod(npy_shape(file), dtype=float)))
     array = np.load(path, allow_pickle=False)
     if array.dtype.names:
         for name in array.dtype.names:
@@ -147,12 +161,14 @@ def _load_npy(path: Path, columns: Columns) -> None:
         return
     if array.ndim == 2 and array.shape[0] < array.shape[1]:
         array = array.T
-    for number, column in enumerate(array.T if array.ndim == 2 and array.shape[1] <= WIDEST else [], 1):
-        columns.add(f"column {number}", column)
+    for number, column in enumerate(np.atleast_2d(array.T) if array.ndim in (1, 2) else [], 1):
+        if number <= WIDEST:
+            columns.add(f"column {number}", column)
     name_headerless(columns)
 
 
-def _npy_shape(member: Any) -> tuple[int, ...]:
+def npy_shape(member: Any) -> tuple[int, ...]:
+    """Shape of the array that an open .npy states."""
     version = np.lib.format.read_magic(member)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape: tuple[int, ...] = read(member)[0]
@@ -274,6 +290,7 @@ LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "csv": _load_csv,
     "json": load_json,
     "parquet": _load_parquet,
+    "feather": _load_feather,
     "npz": _load_npz,
     "npy": _load_npy,
     "mat": _load_mat,

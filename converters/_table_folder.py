@@ -20,7 +20,7 @@ from imutool.errors import ConfigError, DataError
 
 from . import Sequence
 from ._source import find_folders, head
-from ._table_files import kind_of, load
+from ._table_files import kind_of, load, npy_shape
 from ._table_groups import TRUE_GROUPS, has_poses, known_layout
 from ._table_headerless import name_headerless
 from ._table_mocap import is_mocap
@@ -40,7 +40,22 @@ IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of U
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
 ROLE = "|".join(["imu|inertial|ground|truth|poses?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
-ENDINGS = ".csv", ".txt", ".tsv", ".dat", ".tum", ".json", ".mat", ".npz", ".npy", ".parquet", ".h5", ".hdf5"
+ENDINGS = (
+    ".csv",
+    ".txt",
+    ".tsv",
+    ".dat",
+    ".tum",
+    ".json",
+    ".mat",
+    ".npz",
+    ".npy",
+    ".parquet",
+    ".feather",
+    ".arrow",
+    ".h5",
+    ".hdf5",
+)
 IMU_GROUP, TRUTH_GROUP, POSES_GROUP = "imu", "ground_truth", "poses"
 
 
@@ -130,8 +145,13 @@ def _is_narrow(path: Path) -> bool:
 
 def _is_clock(path: Path) -> bool:
     """Whether a table is named as a time and holds nothing else."""
-    is_named = re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0])
-    return bool(is_named) and _is_narrow(path) and not is_text_table(head(path), 2)
+    if not re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0]):
+        return False
+    if kind_of(head(path), path) != "npy":
+        return _is_narrow(path) and not is_text_table(head(path), 2)
+    with path.open("rb") as file, suppress(ValueError):  # of a damaged header
+        return len(npy_shape(file)) == 1
+    return False
 
 
 def _clocks(folder: Path) -> dict[str, tuple[np.ndarray, str]]:

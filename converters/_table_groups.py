@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from ._table_map import IMU_TOPIC, Entries, Proposal
 from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
-from ._table_rotations import angles_by_motion, order_by_motion
+from ._table_rotations import TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
@@ -23,6 +23,7 @@ ANGLES = (
     ),
     (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
 )
+GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
 HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
 POSITION = r"((t|p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
@@ -31,7 +32,7 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
     (r"p_?(?P<axis>[ned])", "ned"),
 )
-TURNS = {"quaternion_wxyz", "roll_pitch_yaw"}
+MATRIX = r"(mat|matrix|rot|rotation|rotmat|dcm|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
@@ -167,10 +168,20 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
         reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
     if q:
         return {"quaternion_wxyz": q}
+    if (nine := _matrix(leaves)) and (rows := matrix_by_motion(columns, entries, nine, clock)):
+        reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{'' if rows == nine else ', transposed'}")
+        return {"rotation_matrix": rows}
     found = next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in _angles(leaves))), {})
     if found:
         reasons.append(f"{', '.join(found['roll_pitch_yaw'])} turn as the gyro does, as roll, pitch and yaw")
     return found
+
+
+def _matrix(leaves: dict[str, str]) -> list[str]:
+    """Columns of a matrix, row by row, whose indices count from 0 or from 1."""
+    found = {re.sub(r"_(?=[0-3]$)", "", leaf): column for leaf, column in leaves.items()}
+    names = ([f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1))
+    return next(filter(None, (_axes(MATRIX, found, axes) for axes in names)), [])
 
 
 def _position(leaves: dict[str, str]) -> list[str]:
@@ -182,6 +193,7 @@ def _position(leaves: dict[str, str]) -> list[str]:
 def _angles(leaves: dict[str, str]) -> list[list[str]]:
     """Columns of each roll, pitch and yaw."""
     yaws = {re.sub(HEADING, "yaw", leaf): column for leaf, column in leaves.items()}
+    yaws |= {re.sub(rf"(^|.*_){letter}", rf"\1{axis}", leaf): c for leaf, c in leaves.items() for letter, axis in GREEK.items()}
     return [three for pattern, axes in ANGLES for three in _every(pattern, yaws | leaves, axes)]
 
 
@@ -195,7 +207,7 @@ def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[li
     found: dict[str, dict[str, str]] = {}
     for leaf, column in leaves.items():
         if match := re.fullmatch(pattern, leaf):
-            axis = match["axis"] if "0" in axes else match["axis"].translate(DIGITS)
+            axis = match["axis"].translate(DIGITS) if "x" in axes else match["axis"]
             found.setdefault(leaf[: match.start("axis")], {})[axis] = column
     return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
 

@@ -73,16 +73,20 @@ def _halves(columns: Columns, names: list[str]) -> _Halves | None:
     time = names[:1] if names and rises(columns.values[names[0]]) else []
     six = names[len(time) : len(time) + 6]
     shows = [_has_gravity(columns, half) for half in (six[:3], six[3:])] if len(six) == 6 else []
+    if shows and time and not any(shows):  # increments of velocity, which a rate makes accelerations of
+        rate_hz = 1.0 / float(np.nanmedian(np.diff(columns.values[time[0]].astype(float))))
+        shows = [_has_gravity(columns, half, rate_hz) for half in (six[:3], six[3:])]
     return _Halves(time, six, ("accel", "gyro") if shows[0] else ("gyro", "accel")) if sum(shows) == 1 else None
 
 
-def _has_gravity(columns: Columns, triple: list[str]) -> bool:
+def _has_gravity(columns: Columns, triple: list[str], factor: float = 1.0) -> bool:
     """Whether three columns have the size of gravity, and seldom less, as rates of a fast flight about 1 rad/s have.
 
     Zeros beside a one, as of a pose, have not.
     """
-    values = np.stack([columns.values[name].astype(float) for name in triple])
-    level, near = gravity_units(columns, triple)
+    values = factor * np.stack([columns.values[name].astype(float) for name in triple])
+    level, near = gravity_units(columns, triple, factor)
+    near = near if factor == 1.0 else [unit for unit in near if unit == "m/s^2"]
     tenth = float(np.nanquantile(np.linalg.norm(values, axis=0), 0.1))
     return bool(near) and tenth > LEAST_TENTH * level and not np.isin(values, (-1, 0, 1)).all()
 
@@ -116,7 +120,8 @@ def name_headerless(columns: Columns) -> None:
         new = [*["count"] * count, *["time"] * len(halves.time)]
         new += [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
         shown = halves.columns[:3] if halves.sensors[0] == "accel" else halves.columns[3:]
-        why = f"it has no header: {shown[0]} to {shown[2].removeprefix('column ')} show gravity and count as the accel"
+        first, _, last = (name.removeprefix("column ") for name in shown)
+        why = f"it has no header: columns {first} to {last} show gravity and count as the accel"
     else:
         return
     name = dict(zip(numbered, new, strict=True))

@@ -63,6 +63,7 @@ def propose(columns: Columns) -> Proposal:
         _propose_sensor(proposal, sensor, units, names, columns)
     _propose_time(proposal, names, columns)
     doubt_gravity(proposal, columns)
+    _propose_increments(proposal, columns)
     if "gyro" in proposal.entries and "gyro" not in proposal.open:
         _propose_gyro_unit(proposal, columns)
     if not proposal.entries.keys() & {"gyro", "accel"}:
@@ -240,6 +241,21 @@ def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tup
             if abs(passed - span) > MOST_APART * passed + WHOLE_NS:
                 return f"by {other!r} {passed * 1e-9:.4g} s pass and not {span * 1e-9:.4g} s"
     return ""
+
+
+def _propose_increments(proposal: Proposal, columns: Columns) -> None:
+    """Ask whether the columns hold the velocity and the angle of each sample, where a rate makes gravity of the first."""
+    known = {"time", "time_unit", "accel"} <= proposal.entries.keys() and "time_unit" not in proposal.open
+    if not known or "accel_unit" not in proposal.open:
+        return
+    t, unit = columns.values[str(proposal.entries["time"])].astype(float), str(proposal.entries["time_unit"])
+    rate_hz = float(f"{1e9 / (np.nanmedian(np.diff(t)) * TIME_NS[unit]):.5g}")
+    if "m/s^2" in gravity_units(columns, [*proposal.entries["accel"]], rate_hz)[1]:
+        proposal.reasons.append(f"times the {rate_hz:g} samples a second, the accel is gravity: it seems to hold increments")
+        proposal.hints += [
+            f'accel_scale = {rate_hz}  # with accel_unit = "m/s^2", if it holds increments of velocity (m/s)',
+            f'gyro_scale = {rate_hz}  # with gyro_unit = "rad/s", if it holds increments of angle (rad)',
+        ]
 
 
 def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:

@@ -24,12 +24,13 @@ LIKELY, MOST_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns
 ORTHOGONAL = 0.02  # what two printed decimals leave of R R^T = 1
 NOT_UNIT, MOST_NOT_UNIT = 0.01, 0.1  # error of a quaternion's length, and the share of them that may have it
 ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
+TURNS = {"quaternion_wxyz", "rotation_matrix", "roll_pitch_yaw"}  # entries of a map that name rotations
 MOST_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
 SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, which are often rounded to 0.1 degrees
 DELAYS_S = (*(sign * tenth / 10.0 for tenth in range(11) for sign in (1, -1)),)  # of a clock of the angles' own, none first
 
 
-def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path) -> Float64[np.ndarray, "n 4"]:
+def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path | None = None) -> Float64[np.ndarray, "n 4"]:
     """Quaternions (wxyz) of rotation matrices; zeros of one that is missing.
 
     Raises:
@@ -79,11 +80,15 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
     values = _side_by_side(columns, array)
     found = [_turns_alike(columns, entries, values[:, order], clock)[0] for order in ORDERS]
     best = int(np.argmax(found))
-    return (
-        [array[axis] for axis in ORDERS[best]]
-        if found[best] > SURE and 1.0 - found[best] < CLEARLY * (1.0 - min(found))
-        else []
-    )
+    return [array[axis] for axis in ORDERS[best]] if found[best] > SURE and _is_clear(found[best], min(found)) else []
+
+
+def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> list[str]:
+    """Nine columns, row by row, of a matrix or its transpose that turns as the gyro does; empty where not certain."""
+    ways = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
+    found = [_turns_alike(columns, entries, _rotations(columns, {"rotation_matrix": way}), clock)[0] for way in ways]
+    best = int(np.argmax(found))
+    return ways[best] if found[best] > SURE and _is_clear(found[best], min(found)) else []
 
 
 def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock: tuple[str, str]) -> Entries:
@@ -91,36 +96,43 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
 
     A yaw that counts the other way has a minus. Two signs that change together are another body and world, no other turn.
     """
-    for unit in _angle_units(columns, entries, three, clock):
-        ways: dict[str, Entries] = {
-            yaw: {"roll_pitch_yaw": [*three[:2], yaw + three[2]], "roll_pitch_yaw_unit": unit} for yaw in ("", "-")
-        }
-        turns = {yaw: _rotations(columns, way) for yaw, way in ways.items()}
-        size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
-        for span_s, delay_s in product(SPANS_S, DELAYS_S if clock[0] != entries["time"] else (0.0,)):
-            found = {yaw: _turns_alike(columns, entries, q, clock, span_s, delay_s) for yaw, q in turns.items()}
-            best = max(found, key=lambda yaw: found[yaw])
-            if found[best][0] < SURE or (size and not 1.0 / MOST_OFF < found[best][0] * found[best][1] / size < MOST_OFF):
-                continue
-            return ways["-" if 1.0 - found["-"][0] < CLEARLY * (1.0 - found[""][0]) else ""]
+    ways: dict[tuple[str, str], Entries] = {
+        (unit, yaw): {"roll_pitch_yaw": [*three[:2], yaw + three[2]], "roll_pitch_yaw_unit": unit}
+        for unit, yaw in product(_angle_units(columns, three), ("", "-"))
+    }
+    turns = {way: _rotations(columns, named) for way, named in ways.items()}
+    size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
+    for span_s, delay_s in product(SPANS_S, DELAYS_S if clock[0] != entries["time"] else (0.0,)):
+        found = {}
+        for way, q_wxyz in turns.items():
+            correlation, ratio = _turns_alike(columns, entries, q_wxyz, clock, span_s, delay_s)
+            is_alike = not size or 1.0 / MOST_OFF < correlation * ratio / size < MOST_OFF
+            found[way] = correlation if is_alike else 0.0
+        unit, yaw = max(found, key=lambda way: found[way])
+        best, other_unit = found[unit, yaw], max((r for (u, _), r in found.items() if u != unit), default=0.0)
+        if best > SURE and _is_clear(best, other_unit):
+            return ways[unit, "-" if _is_clear(found[unit, "-"], found[unit, ""]) else ""]
     return {}
 
 
-def _angle_units(columns: Columns, entries: Entries, three: list[str], clock: tuple[str, str]) -> list[str]:
-    """Units that angles may have: the stated one, degrees beyond a turn, else either if the gyro's unit can tell."""
+def _is_clear(correlation: float, other: float) -> bool:
+    """Whether a correlation leaves much less than another."""
+    return 1.0 - correlation < CLEARLY * (1.0 - other)
+
+
+def _angle_units(columns: Columns, three: list[str]) -> list[str]:
+    """Units that angles may have: the stated one, degrees beyond a turn, else either."""
     texts = [column.rpartition("/")[2].lower() + columns.units.get(column, "").lower() for column in three]
     stated = {unit for unit, word in (("deg", "deg|°"), ("rad", "rad")) if all(re.search(word, text) for text in texts)}
+    values = _side_by_side(columns, three)
     if len(stated) == 1:
         return [*stated]
-    values = _side_by_side(columns, three)
-    if not np.isfinite(values).any() or np.nanmax(np.abs(values)) > MOST_RAD:
-        return ["deg"]
-    return ["rad", "deg"] if "gyro_unit" in entries else []
+    return ["rad", "deg"] if np.isfinite(values).any() and np.nanmax(np.abs(values)) < MOST_RAD else ["deg"]
 
 
 def unit_by_poses(columns: Columns, entries: Entries) -> str:
     """Unit in which the gyro turns as far as the poses; empty where none does."""
-    if not entries.keys() & {"quaternion_wxyz", "roll_pitch_yaw"}:
+    if not entries.keys() & TURNS:
         return ""
     q_wxyz = _rotations(columns, entries)
     clock = str(entries["truth_time"]), str(entries["truth_time_unit"])
@@ -138,6 +150,10 @@ def _rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]
     if "roll_pitch_yaw" in entries:
         angles = _side_by_side(columns, entries["roll_pitch_yaw"])
         return of_angles(angles * ANGLE_SI[str(entries["roll_pitch_yaw_unit"])])
+    if "rotation_matrix" in entries:
+        matrices = _side_by_side(columns, entries["rotation_matrix"]).reshape(-1, 3, 3)
+        is_rotation = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHOGONAL
+        return of_matrices(np.where(is_rotation[:, None, None] & (np.linalg.det(matrices) > 0.0)[:, None, None], matrices, 0.0))
     return _side_by_side(columns, entries["quaternion_wxyz"])
 
 

@@ -156,7 +156,7 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
     """
     names = [*table.values]
-    has_header = not all(re.fullmatch(r"column \d+", name) for name in names)  # a text in the first one is no number
+    has_header = not all(re.fullmatch(r"column \d+|time", name) for name in names)  # the time may be that of a clock beside it
     if not sensor:
         pose = POSE if len(names) == len(POSE) and _turns(table, names[-4:]) else POSE[:1]
         new = {} if has_header or not rises(table.values[names[0]]) else dict(zip(names, pose, strict=False))

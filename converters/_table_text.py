@@ -9,6 +9,7 @@ import csv
 import re
 from collections import Counter
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,11 @@ LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, i
 LOOKED_AT = 200  # first lines, which show whether text is a table
 COMMENTS = "#", "%", "//"
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
-SECONDS, NANOSECONDS = (
-    re.compile(r"(.*?)(secs?|seconds?)", re.I),
-    ("nsec", "nsecs", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
-)
+SECONDS = re.compile(r"(.*?)(secs?|seconds?|(unix|utc|posix)[ _]?time)", re.IGNORECASE)
+BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and its unit in ns
+    re.compile(r"n(ano)?s(ec(ond)?s?)?", re.IGNORECASE): 1,
+    re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
+}
 STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
@@ -86,17 +88,22 @@ class Columns:
         self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
 
     def join_stamps(self) -> None:
-        """Make one column of a stamp that has its seconds and its nanoseconds in two, as ROS' header.stamp has."""
+        """Make one column of a stamp that has its seconds and the rest of a second in two, as ROS' header.stamp has."""
         for seconds in [column for column in self.values if SECONDS.fullmatch(column)]:
             stem = SECONDS.fullmatch(seconds)[1]  # type: ignore[index]  # it matched
-            nanoseconds = next((c for c in self.values if c.startswith(stem) and c[len(stem) :].lower() in NANOSECONDS), "")
-            name, pair = f"{stem.rstrip('._/ ') or 'stamp'} [ns]", [self.values.get(c) for c in (seconds, nanoseconds)]
+            ends = product((c for c in self.values if c.startswith(stem)), BELOW_SECONDS.items())
+            rest, size = next(((c, size) for c, (name, size) in ends if name.fullmatch(c[len(stem) :])), ("", 1))
+            name, pair = f"{stem.rstrip('._/ ') or 'stamp'} [ns]", [self.values.get(c) for c in (seconds, rest)]
             if name in self.values or not all(part is not None and part.dtype.kind in "iu" for part in pair):
                 continue
-            sec, nsec = (np.asarray(part).astype(np.int64) for part in pair)
-            if len(sec) == len(nsec) and 0 <= sec.min() <= sec.max() < LAST_S and 0 <= nsec.min() <= nsec.max() < 10**9:
-                del self.values[seconds], self.values[nanoseconds]
-                self.values[name], self.units[name] = sec * 10**9 + nsec, "ns"
+            sec, below = (np.asarray(part).astype(np.int64) for part in pair)
+            if (
+                len(sec) == len(below)
+                and 0 <= sec.min() <= sec.max() < LAST_S
+                and 0 <= below.min() <= below.max() < 10**9 // size
+            ):
+                del self.values[seconds], self.values[rest]
+                self.values[name], self.units[name] = sec * 10**9 + below * size, "ns"
 
 
 def text_of(raw: bytes) -> str:

@@ -57,9 +57,9 @@ COUNTS_A_G = {2: 16384, 4: 8192, 8: 4096, 16: 2048}  # by the range in g, of 16 
 RAW_BAND = 0.1  # share by which the median length of counts may differ from gravity's
 
 
-def gravity_units(columns: Columns, chosen: Sequence[str]) -> tuple[float, list[str]]:
-    """Median length of the vectors, and the units in which it is gravity; none for motion alone."""
-    level = _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
+def gravity_units(columns: Columns, chosen: Sequence[str], factor: float = 1.0) -> tuple[float, list[str]]:
+    """Median length of the vectors times a factor, and the units in which it is gravity; none for motion alone."""
+    level = factor * _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
     return level, [] if is_motion_alone(columns, chosen) else [
         u for u, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND
     ]

@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 import pytest
 import scipy.io
+from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
 from imutool.converters import table
@@ -206,3 +208,71 @@ def test_a_folder_of_tables_that_are_no_text_has_a_recording_for_each(tmp_path, 
     assert [sequence.name for sequence in sequences] == ["walk_1", "walk_2"]
     for sequence in sequences:
         np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].gyro, GYRO)
+
+
+def test_a_matrix_that_a_sensor_gives_beside_its_rates_shows_their_unit(tmp_path):
+    """As MT Manager of Xsens writes it, column by column; also transposed."""
+    names = [f"Mat[{row}][{column}]" for column in (1, 2, 3) for row in (1, 2, 3)]
+    header = (
+        "// Sample rate: 100.0Hz\nPacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z," + ",".join(names) + "\n"
+    )
+    columns_first = TURN.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
+    for matrices in (columns_first, TURN.as_matrix().reshape(-1, 9)):
+        (tmp_path / "MT.txt").write_text(header + rows(np.arange(COUNT), 100 * np.arange(COUNT), ACCEL, GYRO, matrices))
+        imu = read(tmp_path / "MT.txt").imus["/imu0"]
+        np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-5)
+        np.testing.assert_allclose(imu.t_ns, 1e9 * T_S, atol=1.0)
+
+
+def test_angles_that_never_exceed_a_turn_are_in_the_unit_in_which_they_turn_as_the_gyro(tmp_path):
+    header = "t,gx,gy,gz,ax,ay,az\n"
+    (tmp_path / "imu.csv").write_text(header + rows(T_S, GYRO, ACCEL))
+    (tmp_path / "vicon.csv").write_text("time,x,y,z,phi,theta,psi\n" + rows(T_S[::10], P_M[::10], RPY[::10]))
+    log = read(tmp_path)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-6)
+    seen = Rotation.from_quat(log.poses["/ground_truth/pose"].q_wb_wxyz[:, [1, 2, 3, 0]])
+    assert (TURN[::10].inv() * seen).magnitude().max() < 1e-5
+
+
+def test_increments_of_velocity_and_angle_are_asked_about_with_their_rate(tmp_path):
+    (tmp_path / "imr.txt").write_text(rows(300.0 + T_S, 0.01 * GYRO, 0.01 * ACCEL).replace(",", " "))
+    with pytest.raises(ConfigError, match="times the 100 samples a second, the accel is gravity") as refused:
+        read(tmp_path / "imr.txt")
+    lines = (refused.value.fix or "").partition("\n\n")[2].splitlines()
+    stated = {
+        line.partition(" = ")[0].strip("# "): line.strip("# ") for line in lines if " = " in line and "poses:" not in line
+    }
+    stated |= {"gyro_unit": 'gyro_unit = "rad/s"', "accel_unit": 'accel_unit = "m/s^2"'}
+    mapping = tmp_path / "map.toml"
+    mapping.write_text("\n".join(stated[name] for name in stated if not name.startswith("raw")))
+    (sequence,) = table.sequences(tmp_path / "imr.txt")
+    imu = table.read_sequence(sequence, mapping=mapping).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-5)
+    np.testing.assert_allclose(imu.accel, ACCEL, atol=1e-4)
+
+
+@pytest.mark.parametrize("form", ["feather", "microseconds beside seconds", "arrays beside a clock", "a date with dots"])
+def test_further_forms_of_tables(tmp_path, form):
+    accel = TURN.inv().apply([0.0, 0.0, 9.80665])
+    t_ns = 1_600_000_000 * 10**9 + (1e9 * T_S).astype(np.int64)
+    axes = [*(f"Accelerometer {a} (m/s/s)" for a in "XYZ"), *(f"Gyroscope {a} (rad/s)" for a in "XYZ")]
+    values = np.hstack([accel, GYRO])
+    if form == "feather":
+        columns = {"timestamp": t_ns, **dict(zip(axes, values.T, strict=True)), "note": ["a"] * COUNT}
+        feather.write_feather(pyarrow.table(columns), str(tmp_path / "walk.feather"))
+    elif form == "microseconds beside seconds":
+        stamps = np.column_stack([t_ns // 10**9, t_ns % 10**9 // 1000]).astype(object)
+        lines = rows(values).splitlines()
+        text = "".join(f"{s},{us},{line}\n" for (s, us), line in zip(stamps, lines, strict=True))
+        (tmp_path / "RawSensors.csv").write_text(",".join(["Unix Time", "Microseconds", *axes]) + "\n" + text)
+    elif form == "arrays beside a clock":
+        for name, array in (("acc", accel), ("gyro", GYRO), ("imu_time", 1.6e9 + T_S)):
+            np.save(tmp_path / f"{name}.npy", array)
+    else:
+        dates = np.datetime_as_string(t_ns.astype("datetime64[ns]"), unit="ms")
+        text = "".join(f"{d.replace(':', '.')},{line}\n" for d, line in zip(dates, rows(values).splitlines(), strict=True))
+        (tmp_path / "meta.csv").write_text(",".join(["time", *axes]) + "\n" + text)
+    imu = read(tmp_path).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-5)
+    np.testing.assert_allclose(imu.accel, accel, atol=1e-4)
+    np.testing.assert_allclose(imu.t_ns, t_ns, atol=500)
