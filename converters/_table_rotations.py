@@ -84,7 +84,7 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
 
 
 def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> list[str]:
-    """Nine columns, row by row, of a matrix or its transpose that turns as the gyro does; empty where not certain."""
+    """Nine columns of a matrix or its transpose that turns as the gyro does; else none."""
     ways = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
     found = [_turns_alike(columns, entries, _rotations(columns, {"rotation_matrix": way}), clock)[0] for way in ways]
     best = int(np.argmax(found))

@@ -58,7 +58,7 @@ RAW_BAND = 0.1  # share by which the median length of counts may differ from gra
 
 
 def gravity_units(columns: Columns, chosen: Sequence[str], factor: float = 1.0) -> tuple[float, list[str]]:
-    """Median length of the vectors times a factor, and the units in which it is gravity; none for motion alone."""
+    """Median length times a factor, and units in which it is gravity; none for motion alone."""
     level = factor * _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
     return level, [] if is_motion_alone(columns, chosen) else [
         u for u, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND
