@@ -1,4 +1,4 @@
-"""Correct a converted log: units, axes and stamps of IMUs, world, unit and clock of poses.
+"""Corrections of a log: units, axes and stamps of IMUs, frames and clock of poses.
 
 Messages are patched where they stand, so everything else of them stays: covariances turn with their vectors, and the poses in
 the judged poses' frame turn with it. The record `imutool_corrections` says what was changed.
@@ -7,38 +7,30 @@ the judged poses' frame turn with it. The record `imutool_corrections` says what
 from __future__ import annotations
 
 import heapq
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import tee
-from pathlib import Path
 
 import numpy as np
 
-from imutool import registry
 from imutool.array_types import Float64, Int64
-from imutool.cleaning import CleaningSettings, Survey, look
-from imutool.cleaning.conventions import MISREAD, axis_names
+from imutool.cleaning.conventions import MISREAD
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.conversion.message_patch import WXYZ_FROM_XYZW, XYZW_FROM_WXYZ, MessagePatch, corrected_imu
-from imutool.conversion.message_writer import write_log
-from imutool.conversion.restamping import SAME_CLOCK_NS, find_stamps
+from imutool.conversion.restamping import SAME_CLOCK_NS
 from imutool.errors import ConfigError
 from imutool.geometry import quaternion
-from imutool.log_info.inspection import sound_samples
-from imutool.log_info.pose_imu_rotation import Body, frames_of_copies, turned_body
+from imutool.log_info.pose_imu_rotation import Body
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
-from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, VELOCITY_KEY
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
 NOT_TURNED = Body(np.eye(3), frozenset())
-MOST_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
 
 
 @dataclass(frozen=True)
@@ -191,107 +183,3 @@ def parse_corrections(names: Sequence[str]) -> tuple[str, ...]:
         if name not in (CONVENTIONS, STAMPS):
             raise ConfigError(f"{name!r}", where="correct", expected=f"{CONVENTIONS} or {STAMPS}")
     return tuple(names)
-
-
-def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
-    """Corrections that a log shows to be needed.
-
-    Raises:
-        LogError: damage.
-    """
-    imus: dict[str, Float64[np.ndarray, "2 3 3"]] = {}
-    notes: dict[str, list[str]] = defaultdict(list)
-    world, frame_id, late_ns, body, pose_topic, unit, quaternions = np.eye(3), "", 0, NOT_TURNED, "", "m", ""
-    copies, kept = frozenset[str](), list[str]()
-    with Log(path) as log:
-        stamps = find_stamps(log, notes) if STAMPS in wanted else {}
-        for topic in log.imu_topics if CONVENTIONS in wanted else []:
-            described = log.topics[topic]
-            if not described.is_read:
-                continue
-            survey = look(log, topic, CleaningSettings(fix=True))
-            patched = described.reflected is None or isinstance(described.reflected, Reflected)
-            if not patched or described.message_encoding not in ENCODINGS:
-                if (survey.matrices != np.eye(3)).any():
-                    own = described.own_schema or described.schema_name
-                    kept.append(f"{topic} keeps its units and axes: only messages in CDR or ROS 1 are corrected, not {own}")
-                continue
-            if (survey.matrices != np.eye(3)).any():
-                imus[topic] = survey.matrices
-                others = "; other fields of its messages stay" if isinstance(described.reflected, Reflected) else ""
-                notes[topic].append(_imu_note(survey) + others)
-            if frame_id or not survey.pose_topic:
-                continue
-            comes_later = topic in imus or survey.pose_delay_ns or survey.quaternions  # all of it hides a body's rotation
-            turned = None if comes_later else turned_body(log, sound_samples(log, topic), survey.pose_topic)
-            if changes := _pose_notes(survey, turned):
-                world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
-                unit, quaternions, copies = survey.position_unit, survey.quaternions, frames_of_copies(log, pose_topic)
-                frame_id = next(log.pose_batches(pose_topic)).frame_id
-                notes[pose_topic] += changes
-        own_types = {t: found for t in (*stamps, *imus) if isinstance(found := log.topics[t].reflected, Reflected)}
-    said = {topic: "; ".join(lines) for topic, lines in notes.items()}
-    poses = world, frame_id, late_ns, body, pose_topic, unit, quaternions, copies
-    return Corrections(imus, *poses, stamps, own_types, said, kept)
-
-
-def _imu_note(survey: Survey) -> str:
-    gyro, accel = (axis_names(P) for P in survey.axes)
-    scale = f"gyro times {survey.scale[0]:.9g}, accel times {survey.scale[3]:.9g}"
-    return f"{scale}; x, y, z are now {gyro} of gyro and {accel} of accel as recorded"
-
-
-def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
-    parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
-    if survey.quaternions:
-        parts.append(f"quaternions now take vectors of the body to the world (as recorded, they {survey.quaternions})")
-    if survey.position_unit != "m":
-        parts.append(f"positions are now in m, and were in {survey.position_unit}")
-    if survey.pose_delay_ns:
-        side = "earlier" if survey.pose_delay_ns > 0 else "later"
-        parts.append(f"stamps are {abs(survey.pose_delay_ns) * 1e-9:.6f} s {side} now")
-    if turned is not None:
-        deg = ", ".join(f"{angle:.4f}" for angle in np.degrees(quaternion.log(quaternion.of_matrix(turned.turn))[0]))
-        parts.append(f"the body is now that of the IMU, turned by ({deg})° from that recorded")
-    return parts
-
-
-def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
-    """Write a log with corrections of what its motion shows to be wrong; return notes on them.
-
-    After each round a log without images, in a new folder next to `log`, shows what the next has to correct.
-
-    Raises:
-        ImutoolError: damage, or the target cannot be written.
-    """
-    refuse_existing(target, overwrite=overwrite)
-    judged, rounds, kept = log, list[Corrections](), list[str]()
-    most = MOST_ROUNDS if CONVENTIONS in wanted else 1
-    for number in range(most):
-        found = find_corrections(judged, [CONVENTIONS] if number else wanted)
-        kept = list(found.kept)
-        if not found:
-            break
-        rounds.append(found)
-        if number + 1 == most:
-            break
-        small = log.parent / f"round_{number}" / log.name
-        small.parent.mkdir()
-        write_log(found.put_on(_content(judged, images=False)), small, compression="none")
-        judged = small
-    if not rounds:
-        log.replace(target)
-        return (*kept,) or ("the motion shows nothing to correct",)
-    content = _content(log)
-    for found in rounds:
-        content = found.put_on(content)
-    write_log(content, target, compression=compression, overwrite=overwrite)
-    return (*content.remarks.notes, *kept)
-
-
-def _content(log: Path, *, images: bool = True) -> MessageLog:
-    """Content of a log with its records."""
-    module = registry.load("imutool.converters", "mcap_log")
-    content: MessageLog = module.read_sequence(next(iter(module.sequences(log))), images=images)
-    with Log(log) as opened:
-        return replace(content, metadata=opened.metadata())

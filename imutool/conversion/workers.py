@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
-from imutool.conversion.corrections import write_corrected
+from imutool.conversion.correction_rounds import write_corrected
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError

@@ -134,21 +134,35 @@ class Body(NamedTuple):
 
 
 def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
-    """Body of poses that is turned by more than `TURNED_DEG`.
-
-    A frame of a transform that has the same orientations is the same body.
-    """
+    """Body of poses that is turned by more than `TURNED_DEG`."""
     poses = read_truth(log, topics=[topic])
     found = None if poses is None else agreement(poses, imu)
     if poses is None or found is None or found.turned is None or not body_warnings(topic, found.turned.deg.tolist()):
         return None
+    return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.turned.deg)[None]))[0])
+
+
+def is_straight(log: Log, imu: Imu, topic: str) -> bool:
+    """Whether an IMU shows that it lies as the body of poses does."""
+    poses = read_truth(log, topics=[topic])
+    found = None if poses is None else agreement(poses, imu)
+    return found is not None and found.turned is not None and not body_warnings(topic, found.turned.deg.tolist())
+
+
+def body_of(log: Log, topic: str, turn: Float64[np.ndarray, "3 3"]) -> Body:
+    """Body of poses that is turned so, with its frames in transforms.
+
+    A frame whose transforms have the same orientations is the same body.
+    """
+    poses = read_truth(log, topics=[topic])
+    assert poses is not None, "what judged its body has read it"
     alike, other = set[str](), set[str]()
     for named in log.with_schema((schemas.TF,)):
         for batch in log.pose_batches(named.name):
             _, mine, theirs = np.intersect1d(poses.t_ns, batch.stamp_ns, return_indices=True)
             same = np.abs((poses.q_wb_wxyz[mine] * batch.q_wb_wxyz[theirs]).sum(axis=1)) > 1.0 - SAME_TURN
             (alike if len(same) and same.all() else other).add(batch.child_frame_id)
-    return Body(quaternion.matrix(quaternion.exp(np.radians(found.turned.deg)[None]))[0], frozenset(alike - other))
+    return Body(turn, frozenset(alike - other))
 
 
 def _turned(
