@@ -334,3 +334,27 @@ def test_poses_that_belong_before_the_zero_of_the_clock_are_left_out_and_counted
     assert fixed.t_ns[0] >= 0
     assert len(made.truth) - 2 <= len(fixed) <= len(made.truth)
     assert any("belong before the zero of the log's clock, and are left out" in note for note in report.notes)
+
+
+def test_the_poses_follow_the_first_imu_and_another_mount_is_turned_to_it(made: Recording, tmp_path: Path) -> None:
+    """Two IMUs and a body of the poses, each with axes of its own."""
+    source, Q = tmp_path / "flight", np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    source.mkdir()
+    header = "t [ns],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
+    turn = Rotation.from_quat(made.truth.q_wb_wxyz.copy(), scalar_first=True) * Rotation.from_matrix(P)
+    poses = np.column_stack([made.truth.t_ns * 1e-9, made.truth.p_wb, turn.as_quat(scalar_first=True)])
+    for name, axes in (("imu_1", np.eye(3)), ("imu_2", Q)):
+        samples = np.hstack([made.imu.gyro @ axes.T, made.imu.accel @ axes.T])
+        lines = (f"{t}," + ",".join(map(repr, row)) for t, row in zip(made.imu.t_ns.tolist(), samples.tolist(), strict=True))
+        (source / f"{name}.csv").write_text(header + "\n".join(lines) + "\n")
+    text = "\n".join(",".join(map(repr, row)) for row in poses.tolist())
+    (source / "gt.csv").write_text("t [s],x,y,z,qw,qx,qy,qz\n" + text + "\n")
+    convert(source, tmp_path / "two.mcap")
+    convert(tmp_path / "two.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    for topic in ("/imu_1/imu", "/imu_2/imu"):
+        fixed = read(tmp_path / "right.mcap", imu=topic)
+        np.testing.assert_allclose(fixed.imu.gyro, made.imu.gyro, atol=1e-12)
+        np.testing.assert_allclose(fixed.imu.accel, made.imu.accel, atol=1e-12)
+    left = Rotation.from_quat(fixed.truth.q_wb_wxyz.copy(), scalar_first=True) * (turn * Rotation.from_matrix(P.T)).inv()
+    assert left.magnitude().max() < 1e-6
+    assert inspect(tmp_path / "right.mcap").warnings == []
