@@ -28,10 +28,11 @@ HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
 POSITION = r"((t|p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
-    (r"(p(os(ition)?)?_?)?(?P<axis>north|east|down)", ("north", "east", "down")),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
+    (r"(p(os(ition)?)?_?)?(?P<axis>north|east|down)", ("north", "east", "down")),
     (r"p_?(?P<axis>[ned])", "ned"),
 )
+NED = POSITIONS[2:]
 MATRIX = r"(mat|matrix|rot|rotation|rotmat|dcm|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
@@ -139,6 +140,9 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
         if position:
             stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
             found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
+        if named := _position({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
+            found["pose_world"] = "ned"
+            reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")
     return found
 
 
@@ -184,9 +188,9 @@ def _matrix(leaves: dict[str, str]) -> list[str]:
     return next(filter(None, (_axes(MATRIX, found, axes) for axes in names)), [])
 
 
-def _position(leaves: dict[str, str]) -> list[str]:
-    """Columns x, y, z of a position, or north, east, down, or east, north, up."""
-    found = (_axes(pattern, leaves, axes) for pattern, axes in POSITIONS)
+def _position(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
+    """Columns x, y, z of a position, or east, north, up, or north, east, down."""
+    found = (_axes(pattern, leaves, axes) for pattern, axes in forms)
     return next(filter(None, found), [])
 
 

@@ -120,8 +120,8 @@ def name_headerless(columns: Columns) -> None:
         new = [*["count"] * count, *["time"] * len(halves.time)]
         new += [f"{sensor}_{axis}" for sensor in halves.sensors for axis in "xyz"]
         shown = halves.columns[:3] if halves.sensors[0] == "accel" else halves.columns[3:]
-        first, _, last = (name.removeprefix("column ") for name in shown)
-        why = f"it has no header: columns {first} to {last} show gravity and count as the accel"
+        begin, _, end = (name.removeprefix("column ") for name in shown)
+        why = f"it has no header: columns {begin} to {end} show gravity and count as the accel"
     else:
         return
     name = dict(zip(numbered, new, strict=True))

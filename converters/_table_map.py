@@ -23,6 +23,7 @@ from ._table_units import TIME_NS, UNITS_OF
 
 IMU_TOPIC = "/imu0"
 LARGEST_NS = 2**63 - 1
+WORLDS = "", "ned"
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
 Entries = dict[str, str | list[str]]  # of a map
@@ -58,6 +59,7 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     roll_pitch_yaw: list[str] = []  # body to world is Rz(yaw) Ry(pitch) Rx(roll)
     roll_pitch_yaw_unit: str = "deg"
     pose_kind: str = "truth"
+    pose_world: str = ""  # "ned": poses in north, east, down, which become east, north, up
 
 
 def read_map(path: Path) -> TableMap:
@@ -83,6 +85,8 @@ def read_map(path: Path) -> TableMap:
             raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
     if table.pose_kind not in KINDS:
         raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
+    if table.pose_world not in WORLDS:
+        raise ConfigError(f"pose_world is {table.pose_world!r}", where=path, expected='"ned", or none')
     if isinstance(table.rotation_matrix, list) and len(table.rotation_matrix) != 9:
         raise ConfigError(
             f"rotation_matrix names {len(table.rotation_matrix)} columns", where=path, expected="nine, row by row"

@@ -12,8 +12,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from imutool.array_types import Int64
+from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError
+from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
@@ -36,6 +37,7 @@ GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 MOST_LOSSES = 8  # in a refusal
 POSES_TOPIC = "/ground_truth/pose"
+NED_TO_ENU = np.array([[0.0, 0.5**0.5, 0.5**0.5, 0.0]])  # half a turn about north-east
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
@@ -203,22 +205,14 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
             raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
         columns = load(other, kind_of(head(other), other))
     t_ns = times_named(columns, table.truth_time or table.time, table.truth_time_unit or table.time_unit, where)
-    if table.quaternion_wxyz:
-        q_wxyz = vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
-    elif table.roll_pitch_yaw:
-        q_wxyz = of_angles(vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where))
-    elif isinstance(table.rotation_matrix, list):
-        q_wxyz = of_matrices(vectors_named(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3), where)
-    elif table.rotation_matrix in columns.matrices:
-        q_wxyz = of_matrices(columns.matrices[table.rotation_matrix], where)
-    else:
-        expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices, or nine columns"
-        raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
+    q_wxyz = _rotations(columns, table, where)
     p = np.zeros((len(q_wxyz), 3))
     if table.position:
         p = vectors_named(columns, table.position, POSITION_SI[table.position_unit], 0.0, where)
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
+    if table.pose_world == "ned":
+        p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(NED_TO_ENU, q_wxyz)
     known, notes = known_rotations(q_wxyz, POSES_TOPIC)
     kept = in_order(t_ns[known], np.concatenate([p, q_wxyz], axis=1)[known], POSES_TOPIC)
     remarks.notes.extend(notes + kept.notes)
@@ -228,6 +222,20 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
     topic = POSES_TOPIC if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
+
+
+def _rotations(columns: Columns, table: TableMap, where: Path) -> Float64[np.ndarray, "n 4"]:
+    """Quaternions (wxyz) of the columns that the map names for the poses."""
+    if table.quaternion_wxyz:
+        return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
+    if table.roll_pitch_yaw:
+        return of_angles(vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where))
+    if isinstance(table.rotation_matrix, list):
+        return of_matrices(vectors_named(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3), where)
+    if table.rotation_matrix in columns.matrices:
+        return of_matrices(columns.matrices[table.rotation_matrix], where)
+    expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices, or nine columns"
+    raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
 
 
 def _further(
