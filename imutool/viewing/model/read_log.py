@@ -67,7 +67,8 @@ def read_log(path: Location, *, imu: str | None = None, truth: str | None = None
 
     Raises:
         ConfigError: the file cannot be opened.
-        LogError: nothing can be recovered, no IMU or several without `imu`, fewer than two samples, no such topic.
+        LogError: nothing can be recovered, no IMU, several without `imu` (unless one of them was debiased), fewer than two
+            samples, no such topic.
     """
     notes: list[str] = []
     opened: Callable[[Location], Log] = Log
@@ -109,7 +110,9 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
         notes.append(f"The true poses on {name} are left out: {error.what}.")
 
     with opened as log:
-        topic = log.only_imu() if imu is None else log.topic(imu, (schemas.IMU,)).name
+        debiased = {t.metadata.get(DERIVED_KEY, "") for t in log.with_schema((schemas.IMU,))} & {*log.imu_topics}
+        shown = debiased.pop() if imu is None and len(debiased) == 1 else imu  # of several IMUs the one that was debiased
+        topic = log.only_imu() if shown is None else log.topic(shown, (schemas.IMU,)).name
         derived = [channel.name for channel in log.with_schema((schemas.IMU,)) if channel.metadata.get(DERIVED_KEY) == topic]
         biases = [channel.name for channel in log.with_schema((schemas.TWIST,)) if channel.metadata.get(DERIVED_KEY) == topic]
         batches, biases_by_topic = _messages(log, [topic, *derived], biases)

@@ -14,6 +14,7 @@ from support.imu_defects import batch_of, late, pick, repeated, with_values, wri
 
 from imutool.bias_start.correction import apply, apply_with_std
 from imutool.cleaning.survey import raw_batches
+from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError
 from imutool.evaluation import evaluate, started
@@ -331,3 +332,23 @@ def test_of_stamps_that_were_never_set_the_refusal_says_what_to_do(made: Recordi
     write_log(batch._replace(stamp_ns=np.zeros_like(batch.stamp_ns)), tmp_path / "unset.mcap")
     with pytest.raises(LogError, match="--restamp takes the log times"):
         load(tmp_path / "unset.mcap")
+
+
+def test_of_several_imus_the_one_that_was_debiased_is_shown(made: Recording, tmp_path: Path) -> None:
+    header = "t [ns],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
+    lines = [
+        f"{t}," + ",".join(map(repr, row))
+        for t, row in zip(made.imu.t_ns.tolist(), np.hstack([made.imu.gyro, made.imu.accel]).tolist(), strict=True)
+    ]
+    source = tmp_path / "flight"
+    source.mkdir()
+    for name in ("imu_1", "imu_2"):
+        (source / f"{name}.csv").write_text(header + "\n".join(lines) + "\n")
+    poses = np.column_stack([made.truth.t_ns * 1e-9, made.truth.p_wb, made.truth.q_wb_wxyz])
+    text = "\n".join(",".join(map(repr, row)) for row in poses.tolist())
+    (source / "gt.csv").write_text(f"t [s],x,y,z,qw,qx,qy,qz\n{text}\n")
+    (two,) = convert(source, tmp_path / "two.mcap").written
+    with pytest.raises(LogError, match="the log has 2 IMU topics"):
+        load(two)
+    debias(two, tmp_path / "debiased.mcap", model="static", imus=["/imu_2/imu"])
+    assert load(tmp_path / "debiased.mcap").recording.imu_topic == "/imu_2/imu"
