@@ -119,6 +119,19 @@ def check_start_poses(recording: Recording) -> None:
             )
 
 
+def check_poses(recording: Recording) -> None:
+    """Refuse poses whose quaternions, unit or axis that is up the IMU contradicts.
+
+    Raises:
+        DataError: such poses; their body and their clock may differ from the IMU's.
+    """
+    whole = convention_summary(recording.imu, truth_of(recording))
+    for finding in Axes().findings(whole):
+        if "poses" in finding.values:
+            expected = "quaternions as w, x, y, z from body to world, z up, and metres"
+            raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
+
+
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
     """Warn of units, axes, frames, and dead or clipped axes of uncorrected samples."""
     whole = convention_summary(imu, truth)
@@ -146,6 +159,7 @@ def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
     return [warn_of_conventions(r.imu, truth_of(r), f"{r.name} {r.imu_topic}") for r in recordings]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of one sample of 1e160, as a broken driver writes it
 def check_conventions(recordings: Iterable[Recording]) -> None:
     """Refuse recordings whose units, axes or frames are wrong; log other warnings.
 

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imutool.api.logs import export
+from imutool.blind_cases import conceal
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
@@ -21,6 +23,7 @@ from imutool.log_info.inspection import inspect
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
+from imutool.sensor.simulate import simulate
 from imutool.training.run import train
 
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -132,6 +135,31 @@ def test_no_model_learns_wrong_units_axes_or_frames(told: str, made: Recording, 
     with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
         train([log], model, method="linear")
     assert not model.exists()
+
+
+@pytest.mark.parametrize("told", CHANGES)
+def test_no_folder_states_units_axes_or_frames_that_its_numbers_have_not(told: str, made: Recording, tmp_path: Path) -> None:
+    """The header of a EuRoC table says rad/s and m/s²: readings in g passed for these."""
+    log, out = tmp_path / "log.mcap", tmp_path / "euroc"
+    write(CHANGES[told](made), log)
+    with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
+        export(log, out, format="euroc")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("told", CHANGES)
+def test_nothing_is_simulated_along_poses_of_another_world_or_unit(told: str, made: Recording, tmp_path: Path) -> None:
+    """Of the log's own samples nothing is taken, so that their units and axes count for nothing."""
+    log, out = tmp_path / "log.mcap", tmp_path / "sim.mcap"
+    write(CHANGES[told](made), log)
+    if not told.startswith(("-z up", "are in mm")):
+        simulate(log, out)
+        return
+    for use in (lambda: simulate(log, out), lambda: conceal(log, tmp_path / "case", seed=1)):
+        with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
+            use()
+    assert not out.exists()
+    assert not (tmp_path / "case").exists()
 
 
 @pytest.mark.parametrize(("p_wb", "scored"), [(in_ned, False), (in_mm, False), (lambda made: made, True)])

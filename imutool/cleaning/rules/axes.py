@@ -38,7 +38,8 @@ class Axes(Rule):
         if found.quaternions:  # any other finding would be of poses that the log does not hold
             whole.quaternions = found.quaternions
             what = f"the quaternions of the poses {found.topic} {found.quaternions}"
-            yield Finding("axes", "warning", what, 1, values={"fix": "quaternions w, x, y, z"}, confidence=0.95)
+            values = {"poses": found.topic, "fix": "quaternions w, x, y, z"}
+            yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
             return
         fixed = whole.settings.fix
         for finding, gyro, accel in _sensors(found):
@@ -55,13 +56,13 @@ class Axes(Rule):
             whole.world = TO_Z_UP[found.up]
             name = " (as in NED)" if found.up == "-z" else ""
             what = f"the world of the poses {found.topic} has {found.up} up{name}, not +z"
-            yield Finding(
-                "axes", "warning", what, 1, values={"fix": f"turn the world: z up instead of {found.up}"}, confidence=0.95
-            )
+            values = {"poses": found.topic, "fix": f"turn the world: z up instead of {found.up}"}
+            yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
         if found.unit != "m":
             whole.position_unit = found.unit
             what = f"the positions of the poses {found.topic} are in {found.unit} and not in m, by the accelerometer"
-            yield Finding("axes", "warning", what, 1, values={"fix": f"{found.unit} to m"}, confidence=0.95)
+            values = {"poses": found.topic, "fix": f"{found.unit} to m"}
+            yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
         if found.delay is not None and abs(found.delay.seconds) > max(LATE_S, LATE_STDS * found.delay.std_s):
             whole.pose_delay_ns = round(found.delay.seconds * 1e9)
             side = "late" if found.delay.seconds > 0 else "early"
