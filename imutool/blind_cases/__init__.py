@@ -27,7 +27,6 @@ from imutool.blind_cases.motion import smoother
 from imutool.blind_cases.scene import SIM_SHARE, Scene, place_scene, stamps_ns
 from imutool.blind_cases.score import SCHEMA, Score, score
 from imutool.errors import ConfigError, DataError
-from imutool.log_info.convention_report import check_poses
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.mcap_io.storage.target import Target
@@ -85,7 +84,6 @@ def conceal(
         if (folder / name).exists():
             raise ConfigError("the folder holds a case already", where=folder / name, fix="Choose another folder")
     recording = read(trajectory, truth=truth)
-    check_poses(recording)
     chosen = secrets.randbits(64) if seed is None else seed
     planned = plan(recording, chosen, kind, size, noise, effects, longest_s)
     _write(folder, planned, pose_noise, chosen, recording.name)

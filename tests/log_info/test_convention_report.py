@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -14,7 +15,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.api.logs import export
-from imutool.blind_cases import conceal
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
@@ -155,10 +155,18 @@ def test_nothing_is_simulated_along_poses_of_another_world_or_unit(told: str, ma
     if not told.startswith(("-z up", "are in mm")):
         simulate(log, out)
         return
-    for use in (lambda: simulate(log, out), lambda: conceal(log, tmp_path / "case", seed=1)):
-        with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
-            use()
+    with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
+        simulate(log, out)
     assert not out.exists()
+
+
+def test_no_case_is_concealed_along_such_poses(
+    imutool: Callable[..., subprocess.CompletedProcess[str]], made: Recording, tmp_path: Path
+) -> None:
+    write(in_mm(made), tmp_path / "log.mcap")
+    done = imutool("conceal", "log.mcap", "case", cwd=tmp_path)
+    assert done.returncode == 4
+    assert "are in mm and not in m" in done.stderr
     assert not (tmp_path / "case").exists()
 
 
