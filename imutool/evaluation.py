@@ -24,8 +24,9 @@ from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
-from imutool.inertial.aids import Aids, find_aids, parse_aids
+from imutool.inertial.aids import Aids, parse_aids
 from imutool.inertial.strapdown import StartPose, along_truth, drift, gaps_crossed
+from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import writing

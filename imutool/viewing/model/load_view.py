@@ -18,7 +18,7 @@ from imutool.bias.model import GAP_S
 from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
 from imutool.file_location import Location
-from imutool.inertial.aids import Aids, find_aids, listed, parse_aids
+from imutool.inertial.aids import Aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
@@ -68,6 +68,8 @@ def load(
     aids = None
     if asked is not None:
         with contents.opened(log) as opened:
+            from imutool.log_info.aid_search import find_aids
+
             aids = find_aids(opened, recording, asked)
     events, notes = survey_events(contents.survey)
     with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids, notes)
