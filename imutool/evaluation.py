@@ -94,7 +94,7 @@ def _evaluated(
 ) -> list[dict[str, Any]]:
     """Results of one stretch of a log."""
     (whole,) = warn_of_recordings([recording])
-    if (whole.world != np.eye(3)).any() or whole.position_unit != "m":
+    if (whole.world != np.eye(3)).any() or whole.position_unit != "m" or whole.quaternions:
         logger.warning("%s: until then its positions and velocities are not scored", recording.name)
         orientations = replace(recording.truth, p_wb=np.zeros_like(recording.truth.p_wb), v_w=None)
         recording = replace(recording, truths={next(iter(recording.truths)): orientations})

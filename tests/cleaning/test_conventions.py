@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.imu_defects import batch_of
 
-from imutool.cleaning.conventions import MISREAD, Conventions, judge, signed_permutations
+from imutool.cleaning.conventions import Conventions, judge, signed_permutations
+from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, read_right
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.cleaning.rule import CleaningSettings
 from imutool.cleaning.rules.axes import TO_Z_UP
@@ -116,6 +117,26 @@ def test_misread_quaternions_of_a_body_that_is_turned_against_the_gyro_are_named
     middle = 0.5 * (truth.t_ns[1:] + truth.t_ns[:-1])
     measured = np.stack([np.interp(middle, imu.t_ns, column) for column in (planted.gyro @ found.gyro.axes.T).T], axis=1)
     assert np.median(np.abs(measured - rate)) < 0.2 * np.median(np.abs(rate))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_quaternions_of_another_world_than_the_positions_are_named(sign: float, flown: tuple[Imu, Truth]) -> None:
+    """NED beside ENU, either way round: not an accelerometer that is reversed, which looks alike."""
+    imu, truth = flown
+    in_ned = truth._replace(q_wb_wxyz=read_right(OTHER_WORLD, truth.q_wb_wxyz))
+    both = in_ned._replace(p_wb=truth.p_wb[:, [1, 0, 2]] * [1, 1, -1])
+    samples = motion_of(Imu(imu.t_ns, imu.gyro, sign * imu.accel))
+    for poses, quaternions in (
+        (truth, ""),
+        (both, ""),
+        (in_ned, OTHER_WORLD),
+        (both._replace(q_wb_wxyz=truth.q_wb_wxyz), OTHER_WORLD),
+    ):
+        found = judge(samples, poses, 1.0)
+        if sign > 0:
+            assert found.quaternions == quaternions
+        else:
+            assert found.quaternions == "" or quaternions
 
 
 @pytest.mark.parametrize(("unit", "up"), [("mm", "+z"), ("cm", "-z"), ("mm", "+y"), ("m", "+z")])
