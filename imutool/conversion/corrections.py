@@ -210,6 +210,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             if not described.is_read:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
+            kept += [f"{topic}: {step}" for step in survey.clock_steps]
             patched = described.reflected is None or isinstance(described.reflected, Reflected)
             if not patched or described.message_encoding not in ENCODINGS:
                 if (survey.matrices != np.eye(3)).any():

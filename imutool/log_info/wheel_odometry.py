@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import CLEARLY
-from imutool.cleaning.pose_delay import pose_delay
+from imutool.cleaning.pose_delay import pose_delay, side
 from imutool.cleaning.rules.axes import LATE_S, LATE_STDS
 from imutool.cleaning.truth import of_poses
 from imutool.errors import DataError
@@ -97,6 +97,10 @@ def _on_clock(poses: Poses, imu: Imu, name: str) -> tuple[Poses, float]:
     if slow is None:
         return poses, 0.0
     delay = pose_delay(convention_summary(imu, slow).motion, slow)
+    if delay is not None and delay.step is not None:
+        before, after, _ = delay.step
+        what = f"{name} is first {side(before)}, then {side(after)}, by the gyro"
+        raise DataError(what, expected="one clock that never steps", fix="Cut the log where the clock steps")
     delay_s = delay.seconds if delay is not None and abs(delay.seconds) > max(LATE_S, LATE_STDS * delay.std_s) else 0.0
     late_ns = nanoseconds(delay_s)
     seen = agreement(slow._replace(t_ns=slow.t_ns - late_ns), imu)
