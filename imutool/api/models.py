@@ -27,6 +27,7 @@ from imutool.bias_start.stretches import measured_imu
 from imutool.debiasing import DebiasReport
 from imutool.errors import ConfigError
 from imutool.file_location import Location, LogPath, location, several
+from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.recording import Imu, Recording
@@ -238,9 +239,10 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     recording.imu.check_rate(recording.name)
     measured_imu(recording.imu, recording.name)  # warns of what is no measurement, and refuses a recording of nothing else
+    wrong = [text for whole in warn_of_recordings([recording]) for text in contradictions(whole)]
     name, chosen, start = _model_and_start(recording, model, init, smooth)
-    about = recording.metadata.get("imutool", {})
-    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).report(name, recording.name, force=force)
+    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], recording.metadata.get("imutool", {})).beside(wrong)
+    fitness.report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
     return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
 

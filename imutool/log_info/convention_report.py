@@ -81,6 +81,11 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
     ]
 
 
+def contradictions(whole: TopicSummary) -> list[str]:
+    """Sentences on a gyro or an accelerometer whose axes the motion contradicts."""
+    return [finding.what for finding in Axes().findings(whole) if finding.severity == "error"]
+
+
 def constant_sensors(imu: Imu) -> list[str]:
     """Warnings of a gyro or an accelerometer that never changes: a measurement has noise."""
     why = "no sensor is behind it, or a simulation at rest without noise"

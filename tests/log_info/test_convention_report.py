@@ -15,6 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.api.logs import export
+from imutool.api.models import debias as debias_recording
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
@@ -196,6 +197,26 @@ def test_a_log_in_g_is_not_debiased_as_metres_a_second_squared(made: Recording, 
     with pytest.raises(ModelError, match=r"specific force has a median of .*--fix"):
         debias(log, out, init="0,0,0,0,0,0")
     assert not out.exists()
+
+
+def test_no_model_fits_samples_whose_axes_the_poses_contradict(
+    made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A reversed accelerometer turned as gravity does, and the verdict in `--json` was that the model fits."""
+    wrong = CHANGES["accel contradicts"](made)
+    write(wrong, tmp_path / "log.mcap")
+    report = debias(tmp_path / "log.mcap", tmp_path / "out.mcap", model="static")
+    (scored,) = [row["fit"] for row in evaluate(tmp_path / "log.mcap", models=["static"]) if row["model"] == "static"]
+    caplog.clear()
+    fitness = debias_recording(wrong, "static").fitness
+    assert "accel contradicts the true poses" in caplog.text
+    for verdict, reasons in (
+        (report.fits["/imu0"].verdict, report.fits["/imu0"].reasons),
+        (scored["verdict"], scored["reasons"]),
+        (fitness.verdict, fitness.reasons),
+    ):
+        assert verdict == "doubtful"
+        assert reasons[0].startswith("accel contradicts the true poses")
 
 
 @pytest.mark.parametrize("angle_deg", [3.0, 5.0, 46.0])

@@ -118,13 +118,14 @@ def _with_models(
     from imutool.bias_start.fitness import judge
     from imutool.bias_start.initial_bias import model_samples
     from imutool.evaluation import started
-    from imutool.log_info.convention_report import warn_of_recordings
+    from imutool.log_info.convention_report import contradictions, warn_of_recordings
 
     method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
     runs, aided, origins, about = list[Run](), list[Run](), {}, recording.metadata.get("imutool", {})
-    warn_of_recordings([recording])
+    wrong = [text for whole in warn_of_recordings([recording]) for text in contradictions(whole)]
     for name, model, start in started(recording, models, init, log, smooth=smooth):
-        fit = judge(model, start, [model_samples(model, recording.imu)], about).report(name, recording.name, force=True)
+        fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong)
+        fit = fit.report(name, recording.name, force=True)
         notes += [] if fit.verdict == "fits" else [fit.sentence(f"The model {name}")]
         debiased, std = apply_with_std(model, start, recording.imu)
         runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))
