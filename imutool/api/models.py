@@ -23,9 +23,9 @@ from imutool.bias_start.earlier_load import switched_on_before
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
-from imutool.bias_start.stretches import measured_imu
+from imutool.bias_start.stretches import measured_imu, unusual_gravity
 from imutool.debiasing import DebiasReport
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location, LogPath, location, several
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.storage import output_conflicts
@@ -75,7 +75,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
 
     Raises:
         ConfigError: `model` is not a loaded model, or `imu` not an `Imu`.
-        DataError: The samples are not at rest.
+        DataError: The samples are not at rest, their accelerometer shows no gravity, or their times are not in nanoseconds.
 
     Examples:
         >>> import imutool
@@ -88,6 +88,9 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     if not isinstance(given[0], BiasModel) or not isinstance(given[1], Imu):
         what = f"of type {type(given[0]).__name__}, {type(given[1]).__name__}"
         raise ConfigError(what, where="model, imu", expected="a model of `imutool.load_model`, and an `Imu`")
+    imu.check_rate("imu")
+    if wrong := unusual_gravity(imu.accel) if len(imu) else "":
+        raise DataError(wrong, where="imu", expected="samples in rad/s and m/s²")
     return at_rest(model, imu)
 
 
