@@ -128,6 +128,23 @@ def test_every_use_of_wrong_samples_is_warned_of(
     warned("accel looks like g", name, made, tmp_path / "log.mcap", caplog)
 
 
+def test_a_diagnosis_says_in_its_remarks_what_is_wrong_with_the_samples(
+    made: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its JSON and its page had no word of it."""
+    told: list[str] = []
+
+    def begun(*given: Any) -> None:
+        told.extend(given[6])
+        raise StopError
+
+    monkeypatch.setattr("imutool.diagnosis.diagnose._beside_reference", begun)
+    write(CHANGES["accel looks like g"](made), tmp_path / "log.mcap")
+    with pytest.raises(StopError):
+        diagnose([tmp_path / "log.mcap"])
+    assert [text for text in told if "accel looks like g" in text]
+
+
 @pytest.mark.parametrize("told", CHANGES)
 def test_no_model_learns_wrong_units_axes_or_frames(told: str, made: Recording, tmp_path: Path) -> None:
     """Trained on a world whose z is down, the accelerometer got a bias of twice gravity."""
