@@ -30,6 +30,10 @@ NO_HEIGHT = re.compile(
     r"diff|dynamic|airspeed|temp|ti?y?re|estimat|innov|bias|gps|gnss|navsat|global|setpoint|home|_id\b|count|ratio"
 )
 
+TYPES = {
+    BAROMETER: "a FluidPressure, or a number that is named as a pressure or an altitude",
+    WHEELS: "poses of the kind odometry, or a twist with a header",
+}
 ALTITUDES_M = (-500.0, 2e4)
 STEP_S, LONGEST_S, LATE_S, FEWEST = 0.5, 5.0, 1.0, 20  # of heights that are compared with the true ones
 FROZEN_S = 5.0
@@ -55,9 +59,8 @@ def find_aids(log: Log, recording: Recording, asked: dict[str, str]) -> Aids:
             continue
         names, looked_at = ([wanted[kind]], "") if wanted[kind] else offered(log, recording)
         if not names and kind in asked:
-            raise LogError(
-                f"no {kind} in this log; looked at {looked_at}", where=log.path, fix="Name a topic, or leave this aid out"
-            )
+            what = f"no {kind} in this log; looked at {looked_at}"
+            raise LogError(what, where=log.path, expected=TYPES[kind], fix="Name a topic, or leave this aid out")
         try:
             found = read(found, log, recording, names[0]) if names else found
         except (LogError, DataError) as error:

@@ -129,15 +129,15 @@ def check_start_poses(recording: Recording) -> float:
     return delay.seconds if delay is not None and clear else 0.0
 
 
-def check_poses(recording: Recording) -> None:
-    """Refuse poses whose quaternions, unit or axis that is up the IMU contradicts.
+def check_poses(recording: Recording, *, world: bool = True) -> None:
+    """Refuse poses whose quaternions, unit or (with `world`) axis that is up the IMU contradicts.
 
     Raises:
         DataError: such poses; their body and their clock may differ from the IMU's.
     """
     whole = convention_summary(recording.imu, truth_of(recording))
     for finding in Axes().findings(whole):
-        if "poses" in finding.values:
+        if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
             expected = "quaternions as w, x, y, z from body to world, z up, and metres"
             raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
 
