@@ -130,7 +130,7 @@ def check_start_poses(recording: Recording) -> float:
 
 
 def check_poses(recording: Recording, *, world: bool = True) -> None:
-    """Refuse poses whose quaternions, unit or axis that is up the IMU contradicts; the last with `world`.
+    """Refuse poses whose quaternions, unit or, with `world`, vertical the IMU contradicts.
 
     Raises:
         DataError: such poses; their body and their clock may differ from the IMU's.
