@@ -20,7 +20,7 @@ from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
-from imutool.bias_start.fitness import judge
+from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, unusual_gravity
@@ -30,7 +30,7 @@ from imutool.file_location import Location, LogPath, location, several
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
-from imutool.recording import Imu, Recording
+from imutool.recording import Imu, Recording, nanoseconds
 
 Model = str | Path | BiasModel
 
@@ -242,7 +242,9 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     recording.imu.check_rate(recording.name)
     measured_imu(recording.imu, recording.name)  # warns of what is no measurement, and refuses a recording of nothing else
-    wrong = [text for whole in warn_of_recordings([recording]) for text in contradictions(whole)]
+    first_ns = int(recording.imu.t_ns[0]) if len(recording.imu) else 0
+    begun = recording.between(first_ns, first_ns + nanoseconds(CHECKED_S))  # as much as the command looks at
+    wrong = [text for whole in warn_of_recordings([begun]) for text in contradictions(whole)]
     name, chosen, start = _model_and_start(recording, model, init, smooth)
     fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], recording.metadata.get("imutool", {})).beside(wrong)
     fitness.report(name, recording.name, force=force)
