@@ -20,10 +20,9 @@ from imutool.array_types import Float64
 from imutool.bias import static
 from imutool.bias.model import BiasModel
 from imutool.bias.temperature_drift import rows_without_drift, with_drift
-from imutool.bias_start import Fitness
+from imutool.bias_start import Fitness, model_choice
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias
-from imutool.bias_start.model_choice import check_smooth, choose_imus, choose_model_and_start, fitness_in_log, model_of_log
 from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
@@ -179,7 +178,7 @@ def debias(
         LogError: nothing can be saved, no such IMU, one debiased already, damaged and its own target, or not to be trusted.
         ModelError: no model and no time at rest; a model for another rate, or one that does not fit; a damaged model file.
     """
-    check_smooth(init, smooth)
+    model_choice.check_smooth(init, smooth)
     check_mode(check)
     if encoding not in ENCODINGS:
         raise ConfigError(f"{encoding!r}", where="encoding", expected=" or ".join(ENCODINGS))
@@ -235,18 +234,20 @@ def _debias(
     """Debiases an open log: the source itself, or the repaired copy of a damaged one."""
     model = options.model
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
-    topics = choose_imus(log, options.imus, given)
+    topics = model_choice.choose_imus(log, options.imus, given)
     check_new_topics(log, {topic: new_topics(topic) for topic in topics})
     log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     derived, starts, models, records, fits = [], {}, {}, {}, {}
     with SourceDigest(log.index, source) as digest:
         for topic in topics:
-            name, survey = given.get(topic) or given.get("") or model_of_log(log, topic), surveys.get(topic)
-            chosen, start = choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
+            name, survey = given.get(topic) or given.get("") or model_choice.model_of_log(log, topic), surveys.get(topic)
+            wrong = model_choice.warn_of_log(log, topic) if survey is None else []
+            chosen, start = model_choice.choose_model_and_start(log, topic, name, options.init, options.smooth, survey)
             derived.append(Debiaser(topic, chosen, start, survey, options.watch))
             starts[topic], models[topic] = start, str(chosen.card.get("name", chosen.method))
-            fits[topic] = fitness_in_log(log, topic, chosen, start, survey).report(models[topic], topic, force=options.force)
+            fit = model_choice.fitness_in_log(log, topic, chosen, start, survey).beside(wrong)
+            fits[topic] = fit.report(models[topic], topic, force=options.force)
             records[topic] = _provenance(topic, chosen, start, options.init, options.smooth)
 
         sieves = {debiaser.source_topic: debiaser.sieve for debiaser in derived}

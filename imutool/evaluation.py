@@ -24,9 +24,10 @@ from imutool.bias_start.model_choice import bound_to, check_smooth, estimate_at_
 from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
-from imutool.inertial.aids import Aids, find_aids, parse_aids
+from imutool.inertial.aids import Aids, parse_aids
 from imutool.inertial.strapdown import StartPose, along_truth, drift, gaps_crossed
-from imutool.log_info.convention_report import warn_of_recordings
+from imutool.log_info.aid_search import find_aids
+from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import writing
 from imutool.recording import Imu, Poses, Recording
@@ -93,14 +94,15 @@ def _evaluated(
 ) -> list[dict[str, Any]]:
     """Results of one stretch of a log."""
     (whole,) = warn_of_recordings([recording])
-    if (whole.world != np.eye(3)).any() or whole.position_unit != "m":
+    wrong = contradictions(whole)
+    if (whole.world != np.eye(3)).any() or whole.position_unit != "m" or whole.quaternions:
         logger.warning("%s: until then its positions and velocities are not scored", recording.name)
         orientations = replace(recording.truth, p_wb=np.zeros_like(recording.truth.p_wb), v_w=None)
         recording = replace(recording, truths={next(iter(recording.truths)): orientations})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
         found, std = _corrected(recording.imu, model, start)
-        fit = judge(model, start, [model_samples(model, recording.imu)], about) if model and start else None
+        fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid)
         if name == RAW and (gaps := gaps_crossed(integrated, GAP_S, int(recording.imu.t_ns[0]))):

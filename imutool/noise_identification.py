@@ -17,6 +17,7 @@ from imutool.config import build
 from imutool.errors import DataError
 from imutool.file_location import Location
 from imutool.inertial.stationary import rest_stretches, white_noise
+from imutool.log_info.unit_conversion import in_si_units
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import longest_recording, read_recordings
 from imutool.noise import allan
@@ -87,7 +88,7 @@ def identify(
     path, recording = log.path, longest_recording(read_recordings(log, imu=imu, truth=truth))
     if truth is None and recording.truths:
         recording = recording.with_truth(next(iter(recording.truths)))
-    remarks: list[str] = []
+    recording, remarks = in_si_units(recording)
     rest = _at_rest(recording.imu, remarks)
     motion = None
     if recording.truths:

@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -314,6 +315,32 @@ def test_a_live_sample_of_another_kind_is_refused() -> None:
         with pytest.raises(imutool.DataError, match="expected one sample of 3 numbers each, at integer nanoseconds"):
             call(imutool.OnlineDebiaser(STATIC), stamp, gyro, accel)
     assert call(imutool.OnlineDebiaser(STATIC), np.int64(5), [0.0, 0.0, 0.1], (0.0, 0.0, 9.8))[0][2] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("told", "stamps_ns", "step"),
+    [("the stamps are not in nanoseconds", 1e-3, 1), ("IMU at 100.0 Hz; expected 200.0 Hz", 1.0, 2), ("", 1.0, 1)],
+)
+def test_a_live_sensor_of_another_rate_is_refused_by_its_first_samples(
+    told: str, stamps_ns: float, step: int, logs: Path
+) -> None:
+    """With stamps in microseconds no time went by, so that the bias stayed where it began."""
+    imu, model = imutool.read(logs / "flight_2.mcap").imu, imutool.load_model(logs / "linear.safetensors")
+    online, samples = imutool.OnlineDebiaser(model), imu.rows(slice(0, 1000 * step, step))
+
+    with pytest.raises(imutool.ImutoolError, match=told) if told else nullcontext():
+        for t_ns, gyro, accel in zip(samples.t_ns.tolist(), samples.gyro, samples.accel, strict=True):
+            online(round(t_ns * stamps_ns), gyro, accel)
+
+
+def test_samples_in_g_are_warned_of_one_by_one_and_give_no_bias_at_rest(logs: Path, caplog: pytest.LogCaptureFixture) -> None:
+    imu, model = imutool.read(logs / "flight_2.mcap").imu.rows(slice(0, 500)), imutool.load_model(logs / "linear.safetensors")
+    online, in_g = imutool.OnlineDebiaser(model), imutool.Imu(imu.t_ns, imu.gyro, imu.accel / 9.80665)
+    for sample in zip(imu.t_ns.tolist(), in_g.gyro, in_g.accel, strict=True):
+        online(*sample)
+    assert caplog.text.count("the specific force has a median of 1.0") == 1
+    with pytest.raises(imutool.DataError, match="the specific force has a median of 1"):
+        imutool.bias_at_rest(model, in_g)
 
 
 @pytest.mark.parametrize("set_back_ns", [0, 20_000_000_000])

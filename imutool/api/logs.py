@@ -214,6 +214,7 @@ def export(
     Raises:
         ConfigError: Unknown format, an option that the format does not use, an existing folder.
         LogError: The log is damaged, or holds data that the format cannot represent.
+        DataError: Units, axes or poses are not those that a EuRoC folder states.
 
     Examples:
         >>> import imutool

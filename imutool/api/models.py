@@ -20,16 +20,17 @@ from imutool.bias_start import Fitness
 from imutool.bias_start.bias_at_rest import at_rest
 from imutool.bias_start.correction import apply_with_std
 from imutool.bias_start.earlier_load import switched_on_before
-from imutool.bias_start.fitness import judge
+from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
-from imutool.bias_start.stretches import measured_imu
+from imutool.bias_start.stretches import measured_imu, unusual_gravity
 from imutool.debiasing import DebiasReport
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location, LogPath, location, several
+from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
-from imutool.recording import Imu, Recording
+from imutool.recording import Imu, Recording, nanoseconds
 
 Model = str | Path | BiasModel
 
@@ -74,7 +75,7 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
 
     Raises:
         ConfigError: `model` is not a loaded model, or `imu` not an `Imu`.
-        DataError: The samples are not at rest.
+        DataError: The samples are not at rest, their accelerometer shows no gravity, or their times are not in nanoseconds.
 
     Examples:
         >>> import imutool
@@ -87,6 +88,9 @@ def bias_at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     if not isinstance(given[0], BiasModel) or not isinstance(given[1], Imu):
         what = f"of type {type(given[0]).__name__}, {type(given[1]).__name__}"
         raise ConfigError(what, where="model, imu", expected="a model of `imutool.load_model`, and an `Imu`")
+    imu.check_rate("imu")
+    if wrong := unusual_gravity(imu.accel) if len(imu) else "":
+        raise DataError(wrong, where="imu", expected="samples in rad/s and m/s²")
     return at_rest(model, imu)
 
 
@@ -238,9 +242,12 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     recording.imu.check_rate(recording.name)
     measured_imu(recording.imu, recording.name)  # warns of what is no measurement, and refuses a recording of nothing else
+    first_ns = int(recording.imu.t_ns[0]) if len(recording.imu) else 0
+    begun = recording.between(first_ns, first_ns + nanoseconds(CHECKED_S))  # as much as the command looks at
+    wrong = [text for whole in warn_of_recordings([begun]) for text in contradictions(whole)]
     name, chosen, start = _model_and_start(recording, model, init, smooth)
-    about = recording.metadata.get("imutool", {})
-    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).report(name, recording.name, force=force)
+    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], recording.metadata.get("imutool", {})).beside(wrong)
+    fitness.report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
     return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
 

@@ -78,7 +78,7 @@ def simulate(
     Raises:
         ConfigError: A setting, a settings file, or an existing log.
         LogError: No poses, or damage.
-        DataError: Less than 2 s of usable motion, or no input channel for an effect.
+        DataError: Less than 2 s of usable motion, no input channel for an effect, or poses that the log's IMU contradicts.
 
     Examples:
         >>> import imutool

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Literal
 
 from imutool.errors import ModelError
@@ -22,6 +23,12 @@ class Fitness(Section, frozen=True):
     def sentence(self, model: str) -> str:
         """Verdict on a model and the reasons, in words."""
         return f"{model} {'fits' if self.verdict == 'fits' else f'is {self.verdict}'}: {'; '.join(self.reasons)}."
+
+    def beside(self, contradictions: Sequence[str]) -> Fitness:
+        """Verdict on samples whose axes the motion contradicts: a model fits none of them for certain."""
+        if not contradictions:
+            return self
+        return Fitness("doubtful" if self.verdict == "fits" else self.verdict, (*contradictions, *self.reasons))
 
     def report(self, name: str, where: str, *, force: bool) -> Fitness:
         """Warn of a doubtful model, refuse an unfit one.

@@ -52,8 +52,8 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     """
     both = recording.overlap()
     first_ns = int(both.imu.t_ns[0])
-    check_start_poses(both.between(first_ns, first_ns + nanoseconds(max(truth_s, CHECKED_S))))
-    imu, truth = both.imu, both.truth
+    late_s = check_start_poses(both.between(first_ns, first_ns + nanoseconds(max(truth_s, CHECKED_S))))
+    imu, truth = both.imu, replace(both.truth, t_ns=both.truth.t_ns - nanoseconds(late_s))
     poses, trusted = with_velocity(truth).at(imu.t_ns)
     t = seconds(imu.t_ns, int(imu.t_ns[0]))
     usable = np.flatnonzero(trusted)
@@ -74,7 +74,8 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
     start = replace(start, std=supported_std(start.std, start.least, offset, variance + WORLD_TILT_STD**2))
     rest, std = _updated(start, offset, variance)
-    how = f"truth over {length_s:.1f} s{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
+    late = f", of poses {1e3 * abs(late_s):.0f} ms {'late' if late_s > 0 else 'early'}" if late_s else ""
+    how = f"truth over {length_s:.1f} s{late}{', weighed against the training runs' if model.card else ''}, {accuracy(std)}"
     if not model.card:
         return InitialBias(rest, std, how)
     mean, spread = _updated(start, offset, variance + WORLD_TILT_STD**2)

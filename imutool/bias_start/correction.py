@@ -14,13 +14,14 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import GAP_S, BiasModel, SampleStream, Stream, Vector6
+from imutool.bias.model_file import check_rate
 from imutool.bias.temperature_drift import OnlineDrift, bound
 from imutool.bias_start.bias_covariance import BiasEstimator
 from imutool.bias_start.initial_bias import InitialBias, model_samples, tracked_from_prior
-from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured
+from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured, unusual_gravity
 from imutool.errors import ConfigError, DataError
-from imutool.recording import Imu, nanoseconds
-from imutool.recording.columns import MOST_GAP_S
+from imutool.recording import LEAST_PERIOD_S, Imu, nanoseconds
+from imutool.recording.columns import MOST_GAP_S, median
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +76,9 @@ def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) ->
     return np.asarray(values[np.maximum(np.cumsum(good) - 1, 0)])
 
 
+CHECKED = 400  # first samples of a stream whose rate and gravity are checked: 2 s at 200 Hz
+
+
 class OnlineDebiaser:
     """Corrects IMU samples one at a time, for a live node.
 
@@ -94,6 +98,7 @@ class OnlineDebiaser:
         self._model, self._start, self._begun = model, start, False
         self._start_ns, self._before_ns, self._bias = 0, 0, np.zeros(6)
         self._drift = OnlineDrift(model) if model.temperature_parameters() else None
+        self._first: list[tuple[int, Float64[np.ndarray, "3"]]] | None = []  # None once they are checked
 
     def __call__(
         self,
@@ -107,7 +112,9 @@ class OnlineDebiaser:
         A sample that is no measurement (NaN, for instance) changes nothing: the bias is that of the sample before.
 
         Raises:
-            DataError: not one sample of three and three values, or a stamp that is not an integer.
+            DataError: not one sample of three and three values, a stamp that is not an integer, or first samples whose stamps
+                are not in nanoseconds.
+            ModelError: first samples at another rate than the model's training logs.
         """
         try:
             u, stamp_ns = np.concatenate((gyro, accel), dtype=np.float64, casting="safe"), index(stamp_ns)
@@ -118,6 +125,8 @@ class OnlineDebiaser:
             raise DataError(what, where="OnlineDebiaser", expected="one sample of 3 numbers each, at integer nanoseconds")
         size = np.abs(u)
         if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
+            if self._first is not None:
+                self._check_first(stamp_ns, u[3:])
             if self._drift is None:
                 t_s = self._seconds(stamp_ns)
                 self._bias = self._correct(t_s, u)
@@ -128,6 +137,29 @@ class OnlineDebiaser:
         bias = self._bias.copy()
         clean = u - bias
         return clean[:3], clean[3:], bias
+
+    def _check_first(self, stamp_ns: int, accel: Float64[np.ndarray, "3"]) -> None:
+        """Check rate and gravity once, by the first samples; they may come in batches, or a moment late.
+
+        Raises:
+            DataError, ModelError: as in a log.
+        """
+        assert self._first is not None
+        self._first.append((stamp_ns, accel))
+        if len(self._first) < CHECKED:
+            return
+        first, self._first = self._first, None
+        t_ns = np.unique(np.array([stamp_ns for stamp_ns, _ in first], np.int64))
+        if len(t_ns) > CHECKED // 2:
+            steps = np.diff(t_ns) * 1e-9
+            periods = [float(steps.mean()), float(median(steps))]
+            if max(periods) < LEAST_PERIOD_S:
+                what = f"{1.0 / max(periods):.3g} samples a second: the stamps are not in nanoseconds"
+                raise DataError(what, where="OnlineDebiaser", expected=f"steps of at least {LEAST_PERIOD_S * 1e9:.0f} ns")
+            rates = [1.0 / period_s for period_s in periods]
+            check_rate(self._model, min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz))), "OnlineDebiaser")
+        if wrong := unusual_gravity(np.array([accel for _, accel in first])):
+            logger.warning("OnlineDebiaser: %s", wrong)
 
     def _warn_without(self, stamp_ns: int, temperature: float | None) -> None:
         """Warn of a first sample without temperature; the rest bias then varies as much as the drift did in training."""

@@ -40,6 +40,7 @@ from imutool.bias_start.prior_width import (
     supported_std,
     turned_axes,
 )
+from imutool.bias_start.stretches import GRAVITY_RANGE, unusual_gravity
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
@@ -57,7 +58,6 @@ MOST_RATE = 2e-3  # relative difference of sample rates; one unit's clock stays 
 HALF, MOST_SHARE = 0.5, 1.5  # of a correction: between them it does more good than harm
 LEAST_SHARE = -2.0  # below, the log lacks so much else that the correction makes it worse by less than half
 SURE = 3.0  # standard deviations; of made-up sensors' own shares, the largest lies 3.8 from one
-GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 
 
 @dataclass(frozen=True)
@@ -154,12 +154,9 @@ def head(batches: Iterable[Samples]) -> Samples:
 
 def _wrong_gravity(samples: Samples, start: InitialBias) -> str:
     """Sentence on a specific force that is not gravity's in the median or at rest; empty if it is."""
-    size, bias = float(quantile(np.linalg.norm(samples[2], axis=1), 0.5)), float(np.linalg.norm(start.rest[3:]))
-    low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
-    if not low <= size <= high:
-        return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
+    bias = float(np.linalg.norm(start.rest[3:]))
     without = f"the accelerometer would have a bias of {bias:.3g} m/s²: it does not measure gravity, or its unit is not m/s²"
-    return without if bias > GRAVITY_M_S2 - low else ""
+    return unusual_gravity(samples[2]) or (without if bias > (1.0 - GRAVITY_RANGE[0]) * GRAVITY_M_S2 else "")
 
 
 def _without_motion(model: BiasModel, samples: Samples, prior: BiasPrior) -> Samples:

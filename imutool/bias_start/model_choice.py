@@ -39,7 +39,7 @@ from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.file_location import Location
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
-from imutool.log_info.convention_report import warn_of_conventions
+from imutool.log_info.convention_report import contradictions, warn_of_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.log import Log
@@ -134,8 +134,6 @@ def choose_model_and_start(
 ) -> tuple[BiasModel, InitialBias]:
     """Bias model and initial bias for one IMU of a log."""
     untrained = name is None or str(name) == static.Model.method
-    if survey is None:
-        _warn_of_conventions(log, topic)
     first_minute = _first_minute(log, topic, init, survey)
     period_s = first_minute.imu.period_s
     if untrained and init == "auto" and not smooth:
@@ -167,10 +165,11 @@ def bound_to(model: BiasModel, recording: Recording) -> BiasModel:
     return with_earlier_load(model, [model_samples(model, recording.imu)], int(t_ns[0]))
 
 
-def _warn_of_conventions(log: Log, topic: str) -> None:
-    """Warn of units, axes and frames that the start of a log shows to be other than those assumed."""
+def warn_of_log(log: Log, topic: str) -> list[str]:
+    """Contradicted axes at the start of a log, after warnings of all units, axes and frames."""
     end_ns = _after(log, topic, CHECKED_S)
-    warn_of_conventions(_samples(log, topic, None, end_ns), read_truth(log, end_ns=end_ns), f"{log.path} {topic}")
+    samples, truth = _samples(log, topic, None, end_ns), read_truth(log, end_ns=end_ns)
+    return contradictions(warn_of_conventions(samples, truth, f"{log.path} {topic}"))
 
 
 def _after(log: Log, topic: str, length_s: float) -> int | None:

@@ -25,11 +25,12 @@ from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read_recordings
 from imutool.mcap_io.temperature import with_temperatures
 from imutool.mcap_io.topics import CLEAN_FIX, UNSET_FIX
-from imutool.recording import Imu, Recording, nanoseconds, seconds
-from imutool.recording.columns import MOST_GAP_S, jump_warnings
+from imutool.recording import GRAVITY_M_S2, Imu, Recording, nanoseconds, seconds
+from imutool.recording.columns import MOST_GAP_S, jump_warnings, quantile
 
 MOST = np.array([1e4] * 3 + [1e6] * 3)  # rad/s and m/s²: no gyro or accelerometer measures more
 LEAST_FORCE_M_S2 = 1e-9  # on some axis: even in free fall a sensor's noise exceeds it
+GRAVITY_RANGE = (0.4, 2.5)  # of the median specific force to gravity; a sensor in g has 0.1, a racing drone up to 2
 MOST_STRETCHES = 1000  # that a report lists
 NOT_FINITE, OUT_OF_RANGE, ZERO_FORCE = "not_finite", "out_of_range", "zero_force"
 
@@ -50,6 +51,15 @@ class Stretch(NamedTuple):
     def jump(self) -> bool:
         """Whether the clock jumped, rather than paused."""
         return not 0.0 < self.step_s <= MOST_GAP_S
+
+
+def unusual_gravity(accel: Rows3) -> str:
+    """Sentence on a specific force whose median is far from gravity; empty if it is near."""
+    size = float(quantile(np.linalg.norm(accel, axis=1), 0.5))
+    low, high = (share * GRAVITY_M_S2 for share in GRAVITY_RANGE)
+    if low <= size <= high:
+        return ""
+    return f"the specific force has a median of {size:.3g} m/s², expected about {GRAVITY_M_S2:g}: check its unit"
 
 
 def unmeasured(gyro: Rows3, accel: Rows3) -> Mapping[str, Bool[np.ndarray, " n"]]:

@@ -18,6 +18,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, choose
 from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
+from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, read_right
 from imutool.cleaning.position_unit import POSITIONS, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, force_in_world, turning
@@ -31,11 +32,6 @@ WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
 MOST_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
 
-MISREAD = {  # quaternions of poses: what is wrong with them, and the rows and signs that make w, x, y, z of them
-    "have their w in the place of z": ((3, 0, 1, 2), (1, 1, 1, 1)),
-    "have their w in the place of x": ((1, 2, 3, 0), (1, 1, 1, 1)),
-    "are the inverse: they take vectors of the world to the body": ((0, 1, 2, 3), (1, -1, -1, -1)),
-}
 FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
 
 
@@ -75,7 +71,7 @@ class Conventions:
         up: axis of the poses' world that points up, as `+z`.
         delay: of the poses.
         unit: of the poses' positions, metres unless the motion shows another.
-        quaternions: what is wrong with those of the poses, of `MISREAD`; then all else is of the poses without this.
+        quaternions: what is wrong with those of the poses (`pose_quaternions`); then all else is of the poses without this.
     """
 
     topic: str = ""
@@ -100,8 +96,9 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
     late_ns = 0 if delay is None else round(delay.seconds * 1e9)
     shifted = truth._replace(t_ns=truth.t_ns - late_ns)
     gyro, shifted, quaternions = _turns_against_poses(step, mean, motion.middle_ns, shifted)
-    accel, up, unit = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
-    return Conventions(truth.topic, gyro, accel, relative, up, delay, unit, quaternions)
+    force = mean[:, 3:] * accel_factor
+    accel, up, unit, other = _accel_against_poses(step, force, motion.middle_ns, shifted, gyro, relative)
+    return Conventions(truth.topic, gyro, accel, relative, up, delay, unit, quaternions or other)
 
 
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
@@ -212,8 +209,8 @@ def _turns_against_poses(
     if gyro is not None and not gyro.wrong:
         return gyro, truth, ""
     fitting = []
-    for what, (rows, signs) in MISREAD.items():
-        other = truth._replace(q_wb_wxyz=truth.q_wb_wxyz[:, rows] * signs)
+    for what in MISREAD:
+        other = truth._replace(q_wb_wxyz=read_right(what, truth.q_wb_wxyz))
         found = _gyro_against_poses(step, mean, start_ns, other)
         if found is not None and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
             fitting.append((found, other, what))
@@ -260,15 +257,15 @@ def _accel_against_poses(
     truth: Truth,
     gyro: Reading | None,
     relative: Reading | None,
-) -> tuple[Reading | None, str | None, str]:
-    """Axes of the accelerometer against the poses, the axis of their world that is up, and the unit of their positions.
+) -> tuple[Reading | None, str | None, str, str]:
+    """Axes of the accelerometer by the poses, their axis that is up, unit of positions, and `OTHER_WORLD` or nothing.
 
     a_w + g up = R_wb axes f. Without acceleration (axes, up) and (-axes, -up) fit alike; then neither is told.
     """
     at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
     if len(use) < FEWEST_BLOCKS:
-        return None, None, "m"
+        return None, None, "m", ""
     f = np.stack([np.interp(first_s, STEP_S * (step + 0.5), column) for column in accel.T], axis=1)
     ups = np.concatenate([np.eye(3)[2:], -np.eye(3)[2:], np.eye(3)[:2], -np.eye(3)[:2]])
     every = signed_permutations()
@@ -286,8 +283,11 @@ def _accel_against_poses(
     unit = position_unit(residuals, len(readings), blocks)
     a_w = POSITIONS[unit] * a_w
     choice = choose(np.stack([np.linalg.norm(residuals(1.0, row), axis=1) for row in range(len(readings))]), blocks)
+    left = np.zeros((0, 3)) if choice is None else residuals(1.0, choice.best)
+    if gyro is not None and gyro.sole and gyro.as_is and is_other_world(f, q_wb[use], a_w, left, blocks):
+        return None, None, unit, OTHER_WORLD
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
-        return None, None, unit
+        return None, None, unit, ""
     P, up = readings[choice.best]
     as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
@@ -296,5 +296,5 @@ def _accel_against_poses(
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
     named = ("+" if up.sum() > 0 else "-") + "xyz"[int(np.argmax(np.abs(up)))] if one_up else None
     if gyro is None or not gyro.sole:  # without turns about two axes a proposal has no evidence
-        return found if found is not None and found.as_is else None, named if named == "+z" else None, unit
-    return found, named, unit
+        return found if found is not None and found.as_is else None, named if named == "+z" else None, unit, ""
+    return found, named, unit, ""

@@ -16,17 +16,38 @@ from imutool.recording.columns import median
 MOST_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
 SLOW_S = 1.0  # length of the turns that find the delay: in steps of 0.1 s a fast walk fits one stride later as well
+FINE_LAGS_S = FINE_S * np.arange(-12, 13)
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
 DELAY_PARTS, FEWEST_PARTS, FEWEST = 8, 4, 40  # parts whose own lags show how sure the delay is, and poses in each
+STEP_LEAST_S, STEP_STDS = 0.03, 8.0  # of a step of one clock, at least; and in deviations of the parts on each side
+
+
+class Step(NamedTuple):
+    """Step of the delay, by which it differs after a time from before, within a part of the log."""
+
+    before_s: float
+    after_s: float
+    at_ns: int
+
+
+def side(seconds_: float) -> str:
+    """Delay in words, as `0.100 s late`."""
+    late_s = abs(seconds_)
+    text = f"{late_s:.3f} s" if late_s > LONGEST_DELAY_S else f"{1e3 * late_s:.0f} ms"
+    return f"{text} {'late' if seconds_ > 0 else 'early'}"
 
 
 class Delay(NamedTuple):
-    """Lateness of the poses' stamps against the gyro's, with its standard deviation."""
+    """Lateness of the poses' stamps against the gyro's, with its standard deviation.
+
+    With a step of one of the clocks it is that of the larger part of the log.
+    """
 
     seconds: float
     std_s: float
+    step: Step | None = None
 
 
 def pose_delay(motion: Motion, truth: Truth) -> Delay | None:
@@ -46,7 +67,10 @@ def _far_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> 
     if apart_s is None:
         return None
     found = _near_delay(motion, truth._replace(t_ns=truth.t_ns - round(apart_s * 1e9)), bias)
-    return None if found is None else Delay(apart_s + found.seconds, found.std_s)
+    if found is None:
+        return None
+    step = found.step and Step(apart_s + found.step.before_s, apart_s + found.step.after_s, found.step.at_ns)
+    return Delay(apart_s + found.seconds, found.std_s, step)
 
 
 def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> float | None:
@@ -79,11 +103,14 @@ def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) ->
     if count < FEWEST_PARTS:
         return None
     coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
-    whole = slow.correlations(coarse, count)[:, 0]
+    slowly = slow.correlations(coarse, count)
+    if count == DELAY_PARTS and (stepped := _stepped(slow, fast, coarse, slowly, motion.middle_ns)) is not None:
+        return stepped
+    whole = slowly[:, 0]
     at = int(np.argmax(whole))
     if whole[at] < LEAST_CORRELATION or at in (0, len(coarse) - 1):
         return None
-    lags = coarse[at] + np.arange(-12, 13) * FINE_S
+    lags = coarse[at] + FINE_LAGS_S
     fine = fast.correlations(lags, count)
     if fine[:, 0].max() < LEAST_CORRELATION:
         return None
@@ -92,6 +119,32 @@ def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) ->
     if not np.isfinite(peaks[0]) or len(parts) < FEWEST_PARTS:
         return None
     return Delay(float(peaks[0]), float(np.std(parts, ddof=1)) / len(parts) ** 0.5)
+
+
+def _stepped(
+    slow: _Turns, fast: _Turns, coarse: Float64[np.ndarray, " l"], slowly: Float64[np.ndarray, "l p"], start_ns: int
+) -> Delay | None:
+    """Delay of the larger side of a step, which parts show whose own delays are alike on each side of it alone."""
+    own = np.where(slowly.max(axis=0) < LEAST_CORRELATION, np.nan, coarse[np.argmax(slowly, axis=0)])[1:]
+    parts = np.full(DELAY_PARTS, np.nan)
+    for centre in np.unique(own[np.isfinite(own)]):
+        fine = fast.correlations(centre + FINE_LAGS_S, DELAY_PARTS)[:, 1:]
+        for row in np.flatnonzero(own == centre):
+            parts[row] = _peak(centre + FINE_LAGS_S, fine[:, row])
+    found: list[tuple[float, Delay]] = []
+    for within in range(1, DELAY_PARTS):  # the part that the step divides, or that begins with it
+        sides = [side[np.isfinite(side)] for side in (parts[:within], parts[min(within + 1, DELAY_PARTS - 1) :])]
+        if min(map(len, sides)) == 0 or sum(map(len, sides)) < DELAY_PARTS - 2:
+            continue
+        before_s, after_s = (float(median(side)) for side in sides)
+        left = np.concatenate([sides[0] - before_s, sides[1] - after_s])
+        std_s = float(np.sqrt((left**2).sum() / (len(left) - 2)))
+        if abs(after_s - before_s) > max(STEP_LEAST_S, STEP_STDS * std_s):
+            at_ns = start_ns + round(1e9 * float(np.array_split(fast.first_s, DELAY_PARTS)[within][0]))
+            larger = int(len(sides[1]) > len(sides[0]))
+            delay_s = (before_s, after_s)[larger]
+            found.append((std_s, Delay(delay_s, std_s / len(sides[larger]) ** 0.5, Step(before_s, after_s, at_ns))))
+    return min(found, key=lambda each: each[0], default=(0.0, None))[1]
 
 
 class _Turns(NamedTuple):

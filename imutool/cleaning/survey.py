@@ -82,6 +82,12 @@ class Survey:
         return product
 
     @property
+    def clock_steps(self) -> list[str]:
+        """Steps between the clocks of IMU and poses."""
+        steps = (finding.what for finding in self.findings if "steps" in finding.values)
+        return [f"{step}; no shift of all stamps corrects it" for step in steps]
+
+    @property
     def score(self) -> float:
         """Quality from 0 to 1 (`imutool.cleaning.finding.score`)."""
         return score(self.messages - self.surplus, self.valid, self.missing, self.findings)

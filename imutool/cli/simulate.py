@@ -141,7 +141,10 @@ def conceal(
     if findings is not None or json_to is not None:
         raise ConfigError("--findings and --json need --open", where="conceal", fix="Add --open")
     from imutool.blind_cases import conceal as run
+    from imutool.log_info.convention_report import check_poses
+    from imutool.mcap_io.read import read
 
+    check_poses(read(places[0], truth=truth))  # here, as a case shares no code with what estimates
     run(places[0], places[1], seed=seed, kind=kind, size=size, noise=noise, longest_s=longest, truth=truth)
     say(f"{places[1]}: sim.mcap, real.mcap, envelope.json and its key")
     say(f"next: imutool diagnose {places[1]}/real.mcap --sim {places[1]}/sim.mcap -o {places[1]}")

@@ -52,6 +52,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             if not described.is_read:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
+            kept += [f"{topic}: {step}" for step in survey.clock_steps]
             mount = survey.axes[0] if not frame_id and _is_mount(log, survey, before) else None
             if mount is not None or frame_id:  # the next round judges by the corrected poses
                 survey = replace(survey, axes=AS_RECORDED)

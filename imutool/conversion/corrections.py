@@ -16,7 +16,7 @@ from itertools import tee
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.cleaning.conventions import MISREAD
+from imutool.cleaning.pose_quaternions import read_right
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.conversion.message_patch import WXYZ_FROM_XYZW, XYZW_FROM_WXYZ, MessagePatch, corrected_imu
 from imutool.conversion.restamping import SAME_CLOCK_NS
@@ -42,7 +42,7 @@ class Corrections:
         world: rotation of the poses in the frame `frame_id`; `late_ns` is taken from their stamps.
         body: rotation from the body of the poses on `pose_topic` to the IMU.
         unit: of the positions on `pose_topic`, of their velocities, and of transforms of the frames `copies`.
-        quaternions: what is wrong with those of `pose_topic` and `copies`, of `MISREAD`.
+        quaternions: what is wrong with those of `pose_topic` and `copies` (`pose_quaternions`).
         stamps: new stamps of messages of an IMU, of poses or vectors, in file order.
         reflected: topics among them whose messages have a type of their own.
         notes: what is corrected, by topic.
@@ -160,8 +160,7 @@ class Corrections:
             numbers[schemas.POSITION] = factor * self.world @ numbers[schemas.POSITION]
             q_wxyz = numbers[schemas.XYZW][WXYZ_FROM_XYZW]
             if judged and self.quaternions:
-                rows, signs = MISREAD[self.quaternions]
-                q_wxyz = q_wxyz[list(rows)] * signs
+                q_wxyz = read_right(self.quaternions, q_wxyz[None])[0]
             if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
                 q_wxyz = body @ q_wxyz
             numbers[schemas.XYZW] = (turn @ q_wxyz)[XYZW_FROM_WXYZ]

@@ -50,7 +50,7 @@ from imutool.diagnosis.signals import check_signals, with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
 from imutool.errors import ImutoolError
 from imutool.file_location import Location
-from imutool.log_info.convention_report import check_one_sensor, warn_of_recordings
+from imutool.log_info.convention_report import check_one_sensor, convention_warnings, warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
@@ -97,12 +97,12 @@ def diagnose(
     logs_read = [with_channels(read_log(real, imu=first, truth=truth), real) for real in reals]
     recordings = with_unique_names([log.recording for log in logs_read])
     check_one_sensor(recordings)
-    warn_of_recordings(recordings)
+    wrong = [text for whole in warn_of_recordings(recordings) for text in convention_warnings(whole)]
     others = [topic for topic in topics if topic != first] if len(reals) == 1 and first in topics else []
     if others and sim is None and not recordings[0].truths:
         diagnosis = check_without_reference(recordings[0], str(reals[0]), "no simulation and no true poses", settings)
     else:
-        told = [log.remark for log in logs_read if log.remark]
+        told = [*(log.remark for log in logs_read if log.remark), *(wrong if sim is None else ())]
         diagnosis, _ = _beside_reference(recordings, reals, sim, imu, truth, signals, told, report, settings, begin)
     if others and first is not None:
         diagnosis = _with_other_imus(diagnosis, recordings[0], reals[0], first, others, settings)

@@ -12,6 +12,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import LogError
 from imutool.exporting import ExportReport, Progress
+from imutool.log_info.convention_report import check_conventions
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -59,7 +60,11 @@ IDENTITY = "  cols: 4\n  rows: 4\n  data: [1.0, 0.0, 0.0, 0.0,\n" + (
 def write(
     log: Path, out: Path, imu: str | None, sensor_noise: str | Path | None, overwrite: bool, tell: Progress
 ) -> ExportReport:
-    """Writes the folder `out`; the arguments are those of `imutool.export`."""
+    """Writes the folder `out`; the arguments are those of `imutool.export`.
+
+    Raises:
+        DataError: units, axes or frames are not those that the folder states.
+    """
     given = datasheet.read(sensor_noise) if sensor_noise is not None else None
     with Log(log) as opened:
         topic = imu or _best_imu(opened)
@@ -70,6 +75,7 @@ def write(
         recording = read(log, imu=topic)
         if len(recording.imu) < FEWEST:
             raise LogError(f"{topic} has {len(recording.imu)} samples", where=log, expected=f"{FEWEST} or more, for a rate")
+        check_conventions([recording])  # the header of each table states units, and T_BS the body
         with writing(out):
             writer = _Asl(folder / "mav0", recording, source, tell)
             writer.imu(given)

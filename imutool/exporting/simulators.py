@@ -17,16 +17,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imutool.array_types import Float64
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.exporting import ExportReport
 from imutool.mcap_io.storage.target import Target, writing
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Noise
+from imutool.recording import GRAVITY_M_S2
 from imutool.sensor import physics_file
 from imutool.sensor.physics_file import Bias, Entry, PhysicsFile, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
 PHYSICS, NOISE = "physics.toml", "noise.toml"
+MOST_BIAS_M_S2 = 0.6 * GRAVITY_M_S2  # of an accelerometer; with a larger one it measures no gravity
 RATE_HZ = 200.0  # of a sensor whose rate neither the given noise nor the diagnosed one says
 DEVIATIONS = 2.0  # of a range
 CORRELATION_S = 3600.0  # of a bias that walks, where a simulator lets it come back
@@ -118,6 +120,7 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
 
     Raises:
         ConfigError: no physics.toml, or no noise.
+        DataError: the physics of samples in another unit.
     """
     folders = [source] if (source / PHYSICS).is_file() else sorted(path.parent for path in source.glob(f"*/{PHYSICS}"))
     if not folders:
@@ -129,6 +132,10 @@ def read(source: Path, noise: str | Path | None = None) -> Twin:
     sheet = datasheet.read(noise) if noise is not None else _middle(noises)
     biases = {s: np.array([getattr(file.bias, s) for file in files if file.bias is not None]).reshape(-1, 3) for s in SENSORS}
     known = {s: rows for s, rows in biases.items() if len(rows)}
+    for folder, file in zip(folders, files, strict=True):
+        if file.bias is not None and (size := float(np.linalg.norm(file.bias.accel))) > MOST_BIAS_M_S2:
+            what = f"{PHYSICS} has an accelerometer's bias of {size:.3g} m/s²: its log does not measure gravity, or not in m/s²"
+            raise DataError(what, where=folder, fix="Correct the log with imutool convert LOG OUT --fix, and diagnose it again")
     mean = Bias(**{s: three(rows.mean(axis=0)) for s, rows in known.items()}) if known else None
     std: dict[Sensor, Vector] = {s: rows.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(3) for s, rows in biases.items()}
     physics = files[0] if len(files) == 1 else _of_fleet(files)

@@ -10,9 +10,9 @@ import numpy as np
 from imutool.array_types import Int64
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
-from imutool.cleaning.pose_delay import LONGEST_DELAY_S
+from imutool.cleaning.pose_delay import LONGEST_DELAY_S, side
 from imutool.cleaning.rule import TopicSummary
-from imutool.cleaning.rules.axes import Axes
+from imutool.cleaning.rules.axes import LATE_STDS, Axes
 from imutool.cleaning.rules.saturation import Saturation
 from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.rules.units import Units
@@ -34,6 +34,7 @@ CONVERTIBLE = {  # messages of which `convert` makes others
     "px4_msgs/msg/SensorGyro": "an IMU",
 }
 QUATERNIONS = "quaternions of poses"  # said only where they are misread
+START_LATE_S = 0.015  # half of what is a warning; a start from poses 10 ms late is off by about its standard deviation
 NO_POSES = "the log has no true poses"
 NO_TURN = (
     "no order of the axes fits clearly: little motion, turns about one axis only, a turned body, or poses of another motion"
@@ -80,6 +81,11 @@ def convention_warnings(whole: TopicSummary) -> list[str]:
     ]
 
 
+def contradictions(whole: TopicSummary) -> list[str]:
+    """Sentences on a gyro or an accelerometer whose axes the motion contradicts."""
+    return [finding.what for finding in Axes().findings(whole) if finding.severity == "error"]
+
+
 def constant_sensors(imu: Imu) -> list[str]:
     """Warnings of a gyro or an accelerometer that never changes: a measurement has noise."""
     why = "no sensor is behind it, or a simulation at rest without noise"
@@ -99,17 +105,18 @@ def _warnings(imu: Imu, whole: TopicSummary) -> list[str]:
     return [*body_warnings(topic, turned_deg), *motion_warnings(topic, *seen)]
 
 
-def check_start_poses(recording: Recording) -> None:
-    """Refuse poses that would give a wrong initial bias.
+def check_start_poses(recording: Recording) -> float:
+    """Delay of the poses (s) for a start from them; zero where none is clear.
 
-    These are what `convert --fix` corrects, and poses of another motion; jumps at times are no error.
+    Poses of another motion are refused, and what `convert --fix` corrects; jumps at times are no error.
 
     Raises:
         DataError: such poses.
     """
     truth = truth_of(recording)
     found = None if truth is None else agreement(truth, recording.imu)
-    for warning in _warnings(recording.imu, convention_summary(recording.imu, truth)):
+    whole = convention_summary(recording.imu, truth)
+    for warning in _warnings(recording.imu, whole):
         if warning.endswith(CORRECTION) or (found is not None and unlike(found.explained, found.rms_rad_s)):
             raise DataError(
                 warning.removesuffix(f"; {CORRECTION}"),
@@ -117,6 +124,22 @@ def check_start_poses(recording: Recording) -> None:
                 expected="poses and samples of one motion for a start from the truth",
                 fix=f"{CORRECTION if warning.endswith(CORRECTION) else 'See imutool info LOG'}, or give another `init`",
             )
+    delay = whole.conventions.delay
+    clear = delay is not None and delay.step is None and abs(delay.seconds) > max(START_LATE_S, LATE_STDS * delay.std_s)
+    return delay.seconds if delay is not None and clear else 0.0
+
+
+def check_poses(recording: Recording, *, world: bool = True) -> None:
+    """Refuse poses whose quaternions, unit or, with `world`, vertical the IMU contradicts.
+
+    Raises:
+        DataError: such poses; their body and their clock may differ from the IMU's.
+    """
+    whole = convention_summary(recording.imu, truth_of(recording))
+    for finding in Axes().findings(whole):
+        if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
+            expected = "quaternions as w, x, y, z from body to world, z up, and metres"
+            raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
@@ -146,6 +169,7 @@ def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
     return [warn_of_conventions(r.imu, truth_of(r), f"{r.name} {r.imu_topic}") for r in recordings]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of one sample of 1e160, as a broken driver writes it
 def check_conventions(recordings: Iterable[Recording]) -> None:
     """Refuse recordings whose units, axes or frames are wrong; log other warnings.
 
@@ -184,12 +208,15 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
     yield "world of poses", *((True, f"{found.up} is up") if found.up else _unknown(whole, NO_FORCE if turned else NO_TURN))
     if found.unit != "m":
         yield "unit of positions", True, f"{found.unit}: so they accelerate as accel says"
-    if found.delay is not None:
-        side = "late" if found.delay.seconds > 0 else "early"
-        late_s = abs(found.delay.seconds)
-        late = f"{late_s:.3f} s" if late_s > LONGEST_DELAY_S else f"{1e3 * late_s:.1f} ms"
-        late = f"{late} {side}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
-        yield "clock of poses", True, late
+    if found.delay is not None and found.delay.step is not None:
+        before, after, _ = found.delay.step
+        yield "clock of poses", True, f"steps: first {side(before)}, then {side(after)}"
+    elif found.delay is not None:
+        late_s = found.delay.seconds
+        late = (
+            side(late_s) if abs(late_s) > LONGEST_DELAY_S else f"{1e3 * abs(late_s):.1f} ms {'late' if late_s > 0 else 'early'}"
+        )
+        yield "clock of poses", True, f"{late}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
     else:
         yield "clock of poses", *_unknown(whole, NO_DELAY if turned else NO_TURN)
 

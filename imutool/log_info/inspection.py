@@ -131,7 +131,7 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     median = float(np.median(periods)) if known else 0.0
     usual = periods[np.abs(periods - median) <= UNUSUAL * median]  # the median itself is coarse where times are whole ms
     return Clock(
-        rate_hz=1e9 / float(usual.mean()) if median > 0 else None,
+        rate_hz=1e9 / float(usual.mean() if len(usual) else median) if median > 0 else None,  # none is near, of two that differ
         jitter_s=float(np.std(steady)) * 1e-9 if len(steady) else None,
         largest_gap_s=float(periods.max()) * 1e-9 if known else None,
         first_ns=int(ordered[0]) if len(ordered) else None,

@@ -178,7 +178,8 @@ def _turned(
     """
     shared = gyro.T @ (omega @ turn.T) * (length_s / ERRORS_LAST_S / len(gyro))  # symmetric, as R is the best
     seen = np.trace(shared) * np.eye(3) - (shared + shared.T) / 2.0
-    if np.linalg.eigvalsh(seen)[0] <= 0.0:
+    least, _, most = np.linalg.eigvalsh(seen)
+    if least <= 1e-9 * most:  # turns about one axis alone, as of wheels
         return None
     std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
     deg = np.degrees(quaternion.log(quaternion.of_matrix(turn))[0])

@@ -19,12 +19,15 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError, ImutoolError, LogError
+from imutool.geometry import quaternion
+from imutool.log_info.convention_report import check_poses
 from imutool.mcap_io.codec.decode import PoseBatch
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read as read_log
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet as noises
 from imutool.recording import Imu, Poses, Recording, unit_quaternions
+from imutool.recording.columns import median
 from imutool.sensor import physics_file
 from imutool.sensor.channels import channels_at, needs_channels, with_channels
 from imutool.sensor.effect import Acting, simulate_stretches
@@ -37,6 +40,7 @@ SCHEMA = "imutool.simulation/1"
 RATE_HZ = 200.0  # of a trajectory without an IMU
 SLOWEST_HZ, FASTEST_HZ = 10.0, 4000.0
 LEAST_S = 2.0  # of trusted motion
+MOST_M_S2 = 100.0  # median acceleration; ten times gravity for half of the time is no body's
 MOTION_HZ = 400.0  # of the motion's clock, at least: filters and shifts act there before samples are taken
 MOTION_TOPIC = "/motion/pose"  # the exact motion of the samples; the truth that it was smoothed from is copied
 TRUTH_TOPIC = "/ground_truth/pose"
@@ -102,7 +106,7 @@ def simulate(
     Raises:
         ConfigError: a setting, a file of settings or the target.
         LogError: the log has no poses, or is damaged.
-        DataError: less than 2 s of the motion can be trusted, or an effect lacks a channel.
+        DataError: less than 2 s of trusted motion, an effect without its channel, or poses that the log's IMU contradicts.
     """
     report = progress or (lambda done, total, word: None)
     file = PhysicsFile() if physics is None else physics_file.read(physics)
@@ -139,6 +143,7 @@ def _along_poses(
     path: Path, truth: str | None, acting: Acting, start_ns: int | None, noise: noises.Noise, rate_hz: float | None, seed: int
 ) -> Simulation:
     source = _source(path, truth, channels=needs_channels(acting))
+    check_poses(source)
     own_hz = 1.0 / source.imu.period_s if len(source.imu) > 1 else RATE_HZ
     found = simulated(source, acting, noise, _rounded(own_hz) if rate_hz is None else rate_hz, seed, start_ns=start_ns)
     settings = {"truth": next(iter(source.truths)), "imu": None, **found.settings}
@@ -185,7 +190,7 @@ def simulated(
         motion,
         tuple((part.start_s, part.end_s) for part in motion.stretches),
         {"rate_hz": rate_hz, "seed": seed},
-        (*_of_poses(motion, source.truth), *of_noise(noise, rate_hz)),
+        (*_of_poses(motion, source.truth, ideals), *of_noise(noise, rate_hz)),
     )
 
 
@@ -236,10 +241,13 @@ def _nanoseconds(motion: SmoothMotion, stamp_s: Float64[np.ndarray, " m"]) -> In
     return np.asarray(motion.start_ns + np.round(stamp_s * 1e9).astype(np.int64))
 
 
-def _of_poses(motion: SmoothMotion, poses: Poses) -> Iterator[str]:
+def _of_poses(motion: SmoothMotion, poses: Poses, ideals: Sequence[IdealMotion]) -> Iterator[str]:
     left_out = poses.duration_s - motion.duration_s
     if left_out > 0.05 * poses.duration_s:
         yield f"{left_out:.1f} s of {poses.duration_s:.1f} s are left out: holes and glitches of the poses, and their ends"
+    force = float(median(np.concatenate([quaternion.length(ideal.accel) for ideal in ideals])))
+    if force > MOST_M_S2:
+        yield f"the motion has a specific force of {force:.3g} m/s² in the median; are its positions in metres?"
 
 
 def of_noise(noise: noises.Noise, rate_hz: float) -> Iterator[str]:

@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.imu_defects import batch_of
 
-from imutool.cleaning.conventions import MISREAD, Conventions, judge, signed_permutations
+from imutool.cleaning.conventions import Conventions, judge, signed_permutations
+from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, read_right
 from imutool.cleaning.position_unit import POSITIONS
-from imutool.cleaning.rule import CleaningSettings
-from imutool.cleaning.rules.axes import TO_Z_UP
+from imutool.cleaning.rule import CleaningSettings, TopicSummary
+from imutool.cleaning.rules.axes import TO_Z_UP, Axes
 from imutool.cleaning.samples import Motion, Samples
 from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth, of_poses
@@ -116,6 +117,48 @@ def test_misread_quaternions_of_a_body_that_is_turned_against_the_gyro_are_named
     middle = 0.5 * (truth.t_ns[1:] + truth.t_ns[:-1])
     measured = np.stack([np.interp(middle, imu.t_ns, column) for column in (planted.gyro @ found.gyro.axes.T).T], axis=1)
     assert np.median(np.abs(measured - rate)) < 0.2 * np.median(np.abs(rate))
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("step_s", [0.06, 0.5, -0.2])
+def test_a_step_of_one_clock_is_no_delay(share: float, step_s: float, flown: tuple[Imu, Truth]) -> None:
+    """All poses of a log were moved by 194 ms for a step of the IMU's clock by 200 ms after a fifth of it."""
+    imu, truth = flown
+    at_ns = int(imu.t_ns[int(share * len(imu))])
+    stepped = truth._replace(t_ns=truth.t_ns + np.where(truth.t_ns > at_ns, round(step_s * 1e9), 0))
+    if step_s < 0.0:  # poses that come twice are left out
+        keep = np.diff(np.maximum.accumulate(stepped.t_ns), prepend=0) > 0
+        stepped = Truth(truth.topic, *(column[keep] for column in stepped[1:4]), truth.kind)
+    whole = TopicSummary(CleaningSettings(), len(imu), motion_of(imu), stepped)
+    delay = whole.conventions.delay
+    assert delay is not None
+    assert delay.step is not None
+    assert delay.step.after_s - delay.step.before_s == pytest.approx(step_s, abs=0.03)
+    assert abs(delay.step.at_ns - at_ns) < 0.15 * np.ptp(imu.t_ns)
+    (found,) = Axes().findings(whole)
+    assert "the clock of the IMU or that of the poses /ground_truth/pose steps by" in found.what
+    assert "fix" not in found.values
+    assert whole.pose_delay_ns == 0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_quaternions_of_another_world_than_the_positions_are_named(sign: float, flown: tuple[Imu, Truth]) -> None:
+    """NED beside ENU, either way round: not an accelerometer that is reversed, which looks alike."""
+    imu, truth = flown
+    in_ned = truth._replace(q_wb_wxyz=read_right(OTHER_WORLD, truth.q_wb_wxyz))
+    both = in_ned._replace(p_wb=truth.p_wb[:, [1, 0, 2]] * [1, 1, -1])
+    samples = motion_of(Imu(imu.t_ns, imu.gyro, sign * imu.accel))
+    for poses, quaternions in (
+        (truth, ""),
+        (both, ""),
+        (in_ned, OTHER_WORLD),
+        (both._replace(q_wb_wxyz=truth.q_wb_wxyz), OTHER_WORLD),
+    ):
+        found = judge(samples, poses, 1.0)
+        if sign > 0:
+            assert found.quaternions == quaternions
+        else:
+            assert found.quaternions == "" or quaternions
 
 
 @pytest.mark.parametrize(("unit", "up"), [("mm", "+z"), ("cm", "-z"), ("mm", "+y"), ("m", "+z")])

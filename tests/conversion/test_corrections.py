@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from imutool import registry
 from imutool.api.models import debias as debias_log
-from imutool.cleaning.conventions import MISREAD
+from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
 from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.run import convert
 from imutool.errors import LogError
+from imutool.evaluation import evaluate
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -105,6 +106,21 @@ def test_a_turned_body_of_the_poses_comes_back_to_the_imu(made: Recording, tmp_p
     with Log(tmp_path / "straight.mcap") as log:
         transforms = np.concatenate([batch.q_wb_wxyz for batch in log.pose_batches("/tf")])
     np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
+
+
+def test_quaternions_in_ned_beside_positions_in_enu_come_back(made: Recording, tmp_path: Path) -> None:
+    """Their positions were scored as if gravity pointed up."""
+    wrong = replace(made.truth, q_wb_wxyz=in_ned(made.truth).q_wb_wxyz)
+    write(replace(made, truths={"/ground_truth/pose": wrong}), tmp_path / "wrong.mcap")
+    (warning,) = inspect(tmp_path / "wrong.mcap").warnings
+    assert OTHER_WORLD in warning
+    assert evaluate(tmp_path / "wrong.mcap")[0]["ape_m"] is None
+    convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "right.mcap")
+    turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (fixed.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
+    assert (turn * true.inv()).magnitude().max() < 1e-7
+    np.testing.assert_array_equal(fixed.truth.p_wb, made.truth.p_wb)
+    assert inspect(tmp_path / "right.mcap").warnings == []
 
 
 @pytest.mark.parametrize("what", MISREAD)

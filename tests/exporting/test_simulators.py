@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import msgspec
 import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.api.logs import export
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.noise import datasheet
 from imutool.noise.datasheet import Colour, Noise
 from imutool.sensor import physics_file
@@ -166,6 +167,17 @@ def test_what_is_no_diagnosis_is_refused(tmp_path: Path) -> None:
         export(tmp_path, tmp_path / "out", format="gazebo")
     with pytest.raises(ConfigError, match="one IMU"):
         export(diagnosed(tmp_path / "d"), tmp_path / "out", format="gazebo", imu="/imu0")
+
+
+def test_the_physics_of_samples_in_g_are_refused(tmp_path: Path) -> None:
+    """Gravity that they lack became the mean of a simulator's noise: -8.9 m/s²."""
+    source = diagnosed(tmp_path / "d")
+    file = physics_file.read(source / "physics.toml")
+    (source / "physics.toml").unlink()
+    physics_file.write(msgspec.structs.replace(file, bias=Bias(accel=(-8.3, 0.1, 3.1))), source / "physics.toml")
+    with pytest.raises(DataError, match=r"an accelerometer's bias of 8.86 m/s².*imutool convert LOG OUT --fix"):
+        export(source, tmp_path / "out", format="gazebo")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from imutool.api.logs import export
+from imutool.api.models import debias as debias_recording
 from imutool.debiasing import debias
 from imutool.diagnosis.diagnose import diagnose
 from imutool.errors import DataError, ImutoolError, ModelError
@@ -21,6 +24,7 @@ from imutool.log_info.inspection import inspect
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
+from imutool.sensor.simulate import simulate
 from imutool.training.run import train
 
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -124,6 +128,23 @@ def test_every_use_of_wrong_samples_is_warned_of(
     warned("accel looks like g", name, made, tmp_path / "log.mcap", caplog)
 
 
+def test_a_diagnosis_says_in_its_remarks_what_is_wrong_with_the_samples(
+    made: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its JSON and its page had no word of it."""
+    told: list[str] = []
+
+    def begun(*given: Any) -> None:
+        told.extend(given[6])
+        raise StopError
+
+    monkeypatch.setattr("imutool.diagnosis.diagnose._beside_reference", begun)
+    write(CHANGES["accel looks like g"](made), tmp_path / "log.mcap")
+    with pytest.raises(StopError):
+        diagnose([tmp_path / "log.mcap"])
+    assert [text for text in told if "accel looks like g" in text]
+
+
 @pytest.mark.parametrize("told", CHANGES)
 def test_no_model_learns_wrong_units_axes_or_frames(told: str, made: Recording, tmp_path: Path) -> None:
     """Trained on a world whose z is down, the accelerometer got a bias of twice gravity."""
@@ -132,6 +153,39 @@ def test_no_model_learns_wrong_units_axes_or_frames(told: str, made: Recording, 
     with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
         train([log], model, method="linear")
     assert not model.exists()
+
+
+@pytest.mark.parametrize("told", CHANGES)
+def test_no_folder_states_units_axes_or_frames_that_its_numbers_have_not(told: str, made: Recording, tmp_path: Path) -> None:
+    """The header of a EuRoC table says rad/s and m/s²: readings in g passed for these."""
+    log, out = tmp_path / "log.mcap", tmp_path / "euroc"
+    write(CHANGES[told](made), log)
+    with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
+        export(log, out, format="euroc")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("told", CHANGES)
+def test_nothing_is_simulated_along_poses_of_another_world_or_unit(told: str, made: Recording, tmp_path: Path) -> None:
+    """Of the log's own samples nothing is taken, so that their units and axes count for nothing."""
+    log, out = tmp_path / "log.mcap", tmp_path / "sim.mcap"
+    write(CHANGES[told](made), log)
+    if not told.startswith(("-z up", "are in mm")):
+        simulate(log, out)
+        return
+    with pytest.raises(DataError, match=f"{re.escape(told)}.*imutool convert LOG OUT --fix"):
+        simulate(log, out)
+    assert not out.exists()
+
+
+def test_no_case_is_concealed_along_such_poses(
+    imutool: Callable[..., subprocess.CompletedProcess[str]], made: Recording, tmp_path: Path
+) -> None:
+    write(in_mm(made), tmp_path / "log.mcap")
+    done = imutool("conceal", "log.mcap", "case", cwd=tmp_path)
+    assert done.returncode == 4
+    assert "are in mm and not in m" in done.stderr
+    assert not (tmp_path / "case").exists()
 
 
 @pytest.mark.parametrize(("p_wb", "scored"), [(in_ned, False), (in_mm, False), (lambda made: made, True)])
@@ -160,6 +214,26 @@ def test_a_log_in_g_is_not_debiased_as_metres_a_second_squared(made: Recording, 
     with pytest.raises(ModelError, match=r"specific force has a median of .*--fix"):
         debias(log, out, init="0,0,0,0,0,0")
     assert not out.exists()
+
+
+def test_no_model_fits_samples_whose_axes_the_poses_contradict(
+    made: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A reversed accelerometer turned as gravity does, and the verdict in `--json` was that the model fits."""
+    wrong = CHANGES["accel contradicts"](made)
+    write(wrong, tmp_path / "log.mcap")
+    report = debias(tmp_path / "log.mcap", tmp_path / "out.mcap", model="static")
+    (scored,) = [row["fit"] for row in evaluate(tmp_path / "log.mcap", models=["static"]) if row["model"] == "static"]
+    caplog.clear()
+    fitness = debias_recording(wrong, "static").fitness
+    assert "accel contradicts the true poses" in caplog.text
+    for verdict, reasons in (
+        (report.fits["/imu0"].verdict, report.fits["/imu0"].reasons),
+        (scored["verdict"], scored["reasons"]),
+        (fitness.verdict, fitness.reasons),
+    ):
+        assert verdict == "doubtful"
+        assert reasons[0].startswith("accel contradicts the true poses")
 
 
 @pytest.mark.parametrize("angle_deg", [3.0, 5.0, 46.0])

@@ -217,6 +217,16 @@ def test_a_saturated_gyro_in_rad_s_is_no_gyro_in_degrees(tmp_path):
     assert sum(finding.count for finding in findings) == at_limit
 
 
+def test_three_times_with_steps_of_different_length_have_the_rate_of_their_median(tmp_path):
+    """No step is near the median of two: the rate was no number, with a warning of numpy's."""
+    imu = resting(400)
+    truth = still_poses(imu.t_ns[[0, 1, 100]])
+    write(Recording("three", imu, truths={"/ground_truth/pose": truth}), tmp_path / "three.mcap")
+    report = described(tmp_path / "three.mcap")
+    (poses,) = [topic for topic in report["topics"] if topic["name"] == "/ground_truth/pose"]
+    assert poses["rate_hz"] == pytest.approx(1e9 / (50 * PERIOD_NS))
+
+
 def test_a_clock_that_is_set_is_no_jitter(tmp_path):
     imu = resting()
     set_later = imu.t_ns - 50 * 365 * 86_400 * 10**9 * (np.arange(len(imu)) < len(imu) // 2)

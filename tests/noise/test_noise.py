@@ -226,6 +226,16 @@ def test_a_log_at_rest_gives_both_densities_and_says_for_how_long(tmp_path: Path
         assert all(density < bound < 1.5 * density for bound in found.at_most[sensor] if bound is not None)
 
 
+def test_noise_has_the_units_that_are_stated_whatever_those_of_the_samples(tmp_path: Path) -> None:
+    imu = still(60.0)
+    write(Recording("right", imu), tmp_path / "right.mcap")
+    write(Recording("in g", Imu(imu.t_ns, imu.gyro, imu.accel / 9.80665)), tmp_path / "g.mcap")
+    right, in_g = (identify(tmp_path / name) for name in ("right.mcap", "g.mcap"))
+    assert in_g.noise.accel_density == pytest.approx(right.noise.accel_density, rel=1e-9)
+    assert any(remark.startswith("accel is in g") and remark.endswith("converted") for remark in in_g.remarks)
+    assert not any("converted" in remark for remark in right.remarks)
+
+
 def test_a_shaken_sensor_is_said_to_vibrate(tmp_path: Path) -> None:
     imu = still(60.0)
     hum = 0.02 * np.sin(2.0 * np.pi * 13.7 * np.arange(len(imu)) / RATE_HZ)[:, None]

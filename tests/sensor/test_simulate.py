@@ -308,6 +308,15 @@ def test_a_log_without_poses_is_refused(tmp_path: Path, trajectory: Path) -> Non
         simulate(tmp_path / "imu.mcap", tmp_path / "sim.mcap")
 
 
+def test_positions_that_no_body_follows_bring_a_remark() -> None:
+    """Without an IMU beside them nothing else shows that they are in millimetres."""
+    metres = circling()
+    millimetres = replace(metres, p_wb=1e3 * metres.p_wb, v_w=None)
+    for truth, said in ((metres, 0), (millimetres, 1)):
+        remarks = simulated(recording(truth), [], NONE, RATE_HZ, 0).remarks
+        assert len([remark for remark in remarks if "in metres?" in remark]) == said
+
+
 def test_less_than_two_seconds_are_refused() -> None:
     with pytest.raises(DataError, match=r"1\.\d+ s of the motion can be trusted"):
         along(circling().rows(slice(0, 400)))

@@ -13,7 +13,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.cleaning.conventions import Conventions, Reading, axis_names
 from imutool.cleaning.finding import Finding
-from imutool.cleaning.pose_delay import LONGEST_DELAY_S
+from imutool.cleaning.pose_delay import Delay, side
 from imutool.cleaning.rule import Rule, TopicSummary
 
 DISTRUST = "the axes of {} contradict {}"
@@ -38,7 +38,8 @@ class Axes(Rule):
         if found.quaternions:  # any other finding would be of poses that the log does not hold
             whole.quaternions = found.quaternions
             what = f"the quaternions of the poses {found.topic} {found.quaternions}"
-            yield Finding("axes", "warning", what, 1, values={"fix": "quaternions w, x, y, z"}, confidence=0.95)
+            values = {"poses": found.topic, "fix": "quaternions w, x, y, z"}
+            yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
             return
         fixed = whole.settings.fix
         for finding, gyro, accel in _sensors(found):
@@ -55,21 +56,34 @@ class Axes(Rule):
             whole.world = TO_Z_UP[found.up]
             name = " (as in NED)" if found.up == "-z" else ""
             what = f"the world of the poses {found.topic} has {found.up} up{name}, not +z"
-            yield Finding(
-                "axes", "warning", what, 1, values={"fix": f"turn the world: z up instead of {found.up}"}, confidence=0.95
-            )
+            values = {"poses": found.topic, "fix": f"turn the world: z up instead of {found.up}"}
+            yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
         if found.unit != "m":
             whole.position_unit = found.unit
             what = f"the positions of the poses {found.topic} are in {found.unit} and not in m, by the accelerometer"
-            yield Finding("axes", "warning", what, 1, values={"fix": f"{found.unit} to m"}, confidence=0.95)
-        if found.delay is not None and abs(found.delay.seconds) > max(LATE_S, LATE_STDS * found.delay.std_s):
-            whole.pose_delay_ns = round(found.delay.seconds * 1e9)
-            side = "late" if found.delay.seconds > 0 else "early"
-            late_s = abs(found.delay.seconds)
-            late = f"{late_s:.3f} s" if late_s > LONGEST_DELAY_S else f"{1e3 * late_s:.0f} ms"
-            size = f"{late} {side} (standard deviation {1e3 * found.delay.std_s:.0f} ms)"
-            what = f"the stamps of the poses {found.topic} are {size} by the gyro"
-            yield Finding("axes", "warning", what, 1, values={"fix": "move the stamps of the poses"}, confidence=0.9)
+            values = {"poses": found.topic, "fix": f"{found.unit} to m"}
+            yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
+        if found.delay is not None:
+            yield from _clock(found.delay, found.topic, whole)
+
+
+def _clock(delay: Delay, topic: str, whole: TopicSummary) -> Iterator[Finding]:
+    """Finding about poses that are late, or of which one part is; that no shift corrects."""
+    if delay.step is not None:
+        if whole.jumps:  # told by `clock_jumps`
+            return
+        before, after, at_ns = delay.step
+        about_s, size = (at_ns - (whole.motion.start_ns or 0)) * 1e-9, f"{1e3 * abs(after - before):.0f} ms"
+        what = (
+            f"the clock of the IMU or that of the poses {topic} steps by {size} about {about_s:.0f} s after the start:"
+            f" by the gyro the poses are {side(before)} before it, and {side(after)} after it"
+        )
+        yield Finding("axes", "warning", what, 1, values={"steps": topic}, confidence=0.9)
+    elif abs(delay.seconds) > max(LATE_S, LATE_STDS * delay.std_s):
+        whole.pose_delay_ns = round(delay.seconds * 1e9)
+        size = f"{side(delay.seconds)} (standard deviation {1e3 * delay.std_s:.0f} ms)"
+        what = f"the stamps of the poses {topic} are {size} by the gyro"
+        yield Finding("axes", "warning", what, 1, values={"fix": "move the stamps of the poses"}, confidence=0.9)
 
 
 Proposal = tuple[Finding, Float64[np.ndarray, "3 3"] | None, Float64[np.ndarray, "3 3"] | None]

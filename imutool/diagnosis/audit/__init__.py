@@ -22,6 +22,7 @@ from imutool.diagnosis.result import Estimate
 from imutool.diagnosis.wording.quantity import grouped
 from imutool.errors import ImutoolError
 from imutool.file_location import Location
+from imutool.log_info.convention_report import check_poses
 from imutool.noise import datasheet
 from imutool.recording import Recording
 from imutool.report import Report
@@ -62,9 +63,10 @@ def audit(
 
     Raises:
         ConfigError, LogError: a log or the data sheet cannot be read.
-        DataError: the simulation has no poses that can be differentiated.
+        DataError: the simulation has no poses that can be differentiated, or they are misread or in mm.
     """
     simulated, mount = read_simulation(sim, imu=imu, truth=truth)
+    check_poses(simulated, world=False)  # of a wrong world the faults say it, and what to do
     recording, real_mount = (None, AT_BODY) if real is None else read_simulation(real, imu=imu, simulated=False)
     sheet = datasheet.read(noise)
     faults, untold = _faults(simulated, recording, sheet, (mount, real_mount))

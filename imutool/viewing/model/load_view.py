@@ -18,7 +18,7 @@ from imutool.bias.model import GAP_S
 from imutool.bias_start.aided_path import residual_prior
 from imutool.errors import ConfigError
 from imutool.file_location import Location
-from imutool.inertial.aids import Aids, find_aids, listed, parse_aids
+from imutool.inertial.aids import Aids, listed, parse_aids
 from imutool.inertial.metrics import evaluate
 from imutool.inertial.strapdown import StartPose, gaps_crossed, stretch_with_truth, with_velocity
 from imutool.recording import Imu, Poses, Recording, Scalars, seconds
@@ -68,6 +68,8 @@ def load(
     aids = None
     if asked is not None:
         with contents.opened(log) as opened:
+            from imutool.log_info.aid_search import find_aids
+
             aids = find_aids(opened, recording, asked)
     events, notes = survey_events(contents.survey)
     with_models, aided, origins = _with_models(recording, models, init, str(log), smooth, aids, notes)
@@ -116,13 +118,14 @@ def _with_models(
     from imutool.bias_start.fitness import judge
     from imutool.bias_start.initial_bias import model_samples
     from imutool.evaluation import started
-    from imutool.log_info.convention_report import warn_of_recordings
+    from imutool.log_info.convention_report import contradictions, warn_of_recordings
 
     method = "smooth" if smooth else f"truth:{TRUTH_S:g}" if init == "truth" else init
     runs, aided, origins, about = list[Run](), list[Run](), {}, recording.metadata.get("imutool", {})
-    warn_of_recordings([recording])
+    wrong = [text for whole in warn_of_recordings([recording]) for text in contradictions(whole)]
     for name, model, start in started(recording, models, init, log, smooth=smooth):
-        fit = judge(model, start, [model_samples(model, recording.imu)], about).report(name, recording.name, force=True)
+        fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong)
+        fit = fit.report(name, recording.name, force=True)
         notes += [] if fit.verdict == "fits" else [fit.sentence(f"The model {name}")]
         debiased, std = apply_with_std(model, start, recording.imu)
         runs.append(Run(name, debiased.imu, debiased.bias[:, :3], debiased.bias[:, 3:], std, method))

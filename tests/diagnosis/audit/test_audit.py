@@ -23,6 +23,7 @@ from imutool.diagnosis.audit.motion import kinematic_fit, kinematics, motion_fau
 from imutool.diagnosis.audit.noise import Expected, noise_faults
 from imutool.diagnosis.audit.spectral_lines import spectral_lines
 from imutool.diagnosis.diagnose import diagnose
+from imutool.errors import DataError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_transform
 from imutool.mcap_io.file_writer import LogWriter
@@ -180,6 +181,23 @@ def test_poses_too_slow_to_show_a_line_leave_its_cause_open(tmp_path: Path) -> N
     assert report.faults == ()
     assert "Hz (accel)" in report.not_tested["step_lines"]
     assert "step_lines" not in report.tested
+
+
+@pytest.mark.parametrize(
+    ("told", "spoil"),
+    [
+        ("are in mm and not in m", lambda poses: replace(poses, p_wb=1e3 * poses.p_wb)),
+        ("have their w in the place of x", lambda poses: replace(poses, q_wb_wxyz=poses.q_wb_wxyz[:, [3, 0, 1, 2]])),
+    ],
+)
+def test_poses_in_mm_or_with_misread_quaternions_are_no_fault_of_the_imu(
+    told: str, spoil: Callable[[Poses], Poses], tmp_path: Path
+) -> None:
+    """Of those in mm it said that the accelerometer holds gravity alone, of these that it is left-handed and in the world."""
+    sim, _, _ = bench.made("none", 1000, DURATION_S)
+    write(replace(sim, truths={"/ground_truth/pose": spoil(sim.truth)}), tmp_path / "sim.mcap")
+    with pytest.raises(DataError, match=f"{told}.*imutool convert LOG OUT --fix"):
+        audit(tmp_path / "sim.mcap")
 
 
 def test_gravity_left_out_is_found_in_the_plane_too() -> None:

@@ -29,6 +29,7 @@ from imutool.recording import Imu, Recording
 from imutool.sensor.made_up_flight import flight
 from imutool.viewing.model.events import FINDINGS
 from imutool.viewing.model.load_view import MAX_ENTRIES, MAX_VALUE_LENGTH, build, load, provenance
+from imutool.viewing.model.read_log import read_log
 from imutool.viewing.model.run_data import Run
 
 LAST_BITS = 1e-12  # rad/s and m/s²: the bias in blocks and in one go
@@ -351,4 +352,4 @@ def test_of_several_imus_the_one_that_was_debiased_is_shown(made: Recording, tmp
     with pytest.raises(LogError, match="the log has 2 IMU topics"):
         load(two)
     debias(two, tmp_path / "debiased.mcap", model="static", imus=["/imu_2/imu"])
-    assert load(tmp_path / "debiased.mcap").recording.imu_topic == "/imu_2/imu"
+    assert read_log(tmp_path / "debiased.mcap").recording.imu_topic == "/imu_2/imu"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from support import driven
 from support.driven import LEVER_B, R_VB, STILL_S, Drive
 
 from imutool.errors import ConfigError, DataError, LogError
-from imutool.inertial.aids import Aids, find_aids, parse_aids
+from imutool.inertial.aids import Aids, parse_aids
+from imutool.log_info.aid_search import find_aids
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses
@@ -147,6 +149,106 @@ def test_the_truth_is_no_aid_by_any_name(drive: Drive, tmp_path: Path) -> None:
     assert found(path, "odometry=/ekf/odom").odometry is not None
     with pytest.raises(DataError, match="/ekf/odom is the truth"):
         found(path, "odometry=/ekf/odom", truth="/ekf/odom")
+
+
+def of_wheels(drive: Drive, speed: float = 1.0, turn: float = 1.0) -> driven.Topic:
+    """Wheel odometry whose speed and turns are multiplied."""
+    return driven.wheels(replace(drive, speed=speed * drive.speed, turn=turn * drive.turn))
+
+
+@pytest.mark.parametrize(
+    ("told", "changes"),
+    [
+        ("/wheels accelerates 3.* times as much as the IMU", {"speed": 3.6}),
+        ("/wheels accelerates 9.*e.02 times as much as the IMU", {"speed": 1000.0}),
+        ("/wheels turns left where the IMU turns right", {"turn": -1.0}),
+        ("explain 0% of the gyro's motion", {"turn": 57.3}),
+    ],
+)
+def test_wheels_in_another_unit_or_frame_are_refused(
+    told: str, changes: dict[str, float], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Speeds in km/h made a path of 0.7 m one of 2.3 m on FETCH, without a word."""
+    drive = driven.drive(duration_s=40.0)
+    path = driven.write(tmp_path / "a.mcap", drive.imu, drive.truth, {"/wheels": of_wheels(drive, **changes)})
+    with pytest.raises(DataError, match=told):
+        found(path, "odometry")
+    assert found(path, "auto").signals == {"stops": ""}
+    assert "the aid odometry is left out: " in caplog.text
+
+
+def test_wheels_that_accelerate_otherwise_are_refused(tmp_path: Path) -> None:
+    """As velocities in the world's frame do; their own size had passed for evidence of the mount."""
+    drive, other = (driven.drive(seed, duration_s=40.0) for seed in (0, 1))
+    path = driven.write(tmp_path / "a.mcap", drive.imu, drive.truth, {"/wheels": of_wheels(replace(drive, speed=other.speed))})
+    with pytest.raises(DataError, match="the motion does not show how the IMU is mounted in the frame of /wheels"):
+        found(path, "odometry")
+
+
+def test_wheels_whose_radius_is_wrong_still_aid(tmp_path: Path) -> None:
+    drive = driven.drive(duration_s=40.0)
+    for number, speed in enumerate((0.8, 1.2, -1.0)):  # or an IMU that looks backwards
+        topics = {"/wheels": of_wheels(drive, speed=speed)}
+        assert found(driven.write(tmp_path / f"{number}.mcap", drive.imu, drive.truth, topics), "odometry").odometry is not None
+
+
+def test_wheels_that_are_late_get_the_clock_of_the_imu(tmp_path: Path) -> None:
+    drive = driven.drive(duration_s=40.0)
+    kind, t_ns, rows = driven.wheels(drive)
+    both = []
+    for number, late_ns in enumerate((0, 400_000_000)):
+        path = driven.write(tmp_path / f"{number}.mcap", drive.imu, drive.truth, {"/wheels": (kind, t_ns + late_ns, rows)})
+        both.append(found(path, "odometry"))
+    right, late = both
+    assert right.signals["odometry"] == "/wheels"
+    assert re.fullmatch(r"/wheels \(0\.[34]\d\d s late by the gyro, corrected\)", late.signals["odometry"])
+    assert right.odometry is not None
+    assert late.odometry is not None
+    off_ns = int(late.odometry.poses.t_ns[50]) - int(right.odometry.poses.t_ns[50])
+    assert abs(off_ns) < 30_000_000
+
+
+def climbing(truth: Poses) -> Poses:
+    """Poses whose height goes up and down by some metres."""
+    rise = np.column_stack([np.zeros((len(truth), 2)), 3.0 * np.sin(1e-9 * (truth.t_ns - truth.t_ns[0]))])
+    return replace(truth, p_wb=truth.p_wb + rise, v_w=None)
+
+
+@pytest.mark.parametrize(
+    ("told", "factor", "offset"),
+    [
+        ("falls where the true height rises", -1.0, 0.0),
+        ("changes by 3.2. times", 3.28084, 0.0),
+        ("is from 99997 to 100003", 1.0, 1e5),
+    ],
+)
+def test_a_height_of_another_sign_or_unit_is_refused(told: str, factor: float, offset: float, tmp_path: Path) -> None:
+    drive = driven.drive(duration_s=30.0)
+    t_ns, truth = drive.imu.t_ns[::10], climbing(drive.truth)
+    height = 3.0 * np.sin(1e-9 * (t_ns - truth.t_ns[0]))
+    rows = [{"data": float(factor * h + offset)} for h in height]
+    path = driven.write(tmp_path / "a.mcap", drive.imu, truth, {"/altimeter": ("std_msgs/msg/Float64", t_ns, rows)})
+    with pytest.raises(DataError, match=told):
+        found(path, "barometer")
+
+
+def test_a_height_that_ends_stands_still_or_is_late_says_so(tmp_path: Path) -> None:
+    drive = driven.drive(duration_s=30.0)
+    t_ns, truth = drive.imu.t_ns[::10], climbing(drive.truth)
+    noise = 0.05 * np.random.default_rng(0).normal(size=len(t_ns))
+
+    def words(height: np.ndarray, stamps: np.ndarray) -> str:
+        kind, _, rows = driven.pressure(stamps, height)
+        return found(driven.write(tmp_path / "a.mcap", drive.imu, truth, {"/air": (kind, stamps, rows)}), "barometer").signals[
+            "barometer"
+        ]
+
+    height = 3.0 * np.sin(1e-9 * (t_ns - truth.t_ns[0])) + noise
+    half = len(t_ns) // 2
+    assert words(height, t_ns) == "/air.fluid_pressure (Pa)"
+    assert words(height[:half], t_ns[:half]) == "/air.fluid_pressure (Pa), 50% of the time"
+    assert "unchanged for 15 s" in words(np.where(np.arange(len(t_ns)) < half, height, height[half]), t_ns)
+    assert "2.0 s late by the true height" in words(height, t_ns + 2_000_000_000)
 
 
 @pytest.mark.parametrize("exact", [False, True])
