@@ -146,7 +146,7 @@ def axis_squares(found: Fit) -> Axes:
 
 
 def kurtosis(found: Fit) -> Axes:
-    """Kurtosis of white residuals by axis: 3 of normal noise, far more where a few samples hold the squares."""
+    """Kurtosis of white residuals by axis: 3 of normal noise, more where few samples err."""
     each = zip(found.logs, found.residuals, found.bias, strict=True)
     rows = np.concatenate([(r - log.constants * b)[log.rows(found.part)] for log, r, b in each])
     return np.asarray((rows**4).mean(axis=0) / np.maximum((rows**2).mean(axis=0) ** 2, 1e-300))
