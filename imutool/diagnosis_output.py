@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, closed_loop, is_worth_a_round
+from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, closed_loop, figure, is_worth_a_round
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
 from imutool.diagnosis.result import Diagnosis
@@ -117,10 +117,12 @@ def diagnose(
     """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
 
     With `close` its physics is simulated along `sim` or the recording's poses. What is missing against that log begins another
-    search, for some rounds.
+    search, for some rounds. `metric` is called with `sim` before the search; if it fails with the log that closes the loop, a
+    remark of the diagnosis says so.
 
     Raises:
-        ConfigError: as `refuse`; with `close` several recordings, no folder, or an input that is no file or would be replaced.
+        ConfigError: as `refuse`; with `close` several recordings, no folder, or an input that is no file or would be replaced;
+            `metric` gives no number for `sim`.
         LogError: no such topic.
         DataError: no truth and no simulation, or too little shared time.
     """
@@ -139,6 +141,8 @@ def diagnose(
     if folder is None:
         return search(), []
     refuse(folder, overwrite=overwrite)
+    given = local(sim, "close") if close and sim is not None else None
+    was = None if metric is None or given is None else figure(metric, given)
     drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
     diagnosis = search()
     if tell is not None:
@@ -146,11 +150,11 @@ def diagnose(
     remarks = write(diagnosis, folder, logs=look, drawn=drawn, overwrite=overwrite)
     if close:
         rewrite = partial(write, folder=folder, logs=look, overwrite=True)
-        given = None if sim is None else local(sim, "close")
         simulated: Callable[..., object] = partial(simulate, local(reals[0], "close"), truth=truth)
         if given is not None:
             simulated = partial(simulate_again, reals[0], given, imu=imu, settings=settings)
-        diagnosis = _closed(diagnosis, against, search, rewrite, simulated, folder, given, metric=metric, overwrite=overwrite)
+        own = None if metric is None or was is None else (metric, was)
+        diagnosis = _closed(diagnosis, against, search, rewrite, simulated, folder, metric=own, overwrite=overwrite)
     return diagnosis, remarks
 
 
@@ -172,11 +176,11 @@ def _closed(
     rewrite: Callable[[Diagnosis], object],
     simulated: Callable[..., object],
     folder: Path,
-    sim: Path | None,
     *,
-    metric: Callable[[Path], float] | None,
+    metric: tuple[Callable[[Path], float], float] | None,
     overwrite: bool,
 ) -> Diagnosis:
+    """Diagnosis with its closed loop; `metric` is the user's, and its figure of the simulation that was given."""
     log = folder / CLOSED_LOG
     for number in range(1, ROUNDS + 1):
         simulated(log, physics=folder / EFFECT, overwrite=overwrite or number > 1)
@@ -188,7 +192,11 @@ def _closed(
             break
         first = better
         rewrite(first)
-    done = replace(first, closed=closed_loop(first, again, log, metric=metric, before=sim, rounds=number))
+    try:
+        figures = None if metric is None else (metric[1], figure(metric[0], log))
+    except ImutoolError as error:  # for a figure no diagnosis is thrown away
+        figures, first = None, replace(first, remarks=(*first.remarks, f"The metric is not compared: {error}"))
+    done = replace(first, closed=closed_loop(first, again, log, metric=figures, rounds=number))
     (folder / FINDINGS).write_text(json_text(done.report), encoding="utf-8")
     if find_spec("matplotlib") is not None:
         from imutool.viewing.html.diagnosis_page import write as write_page

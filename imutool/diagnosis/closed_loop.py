@@ -23,7 +23,7 @@ from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.result import ClosedLoop, Compared, Diagnosis
 from imutool.diagnosis.to_sensor_files import NO_EFFECT
 from imutool.diagnosis.wording.quantity import symbol
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, ImutoolError
 from imutool.units import ASCII_UNITS, SENSORS
 
 CLOSED_LOG = "closed.mcap"
@@ -43,18 +43,17 @@ def closed_loop(
     again: Diagnosis,
     log: Path,
     *,
-    metric: Callable[[Path], float] | None = None,
-    before: Path | None = None,
+    metric: tuple[float, float] | None = None,
     rounds: int = 1,
 ) -> ClosedLoop:
     """Figures of a recording and two simulations: the given one, and one with found physics.
 
-    `metric` maps a simulation's log to the user's figure.
+    `metric` is the user's figure of both (`figure`).
     """
     other = ANOTHER_MOTION in again.remarks and ANOTHER_MOTION not in first.remarks  # then its figures are of other poses
     compared = [] if other else [*_compared(_shared(first, again))]
-    if metric is not None and before is not None:
-        compared.append(Compared("metric", _figure(metric, before), _figure(metric, log), "-"))
+    if metric is not None:
+        compared.append(Compared("metric", *metric, "-"))
     given = {finding.effect for finding in first.findings} & STAYS
     missing = tuple(finding.effect for finding in again.findings if finding.effect not in given)
     white = all(again.unexplained[sensor].white for sensor in SENSORS if sensor in again.unexplained)  # what was simulated
@@ -94,8 +93,19 @@ def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
     return metric
 
 
-def _figure(metric: Callable[[Path], float], log: Path) -> float:
-    value: object = metric(log)
+def figure(metric: Callable[[Path], float], log: Path) -> float:
+    """Figure of a simulation's log by the user's metric.
+
+    Raises:
+        ConfigError: the metric fails, or gives no number.
+    """
+    try:
+        value: object = metric(log)
+    except ImutoolError:
+        raise
+    except Exception as error:  # whatever a user's function raises
+        what = f"`metric` fails for {log.name}: {type(error).__name__}: {error}"
+        raise ConfigError(what, expected="a number", fix="Correct the function, or leave `metric` out") from error
     try:
         return float(value)  # type: ignore[arg-type]  # whatever a user's function gives
     except (TypeError, ValueError) as error:

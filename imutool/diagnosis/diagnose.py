@@ -127,6 +127,7 @@ def _beside_reference(
     The selection of effects comes with it; none without a reference.
     """
     simulated = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0]
+    warn_of_recordings([] if simulated is None else [simulated])
     of_sim, sim_selection, another = tuple[Finding, ...](), None, list[str]()
     if sim is not None and simulated is not None and is_another_motion(recordings, simulated, signals, settings.alignment):
         report(0, 4, "the simulation, of another motion")
@@ -239,8 +240,6 @@ def unnamed_candidates(pairs: Sequence[Pair]) -> list[tuple[Effect, ...]]:
     like = unnamed.like(pairs)
     return [tuple(unnamed.driven(pairs)), (*unnamed.curves(like), *unnamed.terms(like))]
 
-
-# ── sizes of chosen effects ──
 
 EVERY_UNIT = (
     "mount_rotation",

@@ -6,6 +6,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Meta
+from scipy.integrate import trapezoid
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter, uniform_filter1d
 from scipy.signal import ShortTimeFFT, butter, sosfiltfilt
@@ -46,10 +47,14 @@ class _Shared(NamedTuple):
 
 
 class NoiseLeft(NamedTuple):
-    """One-sided density of the noise that a filter leaves, by frequency: a motion hides it."""
+    """One-sided density of the noise that a filter leaves, by frequency: a motion hides it.
+
+    `unshared` is the deviation of what a recording does not share of a sample before the filter: no noise is larger.
+    """
 
     f_hz: Float64[np.ndarray, " f"]
     density: Float64[np.ndarray, "f k"]
+    unshared: Float64[np.ndarray, " k"] | float = np.inf
 
 
 def wiener_filter(
@@ -107,11 +112,12 @@ def denoised(
         gain *= ~_apart(shared, settings)[:, None]
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
     left = density * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0]
+    unshared: Float64[np.ndarray, " k"] | float = np.inf
     left = np.where(untold, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
     if with_recorded is not None:  # noise is not shared: a vibration looks like white noise, and a recording shares it
         most = uniform_filter1d(all_of_it, settings.short_time_parts, axis=0, mode="nearest")
-        left = np.minimum(left, with_recorded.own * most)
-    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left)
+        left, unshared = np.minimum(left, own := with_recorded.own * most), np.sqrt(trapezoid(own, stft.f, axis=0))
+    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left, unshared)
 
 
 def _line(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
@@ -129,7 +135,8 @@ def recorded_at(
 ) -> Float64[np.ndarray, "m 6"]:
     """Recorded samples at the times of a simulation; NaN outside of them.
 
-    If its rates `gyro` are given, clocks of two rates are brought to one: half a period of drift hides what is shared.
+    If its rates `gyro` are given, clocks are brought to one rate and offset: half a period of drift hides what is shared, and
+    so does a lag, of a filter too, whose turn of the phase differs between frequencies of one mean.
     """
     own_s, columns = seconds(imu.t_ns, start_ns), [*imu.gyro.T, *imu.accel.T]
     own_s = own_s if gyro is None else own_s + _drift_s(own_s, imu.gyro, t_s, gyro)
@@ -163,7 +170,7 @@ def _drift_s(
         squares.append(float((left**2).sum()))
         columns = np.stack([since[:, j, None] * slope for j in (0, 1)], axis=2).reshape(-1, 2)
         line = line + np.linalg.lstsq(columns, left.ravel(), rcond=None)[0]
-    moved = abs(line[1]) > 1.0 / rate_hz and abs(line).max() < MOST_S and squares[-1] < squares[0]
+    moved = 1.0 / rate_hz < abs(line).max() < MOST_S and squares[-1] < squares[0]
     return line[0] + (own_s - at.mean()) / np.ptp(at) * line[1] if moved else np.zeros(len(own_s))
 
 
@@ -181,15 +188,15 @@ def _noise_std(
     out, untold = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1)), np.zeros(top.shape[2], bool)
     for k, (column, unexplained) in enumerate(zip(shared.shared.T, shared.own.T, strict=True) if shared is not None else ()):
         own = np.flatnonzero(_apart(column, settings))
-        by_chance = settings.short_time_parts  # of frequencies whose means overlap
-        if column.sum() > by_chance and len(own) > SMOOTH * settings.short_time_parts:
+        beyond_chance = column.sum() > settings.short_time_parts  # frequencies whose means overlap
+        if beyond_chance and len(own) > SMOOTH * settings.short_time_parts:
             level = median_filter(power[own, k], SMOOTH * settings.short_time_parts, mode="nearest")  # a line is no noise
             out[:, k] = np.interp(np.arange(len(out)), own, level)
-            most = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
-            if white:  # beside a vibration that is not shared it would be too much
-                out[column, k] = np.clip(most[column], NO_NOISE * power[:, k].max(), out[column, k])
         elif column.mean() > ALMOST_ALL or not white:
             out[:, k], untold[k] = NO_NOISE * power[:, k].max(), white
+        if white and beyond_chance and not untold[k]:  # beside a vibration that is not shared it would be too much
+            most = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
+            out[column, k] = np.clip(most[column], NO_NOISE * power[:, k].max(), out[column, k])
     return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold
 
 

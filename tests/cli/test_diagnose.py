@@ -169,6 +169,27 @@ def test_a_loop_closes_in_python_with_a_figure_of_ones_own(folder: Path, tmp_pat
     assert (place / CLOSED_LOG).read_bytes() == before
 
 
+@pytest.mark.parametrize("fails_for", ["ideal", "closed"])
+def test_a_metric_that_fails_costs_no_diagnosis(folder: Path, tmp_path: Path, fails_for: str) -> None:
+    """With the given simulation it fails before the search; with the one that closes the loop, the answer stays."""
+    script, place = tmp_path / "figure.py", tmp_path / "out"
+    script.write_text(f"import sys\nprint('no figure' if '{fails_for}' in sys.argv[2] else 0.5)\n")
+    closed = ("--close", "--metric", script, "-o", place)
+    said = run("diagnose", folder / "null.mcap", "--sim", folder / "ideal.mcap", *closed)
+    if fails_for == "ideal":
+        assert said.exit_code == ConfigError.exit_code
+        assert "printed no number for ideal.mcap: no figure" in said.stderr
+        assert not place.exists()
+        return
+    assert said.exit_code == 0, said.output
+    assert "Nothing but a constant bias" in said.stdout
+    assert "The metric is not compared: " in said.stdout
+    assert "printed no number for closed.mcap: no figure" in said.stdout
+    told = json.loads((place / "findings.json").read_text())
+    assert not told["closed"]["mismatch"]
+    assert "metric" not in [one["figure"] for one in told["closed"]["compared"]]
+
+
 def test_the_conclusion_comes_first(diagnosed: tuple[Path, Done]) -> None:
     place, said = diagnosed
     lines = said.stdout.splitlines()

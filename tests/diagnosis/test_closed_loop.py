@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from imutool.diagnosis.closed_loop import CLOSED_LOG, closed_loop, is_worth_a_round
+from imutool.diagnosis.closed_loop import CLOSED_LOG, closed_loop, figure, is_worth_a_round
 from imutool.diagnosis.compare_findings import ANOTHER_MOTION
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.result import Diagnosis, Finding, HeldOut, Located, Traces, Unexplained
@@ -78,11 +78,13 @@ def test_a_second_simulation_that_no_longer_moves_alike_is_no_closer() -> None:
 
 def test_a_metric_gives_a_number() -> None:
     first, log = diagnosis([(0.0, 20.0, 1.0)]), Path(CLOSED_LOG)
-    loop = closed_loop(first, first, log, metric=lambda _: np.float32(0.5), before=log)  # type: ignore[arg-type,return-value]
+    loop = closed_loop(first, first, log, metric=(figure(lambda _: np.float32(0.5), log),) * 2)  # type: ignore[arg-type,return-value]
     assert loop.compared[-1].before == loop.compared[-1].after == 0.5
     assert json_values(loop)["compared"][-1]["after"] == 0.5
     with pytest.raises(ConfigError, match=r"'abc' for closed\.mcap; expected a number"):
-        closed_loop(first, first, log, metric=lambda _: "abc", before=log)  # type: ignore[arg-type,return-value]
+        figure(lambda _: "abc", log)  # type: ignore[arg-type,return-value]
+    with pytest.raises(ConfigError, match=r"`metric` fails for closed\.mcap: ZeroDivisionError: division by zero; .* leave"):
+        figure(lambda _: 1 / 0, log)
 
 
 def test_what_no_simulation_changes_is_not_missing() -> None:

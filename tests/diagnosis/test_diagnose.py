@@ -120,6 +120,24 @@ def test_noise_and_a_constant_bias_are_no_mismatch_beside_true_poses_either(made
     assert not diagnose([real]).mismatch
 
 
+def test_a_simulation_without_gravity_is_told(
+    nothing: tuple[Path, Path, Diagnosis], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without an attitude no effect says so, and an arm stood for a part of it."""
+    real, sim, _ = nothing
+    ideal, recorded = read(sim), read(real)
+    R_bw = Rotation.from_quat(ideal.truth.at(ideal.imu.t_ns)[0].q_wb_wxyz, scalar_first=True).inv()
+    accel = ideal.imu.accel - R_bw.apply([0.0, 0.0, 9.81])
+    write(replace(ideal, imu=replace(ideal.imu, accel=accel), truths={}), tmp_path / "weightless.mcap")
+    write(replace(recorded, truths={}), tmp_path / "real.mcap")
+    diagnose([tmp_path / "real.mcap"], tmp_path / "weightless.mcap")
+    assert [
+        line
+        for line in caplog.messages
+        if line.startswith(f"{ideal.name} {ideal.imu_topic}: accel reads") and "gravity" in line
+    ]
+
+
 def test_times_count_from_the_start_of_the_log_also_where_its_poses_begin_later(made: Made, tmp_path: Path) -> None:
     real, _ = made({"lever_arm": ARM}, real_poses=True)
     recording = read(real)

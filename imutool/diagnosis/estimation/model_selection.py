@@ -28,7 +28,12 @@ from imutool.diagnosis.estimation.observability import (
     without_implausible,
 )
 from imutool.diagnosis.estimation.significance import bic, gain_for, unnamed_count
-from imutool.diagnosis.estimation.trial.lag_start import beside_offset, with_form_of_low_pass, without_unseen_low_pass
+from imutool.diagnosis.estimation.trial.lag_start import (
+    beside_offset,
+    with_delay_of_accel,
+    with_form_of_low_pass,
+    without_unseen_low_pass,
+)
 from imutool.diagnosis.estimation.trial.model_error import LowPassError
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.verdicts import Trial
@@ -97,6 +102,7 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
             better = with_finer_curve(search.logs, better)
             if better.chosen[-1][0].name in LOW_PASSES:
                 better = with_form_of_low_pass(search.logs, better, search.named)
+                better = with_delay_of_accel(search.logs, better, search.named)
             before, now = now.objective, search.pruned(search.exchanged(better))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))
@@ -190,7 +196,7 @@ class _Search(Trial):
             rivals = self.rivals(now.keys.index(effect.key), now).values()  # a name that leaves no more says more
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
-        now = with_form_of_low_pass(self.logs, now, self.named)
+        now = with_delay_of_accel(self.logs, with_form_of_low_pass(self.logs, now, self.named), self.named)
         now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
         log_p, most = self.candidates.log_p, self.threshold

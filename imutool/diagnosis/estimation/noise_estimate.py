@@ -145,6 +145,13 @@ def axis_squares(found: Fit) -> Axes:
     return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
 
 
+def kurtosis(found: Fit) -> Axes:
+    """Kurtosis of white residuals by axis: 3 of normal noise, more where few samples err."""
+    each = zip(found.logs, found.residuals, found.bias, strict=True)
+    rows = np.concatenate([(r - log.constants * b)[log.rows(found.part)] for log, r, b in each])
+    return np.asarray((rows**4).mean(axis=0) / np.maximum((rows**2).mean(axis=0) ** 2, 1e-300))
+
+
 def ridge_fit(
     A: Float64[np.ndarray, "n q"], y: Float64[np.ndarray, " n"], rows: Bool[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:

@@ -181,12 +181,12 @@ def _simulated(
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
+    noise = np.minimum(noise, left.unshared)  # a vibration looks like white noise, and a recording shares it
     clean = refined(clean, white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)))
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))
     t_ns = start_ns + np.round(t_s * 1e9).astype(np.int64)
-    own = _attitude(sim, t_ns + round(shift_s * 1e9))
-    R_wb = _attitude(real, t_ns) if own is None else own
+    R_wb = own if (own := _attitude(sim, t_ns + round(shift_s * 1e9))) is not None else _attitude(real, t_ns)
     return IdealMotion(t_s, clean[:, :3], clean[:, 3:], alpha, R_wb, _channels(real, t_ns)), noise, None if own_poses else left
 
 

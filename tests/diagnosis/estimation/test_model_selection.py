@@ -575,6 +575,36 @@ def test_a_low_pass_of_one_sensor_is_told_on_it(sensor: str) -> None:
     assert sure(found, f"second_order_low_pass:{sensor}", [8.0, 0.7])
 
 
+@pytest.mark.parametrize("late_s", [0.004, 0.008])
+def test_a_late_accelerometer_is_no_low_pass_of_it(late_s: float) -> None:
+    """A clock that is late and a gyro that is ahead of it: one alone explains little, and a filter or a mount was named."""
+    felt, rng, band = planted.rich(), np.random.default_rng(6), butter(4, 15.0, fs=planted.RATE_HZ, output="sos")
+    gyro, accel = (
+        x + sosfilt(band, size * rng.normal(size=x.shape), axis=0) for x, size in ((felt.gyro, 0.2), (felt.accel, 2.0))
+    )
+    felt = replace(felt, gyro=gyro, accel=accel)
+    late, plain = (planted.ideal(felt, planted.acting(of)) for of in ({"clock_offset": [-late_s]}, {}))
+    added = np.zeros_like(plain)
+    added[:, 3:] = (late - plain)[:, 3:]
+    found = asked(planted.pair(felt, added=added), beyond=False)
+    assert sorted(names(found)) == ["clock_offset", "gyro_delay"]
+    assert sure(found, "clock_offset", [-late_s])
+    assert sure(found, "gyro_delay", [-late_s])
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_dead_band_of_noisy_readings_is_as_unsure_as_its_edges_are(seed: int) -> None:
+    """Without noise inside the band chi-square is small, but a few samples at its edges hold all of it."""
+    felt, width = planted.rich(seed, 40.0), 0.06
+    pair = planted.pair(replace(felt, gyro=0.15 * felt.gyro, alpha=0.15 * felt.alpha), bias=np.zeros(6), seed=seed)
+    real = pair.real.copy()
+    real[:, :3] = np.where(np.abs(real[:, :3]) < width, 0.0, real[:, :3])
+    every = [one for one in planted.catalogue() if one.name != "second_order_low_pass"]
+    found = select_effects([whitened(replace(pair, real=real), every, pair.settings.band)], planted.catalogue())
+    assert names(found) == ["gyro_dead_band"]
+    assert sure(found, "gyro_dead_band", [width])
+
+
 def test_a_low_pass_above_what_samples_can_show_is_told_by_its_delay() -> None:
     """Beside an exact simulation; what smoothed poses say ends six times above their band, and beyond it is a delay."""
     pair = planted.pair(planted.shaken(), {"low_pass": [48.0]})

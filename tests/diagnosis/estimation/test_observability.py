@@ -82,6 +82,14 @@ def test_a_mount_has_no_negative_share(shares: list[float], beyond: bool) -> Non
     assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
 
 
+@pytest.mark.parametrize(("zeta", "beyond"), [(0.9, False), (17.6, True)])
+def test_an_overdamped_mount_is_a_lag_and_no_answer(zeta: float, beyond: bool) -> None:
+    """Shares above one of such a mount are a delay (Padé)."""
+    log = planted.weighed(planted.pair(planted.shaken(2)))
+    ((effect, theta),) = planted.acting({"mount_resonance": [1.0, zeta, 1.9, 2.0, 1.9]})
+    assert beyond_the_band(effect, theta, [log], SETTINGS) == beyond
+
+
 @pytest.mark.parametrize(("sim_noise", "beyond"), [(0.0, False), (1e-3, False), (1e-2, True)])
 def test_a_dead_band_within_the_noise_of_a_simulation_is_that_noise(sim_noise: float, beyond: bool) -> None:
     """In rad/s of a sample: what the filter leaves of it at rest, no gyro reads."""

@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
-from imutool.diagnosis.reference.coverage import align, align_all, repeats
+from imutool.diagnosis.reference.coverage import align, align_all, new_samples, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
@@ -111,6 +111,23 @@ def test_splines_through_poses_take_nothing_of_a_motion_in_their_band() -> None:
     z = np.interp(pair.ideal.t_s, t_s, sensed[:, 2])
     one, other = (sosfiltfilt(band, x - GRAVITY_M_S2)[500:-500] for x in (z, pair.ideal.accel[:, 2]))
     assert one @ other / (one @ one) == pytest.approx(1.0, abs=3.5e-3)
+
+
+@pytest.mark.parametrize("slow", [("gyro",), ("gyro", "accel")])
+@pytest.mark.parametrize("times", [2, 3])
+def test_a_topic_that_is_faster_than_its_sensor_is_read_at_the_rate_of_the_sensor(slow: tuple[str, ...], times: int) -> None:
+    """A reading that is held is late by half of the samples that it is held for, which looks like a low-pass."""
+    real = made(EXACT)
+    imu, sim = along(real, 1).imu, along(real)
+    last = np.arange(len(imu)) // times * times
+    held = replace(imu, **{sensor: getattr(imu, sensor)[last] for sensor in slow})
+    (pair,), remarks = align_all([replace(real, imu=held)], sim, None, DiagnoseSettings())
+    assert pair.period_s == pytest.approx(times * imu.period_s)
+    np.testing.assert_array_equal(pair.real[:, 3:], imu.accel[::times][: len(pair.real)])
+    assert f"{np.count_nonzero(last != np.arange(len(imu)))} samples repeat gyro or accel of the one before" in remarks[0]
+    stuck = imu.gyro.copy()
+    stuck[1000:] = stuck[999]
+    assert len(new_samples(replace(real, imu=replace(imu, gyro=stuck))).imu) == len(imu)
 
 
 def test_a_sample_that_repeats_the_one_before_does_not_count() -> None:

@@ -81,6 +81,23 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
     return now
 
 
+def with_delay_of_accel(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+    """Fit with a delay of the accelerometer for a low-pass of it that is clearly worse (BIC).
+
+    A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
+    that the search finds the filter of this lag.
+    """
+    both = [of for name in ("clock_offset", "gyro_delay") for of in named if of.name == name and of.key not in now.keys]
+    for k, (effect, theta) in enumerate(now.chosen):
+        if len(both) == 2 and effect.name in LOW_PASSES and effect.sensors == ("accel",):
+            start = np.array([-Design.of(effect, theta).lag_s])
+            late = (*now.chosen[:k], *now.chosen[k + 1 :], *((of, start) for of in both))
+            least = bic(now) - logs[0].pair.settings.search.clearly_better
+            trial = fit(logs, late, near=now, give_up_above=now.objective)
+            return trial if bic(trial) < least else now
+    return now
+
+
 def _sensors(chosen: Chosen) -> list[tuple[str, ...]]:
     """Sensors on which low-passes act."""
     return sorted(effect.sensors for effect, _ in chosen if effect.name in LOW_PASSES)

@@ -11,7 +11,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
-from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise
+from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise, kurtosis
 from imutool.diagnosis.estimation.observability import beyond_the_band, unidentified
 from imutool.diagnosis.estimation.significance import (
     Scatter,
@@ -121,6 +121,7 @@ class Trial:
         """
         exact, verdicts = all(log.pair.exact for log in self.logs), list[SelectedEffect]()
         white = exact and whole.objective < self.settings.white_chi_square * whole.numbers  # as the noise that is known
+        white = white and bool((kurtosis(whole) < self.settings.white_kurtosis).all())  # few samples may hold all squares
         scattered = None if white else scatter(whole.logs, whole, whole.part, self.settings.robust_block_s)
         if self._verdict(first, gain_of(whole, first, 1), whole, scattered) is None:  # no fit of the others leaves more
             return verdicts
