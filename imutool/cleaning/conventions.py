@@ -21,7 +21,7 @@ from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, read_right
 from imutool.cleaning.position_unit import POSITIONS, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
-from imutool.cleaning.truth import Truth, force_in_world, turning
+from imutool.cleaning.truth import Truth, axis_of_gravity, force_in_world, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
@@ -31,7 +31,6 @@ SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at 
 WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
 MOST_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
-
 FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
 
 
@@ -96,8 +95,7 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
     late_ns = 0 if delay is None else round(delay.seconds * 1e9)
     shifted = truth._replace(t_ns=truth.t_ns - late_ns)
     gyro, shifted, quaternions = _turns_against_poses(step, mean, motion.middle_ns, shifted)
-    force = mean[:, 3:] * accel_factor
-    accel, up, unit, other = _accel_against_poses(step, force, motion.middle_ns, shifted, gyro, relative)
+    accel, up, unit, other = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
     return Conventions(truth.topic, gyro, accel, relative, up, delay, unit, quaternions or other)
 
 
@@ -260,7 +258,7 @@ def _accel_against_poses(
 ) -> tuple[Reading | None, str | None, str, str]:
     """Axes of the accelerometer by the poses, their axis that is up, unit of positions, and `OTHER_WORLD` or nothing.
 
-    a_w + g up = R_wb axes f. Without acceleration (axes, up) and (-axes, -up) fit alike; then neither is told.
+    a_w + g up = R_wb axes f. Without acceleration, or in noise, (axes, up) and (-axes, -up) fit alike: the up of right axes.
     """
     at_ns, q_wb, a_w = force_in_world(truth)
     use, first_s, _ = usable(at_ns, at_ns + 1, start_ns, step)
@@ -283,18 +281,20 @@ def _accel_against_poses(
     unit = position_unit(residuals, len(readings), blocks)
     a_w = POSITIONS[unit] * a_w
     choice = choose(np.stack([np.linalg.norm(residuals(1.0, row), axis=1) for row in range(len(readings))]), blocks)
+    straight = gyro is not None and gyro.sole and gyro.as_is
     left = np.zeros((0, 3)) if choice is None else residuals(1.0, choice.best)
-    if gyro is not None and gyro.sole and gyro.as_is and is_other_world(f, q_wb[use], a_w, left, blocks):
+    if straight and is_other_world(f, q_wb[use], a_w, left, blocks):
         return None, None, unit, OTHER_WORLD
+    in_mean = axis_of_gravity(quaternion.rotate(q_wb[use], f)) if straight else None
     if choice is None or choice.misfit[choice.best] > CLEARLY * GRAVITY_M_S2:
-        return None, None, unit, ""
+        return None, in_mean, unit, ""
     P, up = readings[choice.best]
     as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
     one_up = all((up == other).all() for _, other in alike)
     one_axes = all((other == P).all() for other, _ in alike)
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
-    named = ("+" if up.sum() > 0 else "-") + "xyz"[int(np.argmax(np.abs(up)))] if one_up else None
+    named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if one_up else in_mean
     if gyro is None or not gyro.sole:  # without turns about two axes a proposal has no evidence
         return found if found is not None and found.as_is else None, named if named == "+z" else None, unit, ""
     return found, named, unit, ""

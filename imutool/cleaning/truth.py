@@ -13,9 +13,10 @@ from imutool.errors import LogError
 from imutool.geometry import quaternion
 from imutool.mcap_io.codec.schemas import TF
 from imutool.mcap_io.log import Log
-from imutool.recording import Poses, Recording, seconds
+from imutool.recording import GRAVITY_M_S2, Poses, Recording, seconds
 
 FEWEST = 3  # poses that show an acceleration
+ALONG, GRAVITY_BAND = np.cos(np.radians(20.0)), 0.25  # of a mean force that is gravity along an axis
 
 
 class Truth(NamedTuple):
@@ -91,6 +92,14 @@ def turning(
     first, last = truth.t_ns[:-apart], truth.t_ns[apart:]
     dt = seconds(last, int(truth.t_ns[0])) - seconds(first, int(truth.t_ns[0]))
     return first, last, quaternion.log(quaternion.multiply(quaternion.inverse(q_wb[:-apart]), q_wb[apart:])) / dt[:, None]
+
+
+def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
+    """Axis along which forces in the world point in the mean, as `+z`, where they have the size of gravity there."""
+    mean = force_w.mean(axis=0)
+    axis, size = int(np.argmax(np.abs(mean))), float(np.linalg.norm(mean))
+    along = abs(mean[axis]) > ALONG * size and abs(size / GRAVITY_M_S2 - 1.0) < GRAVITY_BAND
+    return f"{'+' if mean[axis] > 0.0 else '-'}{'xyz'[axis]}" if along else None
 
 
 def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 3"]]:

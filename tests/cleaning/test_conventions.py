@@ -315,3 +315,20 @@ def test_the_clock_of_poses_of_a_body_that_turns_on_and_on_is_found(late_s: floa
     found = judge(motion_of(imu), truth, 1.0)
     assert found.delay is not None
     assert found.delay.seconds == pytest.approx(late_s, abs=0.01)
+
+
+@pytest.mark.parametrize("up", ["+z", *TO_Z_UP])
+def test_gravity_shows_the_world_where_noise_of_positions_hides_the_motion(up: str, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    C = np.eye(3) if up == "+z" else TO_Z_UP[up].T
+    rng = np.random.default_rng(3)
+    turned_q = (Rotation.from_matrix(C) * Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
+    noisy = truth._replace(p_wb=truth.p_wb @ C.T + 0.1 * rng.normal(size=truth.p_wb.shape), q_wb_wxyz=turned_q)
+    found = judge(motion_of(imu), noisy, 1.0)
+    assert found.accel is None
+    assert found.up == up
+    whole = TopicSummary(CleaningSettings(), len(imu), motion_of(imu), noisy)
+    said = [finding.what for finding in Axes().findings(whole)]
+    assert said == (
+        [] if up == "+z" else [f"{said[0].partition(', not')[0]}, not +z, if the accelerometer counts as it should"]
+    )

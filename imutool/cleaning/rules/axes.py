@@ -55,7 +55,8 @@ class Axes(Rule):
         if found.up is not None and found.up != "+z":
             whole.world = TO_Z_UP[found.up]
             name = " (as in NED)" if found.up == "-z" else ""
-            what = f"the world of the poses {found.topic} has {found.up} up{name}, not +z"
+            if_right = "" if found.accel is not None else ", if the accelerometer counts as it should"
+            what = f"the world of the poses {found.topic} has {found.up} up{name}, not +z{if_right}"
             values = {"poses": found.topic, "fix": f"turn the world: z up instead of {found.up}"}
             yield Finding("axes", "warning", what, 1, values=values, confidence=0.95)
         if found.unit != "m":

@@ -234,15 +234,10 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     reach = [factor * pair.band_hz for pair in by_poses if pair.band_hz is not None]
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
     outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
-    if (
-        effect.name == "mount_resonance"
-    ):  # no spring takes back what it passes on; what is overdamped is a lag, and does not ring
-        return (
-            outside
-            or bool(theta[2:].sum() < 0.0)
-            or theta[1] > 1.0
-            or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
-        )
+    if effect.name == "mount_resonance":
+        takes_back = bool(theta[2:].sum() < 0.0)  # as no spring does
+        overdamped = bool(theta[1] > 1.0)  # a lag, which does not ring
+        return outside or takes_back or overdamped or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
     least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
     return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
