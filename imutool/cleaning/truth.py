@@ -95,7 +95,7 @@ def turning(
 
 
 def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
-    """Axis along which forces in the world point in the mean, as `+z`, where they have the size of gravity there."""
+    """Axis along which forces in the world are gravity in the mean, as `+z`; None for others."""
     mean = force_w.mean(axis=0)
     axis, size = int(np.argmax(np.abs(mean))), float(np.linalg.norm(mean))
     along = abs(mean[axis]) > ALONG * size and abs(size / GRAVITY_M_S2 - 1.0) < GRAVITY_BAND
