@@ -188,10 +188,11 @@ def _smoothed(poses: Poses, passes: int) -> SmoothMotion:
             glitches, steps = glitches + int((~sound).sum()), steps + count
     if not stretches:
         step_s = np.diff(t_s)
-        rate = f" at {1.0 / np.median(step_s):.3g} Hz, with {int((step_s > MAX_GAP_S).sum())} holes," if len(step_s) else ""
+        holes = int((step_s > MAX_GAP_S).sum())
+        rate = f" at {1.0 / np.median(step_s):.3g} Hz, with {holes} steps above {MAX_GAP_S:g} s," if len(step_s) else ""
         raise DataError(
             f"no stretch of the {len(poses)} poses{rate} can be differentiated",
-            expected=f"{LEAST_POSES} poses over {LEAST_S:g} s and more, without a hole of {MAX_GAP_S:g} s",
+            expected=f"poses at 40 Hz or more: {LEAST_POSES} over {LEAST_S:g} s and more, without a step above {MAX_GAP_S:g} s",
         )
     return SmoothMotion(int(poses.t_ns[0]), tuple(stretches), glitches, steps)
 

@@ -222,7 +222,7 @@ def test_too_few_poses_are_refused(path: Trajectory, count: int) -> None:
 
 
 def test_poses_with_holes_everywhere_are_refused(path: Trajectory) -> None:
-    with pytest.raises(DataError, match=r"poses at 8 Hz, with \d+ holes, can be differentiated"):
+    with pytest.raises(DataError, match=r"poses at 8 Hz, with \d+ steps above 0.1 s, can be differentiated"):
         smooth_motion(noisy(path, clock(path.start_ns, 8.0), 0.0, 0.0))
 
 
