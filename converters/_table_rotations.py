@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from ._table_units import ANGLE_SI, GYRO_SI, TIME_NS
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
 MOST_SPANS, LEAST_S = 5.0, 10.0  # multiple of a span that has a gap in it, and the least time to compare
+MOST_S = 300.0  # of a longer table, those that turn most
 SURE, CLEARLY = 0.9, 0.25  # correlation of turns that are the same; share of what the other order leaves that the right one may
 LIKELY, MOST_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns in one unit, as the next is a factor of 57 away
 ORTHOGONAL = 0.02  # what two printed decimals leave of R R^T = 1
@@ -77,8 +79,8 @@ def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Boo
 
 def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> list[str]:
     """Columns w, x, y, z of an array that turns as the gyro does; empty where not certain."""
-    values = _side_by_side(columns, array)
-    found = [_turns_alike(columns, entries, values[:, order], clock)[0] for order in ORDERS]
+    values, gyro, at_s = _side_by_side(columns, array), _GyroTurns.of(columns, entries), _seconds(columns, clock)
+    found = [_turns_alike(gyro, values[:, order], at_s)[0] for order in ORDERS]
     best = int(np.argmax(found))
     return [array[axis] for axis in ORDERS[best]] if found[best] > SURE and _is_clear(found[best], min(found)) else []
 
@@ -86,7 +88,8 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
 def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> list[str]:
     """Nine columns of a matrix or its transpose that turns as the gyro does; else none."""
     ways = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
-    found = [_turns_alike(columns, entries, _rotations(columns, {"rotation_matrix": way}), clock)[0] for way in ways]
+    gyro, at_s = _GyroTurns.of(columns, entries), _seconds(columns, clock)
+    found = [_turns_alike(gyro, _rotations(columns, {"rotation_matrix": way}), at_s)[0] for way in ways]
     best = int(np.argmax(found))
     return ways[best] if found[best] > SURE and _is_clear(found[best], min(found)) else []
 
@@ -101,11 +104,12 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
         for unit, yaw in product(_angle_units(columns, three), ("", "-"))
     }
     turns = {way: _rotations(columns, named) for way, named in ways.items()}
+    gyro, at_s = _GyroTurns.of(columns, entries), _seconds(columns, clock)
     size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
     for span_s, delay_s in product(SPANS_S, DELAYS_S if clock[0] != entries["time"] else (0.0,)):
         found = {}
         for way, q_wxyz in turns.items():
-            correlation, ratio = _turns_alike(columns, entries, q_wxyz, clock, span_s, delay_s)
+            correlation, ratio = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
             is_alike = not size or 1.0 / MOST_OFF < correlation * ratio / size < MOST_OFF
             found[way] = correlation if is_alike else 0.0
         unit, yaw = max(found, key=lambda way: found[way])
@@ -134,10 +138,10 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     """Unit in which the gyro turns as far as the poses; empty where none does."""
     if not entries.keys() & TURNS:
         return ""
-    q_wxyz = _rotations(columns, entries)
-    clock = str(entries["truth_time"]), str(entries["truth_time_unit"])
+    q_wxyz, gyro = _rotations(columns, entries), _GyroTurns.of(columns, entries)
+    at_s = _seconds(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
     for span_s in (SPAN_S, LONG_SPAN_S):
-        correlation, ratio = _turns_alike(columns, entries, q_wxyz, clock, span_s)
+        correlation, ratio = _turns_alike(gyro, q_wxyz, at_s, span_s)
         slope = correlation * ratio  # of the poses' turns by the gyro's: noise of the poses does not bias it
         near = [unit for unit, size in GYRO_SI.items() if 1.0 / MOST_OFF < slope / size < MOST_OFF]
         if correlation > LIKELY and near:
@@ -163,25 +167,40 @@ def _side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray,
     return np.stack([sign * columns.values[name].astype(float) for sign, name in signed], axis=1)
 
 
+class _GyroTurns(NamedTuple):
+    """Angles to which the gyro's rates add up, in its unit times seconds."""
+
+    t_s: Float64[np.ndarray, " n"]
+    angles: Float64[np.ndarray, "n 3"]
+
+    @classmethod
+    def of(cls, columns: Columns, entries: Entries) -> _GyroTurns:
+        """Angles over the `MOST_S` seconds that turn most; none without a time for each rate."""
+        names = [str(entries["time"]), *entries["gyro"]]
+        if len({len(columns.values[name]) for name in names}) > 1:
+            return cls(np.zeros(0), np.zeros((0, 3)))
+        t, *gyro = (columns.values[name].astype(float) for name in names)
+        known = np.isfinite(t)
+        t, rates = t[known] * TIME_NS[str(entries["time_unit"])] * 1e-9, np.nan_to_num(np.stack(gyro, axis=1))[known]
+        if len(t) and t[-1] - t[0] > MOST_S and (np.diff(t) >= 0.0).all():
+            ends, power = np.searchsorted(t, t + MOST_S), np.cumsum((rates**2).sum(axis=1))
+            start = int(np.argmax(power[ends - 1] - power))
+            t, rates = t[start : ends[start]], rates[start : ends[start]]
+        steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(t)[:, None]
+        return cls(t, np.concatenate([np.zeros((min(len(t), 1), 3)), np.cumsum(steps, axis=0)]))
+
+
 def _turns_alike(
-    columns: Columns,
-    entries: Entries,
-    q_wxyz: Float64[np.ndarray, "n 4"],
-    clock: tuple[str, str],
-    span_s: float = SPAN_S,
-    delay_s: float = 0.0,
+    gyro: _GyroTurns, q_wxyz: Float64[np.ndarray, "n 4"], at_s: Float64[np.ndarray, " n"], span_s: float = SPAN_S
 ) -> tuple[float, float]:
     """Correlation of the poses' turns with the gyro's under the best rotation between them, and the ratio of their sizes."""
-    names = [str(entries["time"]), *entries["gyro"]]
-    if len({len(columns.values[name]) for name in names}) > 1:
+    if not len(gyro.t_s):
         return 0.0, 0.0
-    t, *gyro = (columns.values[name].astype(float) for name in names)
-    t, at = t * TIME_NS[str(entries["time_unit"])] * 1e-9, columns.values[clock[0]].astype(float) * TIME_NS[clock[1]] * 1e-9
-    at = at - delay_s
-    t, rates = t[np.isfinite(t)], np.nan_to_num(np.stack(gyro, axis=1))[np.isfinite(t)]
-    size = np.sqrt((q_wxyz**2).sum(axis=1))
-    whole = np.isfinite(size) & (np.abs(size - 1.0) < 0.01) & (at >= t[0]) & (at <= t[-1])
-    at, q = at[whole], q_wxyz[whole]
+    inside = (at_s >= gyro.t_s[0]) & (at_s <= gyro.t_s[-1])
+    at, q = at_s[inside], q_wxyz[inside]
+    size = np.sqrt((q**2).sum(axis=1))
+    whole = np.isfinite(size) & (np.abs(size - 1.0) < 0.01)
+    at, q = at[whole], q[whole]
     step = max(1, round(span_s / max(float(np.median(np.diff(at))), 1e-9))) if len(at) > 1 else 1
     at, q = at[::step], q[::step]
     spans = np.diff(at)
@@ -189,11 +208,15 @@ def _turns_alike(
     if spans[kept].sum() < LEAST_S:
         return 0.0, 0.0
     turned = quaternion.log(quaternion.multiply(quaternion.inverse(q[:-1]), q[1:]))[kept]
-    angles = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t)[:, None], axis=0)])
-    measured = np.diff(np.stack([np.interp(at, t, angle) for angle in angles.T], axis=1), axis=0)[kept]
+    measured = np.diff(np.stack([np.interp(at, gyro.t_s, angle) for angle in gyro.angles.T], axis=1), axis=0)[kept]
     turned, measured = turned - turned.mean(axis=0), measured - measured.mean(axis=0)
     product = turned.T @ measured
     singular = np.linalg.svd(product, compute_uv=False)
     together = singular[0] + singular[1] + np.sign(np.linalg.det(product)) * singular[2]
     power = (turned**2).sum(), (measured**2).sum()
     return float(together / max(np.sqrt(power[0] * power[1]), 1e-30)), float(np.sqrt(power[0] / max(power[1], 1e-30)))
+
+
+def _seconds(columns: Columns, clock: tuple[str, str]) -> Float64[np.ndarray, " n"]:
+    """Times of a column in s."""
+    return np.asarray(columns.values[clock[0]].astype(float) * TIME_NS[clock[1]] * 1e-9)
