@@ -23,6 +23,7 @@ from imutool.viewing.html.drawing import prefix_ids, svg
 from imutool.viewing.html.page import AFTER, AXIS_COLORS, cards, document, text
 
 MOST_NAMED = 10  # robots with an effect
+EQUAL = 1e-6  # of the largest of several values, by which they may differ
 BINS = 30
 OWN_STYLE = """
 .failed { color: var(--before); font-weight: 600; } .quarantined, .lost { color: var(--mark); font-weight: 600; }
@@ -244,7 +245,10 @@ def _histograms(columns: Sequence[tuple[Sequence[float], str]], name: str) -> st
 
 
 def _histogram(axes: Any, values: Float64[np.ndarray, " n"], label: str, color: str) -> None:
-    axes.hist(values, bins=min(BINS, max(5, len(values) // 2)), color=color, alpha=0.7)
+    span, largest = float(np.ptp(values)), float(np.abs(values).max())
+    span = span if span > EQUAL * largest else largest or 1.0  # equal values: as wide as they are large
+    first, last = values.min() - 0.05 * span, values.max() + 0.05 * span
+    axes.hist(values, bins=min(BINS, max(5, len(values) // 2)), range=(first, last), color=color, alpha=0.7)
     axes.set(xlabel=label, ylabel="logs")
     axes.set_axisbelow(True)
     axes.locator_params(axis="x", nbins=5)

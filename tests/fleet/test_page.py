@@ -59,3 +59,16 @@ def test_the_numbers_below_the_histograms_do_not_overlap(monkeypatch: pytest.Mon
             boxes = [label.get_window_extent() for label in labels]
             assert boxes
             assert all(left.x1 + LETTER < right.x0 for left, right in pairwise(boxes)), [label.get_text() for label in labels]
+
+
+@pytest.mark.parametrize("value", [-0.0137, 0.0, 9.8])
+def test_a_histogram_of_equal_values_is_as_wide_as_they_are_large(value: float) -> None:
+    """Starts of logs without a rest are all those of the model's training."""
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    page._histogram(axes, value * (1.0 + 1e-15 * np.arange(27)), "x: gyro bias (rad/s)", "red")
+    first, last = axes.get_xlim()
+    assert first < value < last
+    assert last - first <= 1.5 * (abs(value) or 1.0)
+    assert sum(bar.get_height() for bar in axes.patches) == 27
