@@ -171,8 +171,9 @@ def _told_apart(jobs: list[Job], source: Path) -> list[Job]:
 
 
 def _with_folders(job: Job, source: Path) -> Job:
-    path, inside = job.sequence.path, job.sequence.inside
-    below = path.relative_to(source).parts if path.is_relative_to(source) else ()
+    inside, folder = job.sequence.inside, source.resolve()
+    path = job.sequence.path.parent.resolve() / job.sequence.path.name  # which may be a link out of the folder
+    below = path.relative_to(folder).parts if path.is_relative_to(folder) else ()
     folders = [*below[:-1], *([Path(below[-1]).stem] if below and inside else [])]
     return replace(job, sequence=replace(job.sequence, name="_".join([*folders, job.sequence.name])))
 

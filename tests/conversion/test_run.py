@@ -172,10 +172,12 @@ def test_several_sequences_do_not_go_into_one_file(source, tmp_path, suffix):
         convert(source, tmp_path / f"out.{suffix}")
 
 
-def test_sequences_of_one_name_have_their_folders_in_front_of_it(source, tmp_path):
+@pytest.mark.parametrize("given", ["absolute", "relative", "."])
+def test_sequences_of_one_name_have_their_folders_in_front_of_it(source, tmp_path, monkeypatch, given):
     sequence(source / "copy" / "a")
     sequence(source / "copy" / "older" / "a")
-    convert(source, tmp_path / "out")
+    monkeypatch.chdir(source if given == "." else source.parent)
+    convert({"absolute": source, "relative": Path(source.name), ".": Path()}[given], tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "a.mcap",
         "b.mcap",
