@@ -37,7 +37,6 @@ GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 MOST_LOSSES = 8  # in a refusal
 POSES_TOPIC = "/ground_truth/pose"
-NED_TO_ENU = np.array([[0.0, 0.5**0.5, 0.5**0.5, 0.0]])  # half a turn about north-east
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
@@ -212,7 +211,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     if not len(t_ns) == len(q_wxyz) == len(p):
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
     if table.pose_world == "ned":
-        p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(NED_TO_ENU, q_wxyz)
+        p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz)
     known, notes = known_rotations(q_wxyz, POSES_TOPIC)
     kept = in_order(t_ns[known], np.concatenate([p, q_wxyz], axis=1)[known], POSES_TOPIC)
     remarks.notes.extend(notes + kept.notes)

@@ -23,6 +23,7 @@ from imutool.errors import ConfigError, DataError
 from imutool.recording import LEAST_PERIOD_S, Imu, nanoseconds
 from imutool.recording.columns import MOST_GAP_S, median
 
+CHECKED = 400  # first samples of a stream whose rate and gravity are checked: 2 s at 200 Hz
 logger = logging.getLogger(__name__)
 
 GAP_NS, MOST_GAP_NS = nanoseconds(GAP_S), nanoseconds(MOST_GAP_S)
@@ -74,9 +75,6 @@ def _to_all(good: Bool[np.ndarray, " n"], values: Float64[np.ndarray, "m 6"]) ->
     if not len(values):
         return np.zeros((len(good), 6))
     return np.asarray(values[np.maximum(np.cumsum(good) - 1, 0)])
-
-
-CHECKED = 400  # first samples of a stream whose rate and gravity are checked: 2 s at 200 Hz
 
 
 class OnlineDebiaser:

@@ -32,11 +32,10 @@ class Step(NamedTuple):
     at_ns: int
 
 
-def side(seconds_: float) -> str:
-    """Delay in words, as `0.100 s late`."""
-    late_s = abs(seconds_)
-    text = f"{late_s:.3f} s" if late_s > LONGEST_DELAY_S else f"{1e3 * late_s:.0f} ms"
-    return f"{text} {'late' if seconds_ > 0 else 'early'}"
+def lateness(late_s: float, decimals: int = 0) -> str:
+    """Delay in words, as `100 ms late` or `3.500 s early`; the decimals are those of milliseconds."""
+    text = f"{abs(late_s):.3f} s" if abs(late_s) > LONGEST_DELAY_S else f"{1e3 * abs(late_s):.{decimals}f} ms"
+    return f"{text} {'late' if late_s > 0 else 'early'}"
 
 
 class Delay(NamedTuple):

@@ -15,13 +15,12 @@ MISREAD = {  # quaternions of poses: what is wrong with them, and the rows and s
     "are the inverse: they take vectors of the world to the body": ((0, 1, 2, 3), (1, -1, -1, -1)),
 }
 OTHER_WORLD = "are of a world whose z points the other way than that of the positions (one as in NED, one as in ENU)"
-NED_FROM_ENU_WXYZ = np.array([0.0, 0.5**0.5, 0.5**0.5, 0.0])  # and back
 
 
 def read_right(what: str, q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
     """Quaternions w, x, y, z of those that are misread in one of these ways."""
     if what == OTHER_WORLD:
-        return np.asarray(quaternion.multiply(NED_FROM_ENU_WXYZ[None], q_wxyz))
+        return np.asarray(quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz))
     rows, signs = MISREAD[what]
     return np.asarray(q_wxyz[:, rows] * signs)
 

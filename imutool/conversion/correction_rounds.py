@@ -59,7 +59,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             before.append(topic)
             patched = described.reflected is None or isinstance(described.reflected, Reflected)
             if not patched or described.message_encoding not in ENCODINGS:
-                if (survey.matrices != np.eye(3)).any():
+                if mount is not None or (survey.matrices != np.eye(3)).any():
                     own = described.own_schema or described.schema_name
                     kept.append(f"{topic} keeps its units and axes: only messages in CDR or ROS 1 are corrected, not {own}")
                 continue

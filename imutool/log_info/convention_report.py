@@ -10,7 +10,7 @@ import numpy as np
 from imutool.array_types import Int64
 from imutool.cleaning import CleaningSettings
 from imutool.cleaning.conventions import Conventions, Reading
-from imutool.cleaning.pose_delay import LONGEST_DELAY_S, side
+from imutool.cleaning.pose_delay import lateness
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import LATE_STDS, Axes
 from imutool.cleaning.rules.saturation import Saturation
@@ -210,13 +210,9 @@ def _entries(whole: TopicSummary, found: Conventions) -> Iterator[tuple[str, boo
         yield "unit of positions", True, f"{found.unit}: so they accelerate as accel says"
     if found.delay is not None and found.delay.step is not None:
         before, after, _ = found.delay.step
-        yield "clock of poses", True, f"steps: first {side(before)}, then {side(after)}"
+        yield "clock of poses", True, f"steps: first {lateness(before)}, then {lateness(after)}"
     elif found.delay is not None:
-        late_s = found.delay.seconds
-        late = (
-            side(late_s) if abs(late_s) > LONGEST_DELAY_S else f"{1e3 * abs(late_s):.1f} ms {'late' if late_s > 0 else 'early'}"
-        )
-        yield "clock of poses", True, f"{late}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
+        yield "clock of poses", True, f"{lateness(found.delay.seconds, 1)}, standard deviation {1e3 * found.delay.std_s:.1f} ms"
     else:
         yield "clock of poses", *_unknown(whole, NO_DELAY if turned else NO_TURN)
 

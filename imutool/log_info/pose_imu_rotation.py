@@ -135,18 +135,23 @@ class Body(NamedTuple):
 
 def turned_body(log: Log, imu: Imu, topic: str) -> Body | None:
     """Body of poses that is turned by more than `TURNED_DEG`."""
-    poses = read_truth(log, topics=[topic])
-    found = None if poses is None else agreement(poses, imu)
-    if poses is None or found is None or found.turned is None or not body_warnings(topic, found.turned.deg.tolist()):
+    found = _turned_in(log, imu, topic)
+    if found is None or not body_warnings(topic, found.deg.tolist()):
         return None
-    return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.turned.deg)[None]))[0])
+    return body_of(log, topic, quaternion.matrix(quaternion.exp(np.radians(found.deg)[None]))[0])
 
 
 def is_straight(log: Log, imu: Imu, topic: str) -> bool:
     """Whether an IMU shows that it lies as the body of poses does."""
+    found = _turned_in(log, imu, topic)
+    return found is not None and not body_warnings(topic, found.deg.tolist())
+
+
+def _turned_in(log: Log, imu: Imu, topic: str) -> Turned | None:
+    """Rotation of the body of poses in a log; None where they do not show it."""
     poses = read_truth(log, topics=[topic])
     found = None if poses is None else agreement(poses, imu)
-    return found is not None and found.turned is not None and not body_warnings(topic, found.turned.deg.tolist())
+    return None if found is None else found.turned
 
 
 def body_of(log: Log, topic: str, turn: Float64[np.ndarray, "3 3"]) -> Body:

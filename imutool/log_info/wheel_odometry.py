@@ -17,7 +17,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import CLEARLY
-from imutool.cleaning.pose_delay import pose_delay, side
+from imutool.cleaning.pose_delay import lateness, pose_delay
 from imutool.cleaning.rules.axes import LATE_S, LATE_STDS
 from imutool.cleaning.truth import of_poses
 from imutool.errors import DataError
@@ -57,9 +57,8 @@ def find_wheels(log: Log, recording: Recording) -> tuple[list[str], str]:
     every = [t for t in log.topics.values() if t.schema_name in MESSAGE_TWISTS or t.name in pose_topics]
     kinds = {t.name: "truth" if _is_truth(t, recording) else _kind(t) for t in every if t.count}
     listed = ", ".join(f"{name} ({kind})" for name, kind in kinds.items())
-    return [
-        name for name, kind in kinds.items() if kind == WHEELS
-    ], listed or "types, of which none is of poses or a TwistStamped"
+    wheels = [name for name, kind in kinds.items() if kind == WHEELS]
+    return wheels, listed or "types, of which none is of poses or a TwistStamped"
 
 
 def with_odometry(found: Aids, log: Log, recording: Recording, name: str) -> Aids:
@@ -74,10 +73,8 @@ def with_odometry(found: Aids, log: Log, recording: Recording, name: str) -> Aid
     if recording.truths and _same_path(poses, recording.truth):
         raise DataError(f"{name} moves exactly as the truth, and is no aid", where=recording.name, expected="wheel odometry")
     poses, delay_s = _on_clock(poses, recording.imu, name)
-    side = "late" if delay_s > 0 else "early"
-    words = (
-        f"{name}{f' ({abs(delay_s):.3f} s {side} by the gyro, corrected)' if delay_s else ''}{cover(recording.imu, poses.t_ns)}"
-    )
+    late = f" ({lateness(delay_s)} by the gyro, corrected)" if delay_s else ""
+    words = f"{name}{late}{cover(recording.imu, poses.t_ns)}"
     return replace(found, signals=found.signals | {WHEELS: words}, odometry=_mounted(poses, recording.imu, name))
 
 
@@ -99,7 +96,7 @@ def _on_clock(poses: Poses, imu: Imu, name: str) -> tuple[Poses, float]:
     delay = pose_delay(convention_summary(imu, slow).motion, slow)
     if delay is not None and delay.step is not None:
         before, after, _ = delay.step
-        what = f"{name} is first {side(before)}, then {side(after)}, by the gyro"
+        what = f"{name} is first {lateness(before)}, then {lateness(after)}, by the gyro"
         raise DataError(what, expected="one clock that never steps", fix="Cut the log where the clock steps")
     delay_s = delay.seconds if delay is not None and abs(delay.seconds) > max(LATE_S, LATE_STDS * delay.std_s) else 0.0
     late_ns = nanoseconds(delay_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
@@ -43,6 +44,15 @@ def in_ned(poses: Poses) -> Poses:
         scalar_first=True
     )
     return Poses(poses.t_ns, poses.p_wb @ NED.T, q_wxyz, None if poses.v_w is None else poses.v_w @ NED.T)
+
+
+def assert_comes_back(log: Path, made: Recording) -> None:
+    """The true poses are those that were made, and nothing is warned of."""
+    fixed = read(log)
+    turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (fixed.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
+    assert (turn * true.inv()).magnitude().max() < 1e-7
+    np.testing.assert_array_equal(fixed.truth.p_wb, made.truth.p_wb)
+    assert inspect(log).warnings == []
 
 
 @pytest.mark.parametrize("accel_axes", [P, -P], ids=["both turned", "accel negated too"])
@@ -116,11 +126,7 @@ def test_quaternions_in_ned_beside_positions_in_enu_come_back(made: Recording, t
     assert OTHER_WORLD in warning
     assert evaluate(tmp_path / "wrong.mcap")[0]["ape_m"] is None
     convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
-    fixed = read(tmp_path / "right.mcap")
-    turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (fixed.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
-    assert (turn * true.inv()).magnitude().max() < 1e-7
-    np.testing.assert_array_equal(fixed.truth.p_wb, made.truth.p_wb)
-    assert inspect(tmp_path / "right.mcap").warnings == []
+    assert_comes_back(tmp_path / "right.mcap", made)
 
 
 @pytest.mark.parametrize("what", MISREAD)
@@ -136,15 +142,12 @@ def test_misread_quaternions_come_back_and_what_they_hid_too(what: str, made: Re
     assert what in warnings[0]
     assert "--fix" in warnings[0]
     convert(tmp_path / "wrong.mcap", tmp_path / "right.mcap", correct=["conventions"])
-    fixed = read(tmp_path / "right.mcap")
-    turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (fixed.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
-    assert (turn * true.inv()).magnitude().max() < 1e-7
-    np.testing.assert_array_equal(fixed.truth.p_wb, made.truth.p_wb)
-    assert inspect(tmp_path / "right.mcap").warnings == []
+    assert_comes_back(tmp_path / "right.mcap", made)
+    q_wxyz = read(tmp_path / "right.mcap").truth.q_wb_wxyz
     with Log(tmp_path / "right.mcap") as log:
         assert what in log.metadata()[RECORD]["/ground_truth/pose"]
         transforms = np.concatenate([batch.q_wb_wxyz for batch in log.pose_batches("/tf")])
-    np.testing.assert_allclose(np.abs((transforms * fixed.truth.q_wb_wxyz).sum(axis=1)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs((transforms * q_wxyz).sum(axis=1)), 1.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("late_s", [1.2, -1_600_000_000.0])
@@ -373,4 +376,31 @@ def test_the_poses_follow_the_first_imu_and_another_mount_is_turned_to_it(made: 
         np.testing.assert_allclose(fixed.imu.accel, made.imu.accel, atol=1e-12)
     left = Rotation.from_quat(fixed.truth.q_wb_wxyz.copy(), scalar_first=True) * (turn * Rotation.from_matrix(P.T)).inv()
     assert left.magnitude().max() < 1e-6
+    assert inspect(tmp_path / "right.mcap").warnings == []
+
+
+def test_a_drivers_json_that_is_turned_against_the_poses_keeps_its_axes(made: Recording, tmp_path: Path) -> None:
+    write(made, tmp_path / "made.mcap")
+    with (tmp_path / "made.mcap").open("rb") as file, (tmp_path / "json.mcap").open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        imu = writer.register_channel("/imu", "json", writer.register_schema("Imu", "jsonschema", b'{"type": "object"}'))
+        poses: dict[int, int] = {}
+        for schema, channel, message in make_reader(file).iter_messages(topics=["/ground_truth/pose"]):
+            if channel.id not in poses:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                poses[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known, channel.metadata)
+            writer.add_message(poses[channel.id], message.log_time, message.data, message.publish_time)
+        for t_ns, gyro, accel in zip(made.imu.t_ns.tolist(), made.imu.gyro @ P.T, made.imu.accel @ P.T, strict=True):
+            vectors = {"angular_velocity": gyro, "linear_acceleration": accel}
+            content = {name: dict(zip("xyz", vector.tolist(), strict=True)) for name, vector in vectors.items()}
+            stamp = {"sec": t_ns // 10**9, "nanosec": t_ns % 10**9}
+            writer.add_message(imu, t_ns, json.dumps({"header": {"stamp": stamp}, **content}).encode(), t_ns)
+        writer.finish()
+    report = convert(tmp_path / "json.mcap", tmp_path / "right.mcap", correct=["conventions"])
+    assert any("the body is now that of the IMU" in note for note in report.notes)
+    right = read(tmp_path / "right.mcap")
+    np.testing.assert_allclose(right.imu.gyro, made.imu.gyro @ P.T, atol=1e-12)
+    turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (right.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
+    assert (turn * (true * Rotation.from_matrix(P.T)).inv()).magnitude().max() < 1e-7
     assert inspect(tmp_path / "right.mcap").warnings == []

@@ -13,7 +13,7 @@ import numpy as np
 from imutool.array_types import Float64
 from imutool.cleaning.conventions import Conventions, Reading, axis_names
 from imutool.cleaning.finding import Finding
-from imutool.cleaning.pose_delay import Delay, side
+from imutool.cleaning.pose_delay import Delay, lateness
 from imutool.cleaning.rule import Rule, TopicSummary
 
 DISTRUST = "the axes of {} contradict {}"
@@ -77,12 +77,12 @@ def _clock(delay: Delay, topic: str, whole: TopicSummary) -> Iterator[Finding]:
         about_s, size = (at_ns - (whole.motion.start_ns or 0)) * 1e-9, f"{1e3 * abs(after - before):.0f} ms"
         what = (
             f"the clock of the IMU or that of the poses {topic} steps by {size} about {about_s:.0f} s after the start:"
-            f" by the gyro the poses are {side(before)} before it, and {side(after)} after it"
+            f" by the gyro the poses are {lateness(before)} before it, and {lateness(after)} after it"
         )
         yield Finding("axes", "warning", what, 1, values={"steps": topic}, confidence=0.9)
     elif abs(delay.seconds) > max(LATE_S, LATE_STDS * delay.std_s):
         whole.pose_delay_ns = round(delay.seconds * 1e9)
-        size = f"{side(delay.seconds)} (standard deviation {1e3 * delay.std_s:.0f} ms)"
+        size = f"{lateness(delay.seconds)} (standard deviation {1e3 * delay.std_s:.0f} ms)"
         what = f"the stamps of the poses {topic} are {size} by the gyro"
         yield Finding("axes", "warning", what, 1, values={"fix": "move the stamps of the poses"}, confidence=0.9)
 
