@@ -33,7 +33,7 @@ class Step(NamedTuple):
 
 
 def lateness(late_s: float, decimals: int = 0) -> str:
-    """Delay in words, as `100 ms late` or `3.500 s early`; the decimals are those of milliseconds."""
+    """Delay in words, as `100 ms late` or `3.500 s early`; `decimals` are of milliseconds."""
     text = f"{abs(late_s):.3f} s" if abs(late_s) > LONGEST_DELAY_S else f"{1e3 * abs(late_s):.{decimals}f} ms"
     return f"{text} {'late' if late_s > 0 else 'early'}"
 
