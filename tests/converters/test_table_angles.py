@@ -189,7 +189,7 @@ def test_an_array_or_text_without_names_has_an_imu_that_gravity_shows(tmp_path, 
 
 def test_an_array_of_objects_is_refused(tmp_path):
     np.save(tmp_path / "imu.npy", np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
-    with pytest.raises(DataError, match="cannot be read .*allow_pickle"):
+    with pytest.raises(DataError, match=r"cannot be read .*allow_pickle"):
         read(tmp_path / "imu.npy")
 
 
