@@ -110,7 +110,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     that of a motion capture.
     """
     time, unit = str(entries["time"]), str(entries["time_unit"])
-    other = time_beside(columns, entries["accel"][0].removeprefix("-"), time, unit)
+    other = time_beside(columns, columns.unsigned(entries["accel"][0]), time, unit)
     found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
@@ -149,7 +149,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
 def turned(columns: Columns, entries: Entries) -> Entries:
     """Entries with the orientations beside a sensor's rates, in place of poses."""
     entries = {name: value for name, value in entries.items() if name not in TURNS}
-    group, length = group_of(entries["gyro"][0]), len(columns.values[str(entries["time"])])
+    group, length = group_of(columns.unsigned(entries["gyro"][0])), len(columns.values[str(entries["time"])])
     beside = [c for c, values in columns.values.items() if group_of(c) == group and len(values) == length]
     leaves = {split_name(column.removeprefix(group))[0]: column for column in beside}
     clock = str(entries["time"]), str(entries["time_unit"])

@@ -1,21 +1,22 @@
 """Map of a table: which columns hold time, rates and accelerations, and in which units.
 
-What the columns themselves leave open is for the user to state in a map file.
+What the columns themselves leave open is for the user to state: in a map file, or as single entries of one.
 """
 
 from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.errors import ConfigError, DataError
+from imutool.errors import ConfigError, DataError, did_you_mean
 from imutool.recording.message_log import KINDS
 
 from ._table_text import Columns
@@ -23,13 +24,20 @@ from ._table_units import TIME_NS, UNITS_OF
 
 IMU_TOPIC = "/imu0"
 LARGEST_NS = 2**63 - 1
-WORLDS = "", "ned"
+WORLDS = ("ned",)
+LISTS = {  # entries that name several columns
+    **dict.fromkeys(("gyro", "accel", "position"), (3, "x, y, z")),
+    "quaternion_wxyz": (4, "w, x, y, z"),
+    "roll_pitch_yaw": (3, "roll, pitch, yaw"),
+    "rotation_matrix": (9, "row by row"),
+}
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
-Entries = dict[str, str | list[str]]  # of a map
+Entries = dict[str, Any]  # of a map: names, lists of names, numbers
+IN_WHOLE = "gyro", "gyro_unit", "accel", "accel_unit"  # entries with which, and a time, a map needs nothing from the table
 
 
-class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class TableMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Map of a table's columns; a column named `-ax` counts with the opposite sign.
 
     Without `gyro` and `accel` it holds for each of several IMUs, which the names of the columns show.
@@ -40,9 +48,9 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     rate_hz: float = 0.0  # in place of a time: rows are counted, or what a column `counter` counts
     counter: str = ""
     gyro: list[str] = []
-    gyro_unit: str
+    gyro_unit: str = ""
     accel: list[str] = []
-    accel_unit: str
+    accel_unit: str = ""
     accel_time: str = ""
     gyro_scale: float | list[float] = 1.0
     gyro_offset: float | list[float] = 0.0
@@ -62,41 +70,49 @@ class TableMap(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     pose_world: str = ""  # "ned": poses in north, east, down, which become east, north, up
 
 
-def read_map(path: Path) -> TableMap:
-    """Map in a TOML file.
+def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
+    """Entries that a TOML file or a program states; a text `a,b,c` is a list, too.
 
     Raises:
-        ConfigError: unreadable, no TOML, a missing or unknown entry, or an unknown unit.
+        ConfigError: unreadable, no TOML, an unknown entry, an unknown unit, or no three columns.
     """
+    where = mapping if isinstance(mapping, Path) else "mapping"
+    values = _toml(mapping) if isinstance(mapping, Path) else dict(mapping)
+    for name in {*LISTS} & {*values}:
+        if isinstance(values[name], str) and "," in values[name]:
+            values[name] = [column.strip() for column in values[name].split(",")]
+    for name in [name for name in values if name not in TableMap.__struct_fields__]:
+        known = TableMap.__struct_fields__
+        fix = did_you_mean(name, known, "{}")
+        raise ConfigError(f"{name!r} is no entry of a map", where=where, expected=f"one of {', '.join(known)}", fix=fix)
     try:
-        table = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), TableMap)
+        table = msgspec.convert(values, TableMap)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"is no map of a table ({error})", where=where) from error
+    given = {name: getattr(table, name) for name, value in values.items() if value not in ("", [])}
+    for name, units in {**UNITS_OF, "pose_kind": KINDS, "pose_world": WORLDS}.items():
+        if name in given and given[name] not in units:
+            raise ConfigError(f"{name} is {given[name]!r}", where=where, expected=f"one of {', '.join(units)}")
+    if "rate_hz" in given and ("time" in given or not 0.0 < given["rate_hz"] < np.inf):
+        raise ConfigError("has to name a time or a positive rate_hz", where=where, expected="`time`, or `rate_hz`")
+    for name, (count, of) in LISTS.items():
+        if name in given and not isinstance(given[name], str) and len(given[name]) != count:
+            raise ConfigError(f"{name} names {len(given[name])} columns", where=where, expected=f"{count}: {of}")
+    return given
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
-    except (ValueError, RecursionError, msgspec.ValidationError) as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"is no map of a table ({error})", where=path) from error
-    own_times = not (table.gyro or table.time or table.rate_hz) and table.time_unit  # of several IMUs
-    if not own_times and (not (0.0 < table.rate_hz < np.inf) if not table.time else table.rate_hz):
-        raise ConfigError(
-            "has to name a time or a positive rate_hz", where=path, expected="`time` and `time_unit`, or `rate_hz`"
-        )
-    needless = {"truth_time_unit", *([] if table.time or own_times else ["time_unit"])}
-    for name, units in UNITS_OF.items():
-        if (unit := getattr(table, name)) not in units and (unit or name not in needless):
-            raise ConfigError(f"{name} is {unit!r}", where=path, expected=f"one of {', '.join(units)}")
-    if table.pose_kind not in KINDS:
-        raise ConfigError(f"pose_kind is {table.pose_kind!r}", where=path, expected=f"one of {', '.join(KINDS)}")
-    if table.pose_world not in WORLDS:
-        raise ConfigError(f"pose_world is {table.pose_world!r}", where=path, expected='"ned", or none')
-    if isinstance(table.rotation_matrix, list) and len(table.rotation_matrix) != 9:
-        raise ConfigError(
-            f"rotation_matrix names {len(table.rotation_matrix)} columns", where=path, expected="nine, row by row"
-        )
-    needed = {"gyro": table.gyro or table.accel, "accel": table.gyro or table.accel, "roll_pitch_yaw": table.roll_pitch_yaw}
-    for name in filter(needed.get, needed):
-        if len(names := getattr(table, name)) != 3:
-            of = "roll, pitch, yaw" if name == "roll_pitch_yaw" else "x, y, z"
-            raise ConfigError(f"{name} names {len(names)} columns", where=path, expected=f"three: {of}")
-    return table
+
+
+def is_whole(given: Entries) -> bool:
+    """Whether entries name an IMU, its units and its time."""
+    return {*IN_WHOLE} <= given.keys() and ("rate_hz" in given or {"time", "time_unit"} <= given.keys())
 
 
 class Proposal(msgspec.Struct):
@@ -108,11 +124,28 @@ class Proposal(msgspec.Struct):
     rate_hz: float = 0.0
     hints: list[str] = []  # lines to confirm
 
+    def state(self, given: Entries) -> None:
+        """Enter what the user states; it is open no more."""
+        self.entries |= {name: value for name, value in given.items() if name != "rate_hz"}
+        self.open[:] = [name for name in self.open if name not in given]
+        self.reasons[:] = [each for each in self.reasons if each not in (NO_UNIT.format(name[:-5]) for name in given)]
+
+    def unsigned(self, sensor: str, columns: Columns) -> list[str]:
+        """Columns of a sensor without signs; none where none is found."""
+        return [columns.unsigned(column) for column in self.entries.get(sensor, ())]
+
     def settle_unit(self, sensor: str, unit: str, reason: str) -> None:
         """Enter the unit of a sensor, which was open."""
         self.open.remove(f"{sensor}_unit")
         self.reasons[:] = [each for each in self.reasons if each != NO_UNIT.format(sensor)] + [reason]
         self.entries[f"{sensor}_unit"] = unit
+
+    def in_words(self) -> str:
+        """What is open as `name=value`, where names and numbers settle it."""
+        asked = {name: f"{name}={' or '.join(UNITS_OF.get(name, ['100.0']))}" for name in self.open}
+        if "time" in self.open:
+            asked = {"rate_hz": "rate_hz=100.0", **{name: text for name, text in asked.items() if not name.startswith("time")}}
+        return f"what is open ({', '.join(asked.values())}), or " if asked.keys() <= {*UNITS_OF, "rate_hz"} else ""
 
     def toml(self, several: Sequence[str] = (), *, own_times: bool = False) -> str:
         """The proposal as a map file, with a question behind what is open; `several` are the topics of more than one IMU."""
@@ -163,7 +196,7 @@ def _leaves(proposal: Proposal) -> tuple[str, ...]:
     return tuple(name.rpartition("/")[2] for name in (*proposal.entries.get("gyro", []), *proposal.entries.get("accel", [])))
 
 
-def column_named(columns: Columns, wanted: str, where: Path) -> np.ndarray:
+def column_named(columns: Columns, wanted: str, where: Path | str) -> np.ndarray:
     """Values of a column.
 
     Raises:
@@ -205,9 +238,9 @@ def vectors_named(
     Raises:
         ConfigError: there is no such column, or they have different numbers of rows.
     """
-    signs = np.array([-1.0 if name.startswith("-") and name not in columns.values else 1.0 for name in wanted])
-    parts = [column_named(columns, n if n in columns.values else n.removeprefix("-"), where).astype(np.float64) for n in wanted]
-    if len({len(part) for part in parts}) > 1:
+    signs = np.array([1.0 if name in columns.values else -1.0 for name in wanted])
+    if len({len(column_named(columns, columns.unsigned(name), where)) for name in wanted}) > 1:
         raise ConfigError(f"{', '.join(wanted)} have different numbers of rows", where=where)
-    values: Float64[np.ndarray, "n k"] = (np.stack(parts, axis=1) - np.asarray(offset)) * np.asarray(scale) * signs
+    unsigned = columns.side_by_side(columns.unsigned(name) for name in wanted)
+    values: Float64[np.ndarray, "n k"] = (unsigned - np.asarray(offset)) * np.asarray(scale) * signs
     return values

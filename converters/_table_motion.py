@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -25,7 +24,7 @@ def doubt_gravity(proposal: Proposal, columns: Columns) -> None:
     """Ask about an acceleration that by its name, size or directions lacks gravity."""
     if "accel" not in proposal.entries or not (unit := str(proposal.entries.get("accel_unit", ""))):
         return
-    chosen = [*proposal.entries["accel"]]
+    chosen = [columns.unsigned(column) for column in proposal.entries["accel"]]
     name, (level, _) = spaced_name(chosen[0]), gravity_units(columns, chosen)
     said = f"the median acceleration of {chosen[0]!r} is {level:.3g} {unit}"
     if re.search(NO_GRAVITY, name):
@@ -85,7 +84,7 @@ def _rows(
     proposal: Proposal, columns: Columns
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]] | None:
     """Times since the first sample, rates and accelerations as recorded, in order; None where they are not side by side."""
-    t, gyro, accel = (side_by_side(columns, np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
+    t, gyro, accel = (columns.side_by_side(np.atleast_1d(proposal.entries[name])) for name in ("time", "gyro", "accel"))
     if len(gyro) != len(accel):
         return None
     t_ns = np.rint((t[:, 0] - t[0, 0]) * TIME_NS[str(proposal.entries["time_unit"])]).astype(np.int64)
@@ -94,8 +93,3 @@ def _rows(
     except DataError:
         return None
     return (imu.t_ns, imu.gyro, imu.accel) if len(imu) else None
-
-
-def side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
-    """Columns as one array."""
-    return np.stack([columns.values[name].astype(float) for name in names], axis=1)

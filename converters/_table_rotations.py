@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -79,7 +78,7 @@ def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Boo
 
 def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> list[str]:
     """Columns w, x, y, z of an array that turns as the gyro does; empty where not certain."""
-    values, gyro, at_s = _side_by_side(columns, array), _GyroTurns.of(columns, entries), _seconds(columns, clock)
+    values, gyro, at_s = columns.side_by_side(array), _GyroTurns.of(columns, entries), _seconds(columns, clock)
     found = [_turns_alike(gyro, values[:, order], at_s)[0] for order in ORDERS]
     best = int(np.argmax(found))
     return [array[axis] for axis in ORDERS[best]] if found[best] > SURE and _is_clear(found[best], min(found)) else []
@@ -128,7 +127,7 @@ def _angle_units(columns: Columns, three: list[str]) -> list[str]:
     """Units that angles may have: the stated one, degrees beyond a turn, else either."""
     texts = [column.rpartition("/")[2].lower() + columns.units.get(column, "").lower() for column in three]
     stated = {unit for unit, word in (("deg", "deg|°"), ("rad", "rad")) if all(re.search(word, text) for text in texts)}
-    values = _side_by_side(columns, three)
+    values = columns.side_by_side(three)
     if len(stated) == 1:
         return [*stated]
     return ["rad", "deg"] if np.isfinite(values).any() and np.nanmax(np.abs(values)) < MOST_RAD else ["deg"]
@@ -152,19 +151,13 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
 def _rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
     """Quaternions (wxyz) of the columns that the entries name."""
     if "roll_pitch_yaw" in entries:
-        angles = _side_by_side(columns, entries["roll_pitch_yaw"])
+        angles = columns.side_by_side(entries["roll_pitch_yaw"])
         return of_angles(angles * ANGLE_SI[str(entries["roll_pitch_yaw_unit"])])
     if "rotation_matrix" in entries:
-        matrices = _side_by_side(columns, entries["rotation_matrix"]).reshape(-1, 3, 3)
+        matrices = columns.side_by_side(entries["rotation_matrix"]).reshape(-1, 3, 3)
         is_rotation = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHOGONAL
         return of_matrices(np.where(is_rotation[:, None, None] & (np.linalg.det(matrices) > 0.0)[:, None, None], matrices, 0.0))
-    return _side_by_side(columns, entries["quaternion_wxyz"])
-
-
-def _side_by_side(columns: Columns, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
-    """Columns as one array; one named with a minus counts the other way."""
-    signed = ((-1.0, name[1:]) if name.startswith("-") else (1.0, name) for name in names)
-    return np.stack([sign * columns.values[name].astype(float) for sign, name in signed], axis=1)
+    return columns.side_by_side(entries["quaternion_wxyz"])
 
 
 class _GyroTurns(NamedTuple):
@@ -177,11 +170,11 @@ class _GyroTurns(NamedTuple):
     def of(cls, columns: Columns, entries: Entries) -> _GyroTurns:
         """Angles over the `MOST_S` seconds that turn most; none without a time for each rate."""
         names = [str(entries["time"]), *entries["gyro"]]
-        if len({len(columns.values[name]) for name in names}) > 1:
+        if len({len(columns.values[columns.unsigned(name)]) for name in names}) > 1:
             return cls(np.zeros(0), np.zeros((0, 3)))
-        t, *gyro = (columns.values[name].astype(float) for name in names)
+        t, rates = columns.values[names[0]].astype(float), columns.side_by_side(names[1:])
         known = np.isfinite(t)
-        t, rates = t[known] * TIME_NS[str(entries["time_unit"])] * 1e-9, np.nan_to_num(np.stack(gyro, axis=1))[known]
+        t, rates = t[known] * TIME_NS[str(entries["time_unit"])] * 1e-9, np.nan_to_num(rates)[known]
         if len(t) and t[-1] - t[0] > MOST_S and (np.diff(t) >= 0.0).all():
             ends, power = np.searchsorted(t, t + MOST_S), np.cumsum((rates**2).sum(axis=1))
             start = int(np.argmax(power[ends - 1] - power))

@@ -157,9 +157,11 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     """
     names = [*table.values]
     has_header = not all(re.fullmatch(r"column \d+|time", name) for name in names)  # the time may be that of a clock beside it
+    if has_header and not sensor:
+        return
     if not sensor:
         pose = POSE if len(names) == len(POSE) and _turns(table, names[-4:]) else POSE[:1]
-        new = {} if has_header or not rises(table.values[names[0]]) else dict(zip(names, pose, strict=False))
+        new = dict(zip(names, pose, strict=False)) if rises(table.values[names[0]]) else {}
     else:
         first = next((n for n, name in enumerate(names) if not rises(table.values[name])), len(names))
         first = min(first, len(names) - 3)  # in place of a header: where the axes begin

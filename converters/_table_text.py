@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
@@ -74,6 +76,15 @@ class Columns:
             self.values[name], self.units[name] = array.reshape(-1), unit
         elif array.size == 1:
             self.numbers[name] = float(array.reshape(-1)[0])
+
+    def unsigned(self, name: str) -> str:
+        """The column that a name means: `ax` of `-ax`, which counts the other way."""
+        return name if name in self.values else name.removeprefix("-")
+
+    def side_by_side(self, names: Iterable[str]) -> Float64[np.ndarray, "n k"]:
+        """Columns as one array; one named with a minus counts the other way."""
+        signed = ((1.0 if name in self.values else -1.0, self.unsigned(name)) for name in names)
+        return np.stack([sign * self.values[name].astype(float) for sign, name in signed], axis=1)
 
     def take(self, group: str, other: Columns, label: str) -> None:
         """Take in the columns and remarks of another table as a group."""

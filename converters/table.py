@@ -6,8 +6,9 @@ Columns and units are recognised from their names. What stays open is asked for:
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -24,11 +25,22 @@ from ._source import head, name
 from ._table_files import kind_of, load
 from ._table_folder import POSES_GROUP, TRUTH_GROUP, load_split, sequences_below
 from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
-from ._table_map import IMU_TOPIC, Proposal, TableMap, column_named, read_map, share_units, times_named, vectors_named
+from ._table_map import (
+    IMU_TOPIC,
+    Entries,
+    Proposal,
+    TableMap,
+    column_named,
+    is_whole,
+    read_map,
+    share_units,
+    times_named,
+    vectors_named,
+)
 from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
 from ._table_propose import propose
-from ._table_rotations import known_rotations, of_angles, of_matrices, unit_by_poses
+from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
 from ._table_text import Columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
@@ -54,7 +66,7 @@ def recognises(sequence: Sequence) -> bool:
     return True
 
 
-def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | None = None) -> MessageLog:
+def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Mapping[str, Any] | None = None) -> MessageLog:
     """Message log of a table, by the map file or by the names of its columns.
 
     Raises:
@@ -63,8 +75,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | No
     """
     path = sequence.path
     columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path))
-    remarks, place = columns.remarks, path if mapping is None else mapping
-    tables = _proposed(columns, path, remarks) if mapping is None else _mapped(columns, mapping)
+    remarks, place = columns.remarks, mapping if isinstance(mapping, Path) else path
+    given = {} if mapping is None else read_map(mapping)
+    tables = _mapped(columns, given, place) or _proposed(columns, path, remarks, given)
     tables = [_counted(columns, table, place) for table in tables]
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
@@ -98,14 +111,14 @@ def read(source: Path) -> Iterator[MessageLog]:
     return map(read_sequence, sequences(source))
 
 
-def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
-    """Map of each IMU from the columns' names.
+def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) -> list[TableMap]:
+    """Map of each IMU from the columns' names, and what is given.
 
     Raises:
         ConfigError: something is open; the message holds a map file to complete.
     """
-    apart = {} if known_layout(columns) else imus_apart(columns)
-    proposals = {topic: _proposal(part) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
+    apart = {} if known_layout(columns) or given.keys() & {"gyro", "accel"} else imus_apart(columns)
+    proposals = {topic: _proposal(part, given) for topic, part in (apart or {IMU_TOPIC: columns}).items()}
     share_units(proposals.values())
     own_times = len({str(proposal.entries.get("time", "")) for proposal in proposals.values()}) > 1
     maps = []
@@ -117,45 +130,44 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks) -> list[TableMap]:
             raise ConfigError(
                 f"the meaning of its columns is not certain: {reasons}. Its columns are {names}",
                 where=path,
-                fix=f"Complete this file and give it as `mapping`:\n\n{proposal.toml([*apart], own_times=own_times)}",
+                fix=f"Give as `mapping` {proposal.in_words()}this file, completed:\n\n"
+                f"{proposal.toml([*apart], own_times=own_times)}",
             )
-        named = {key: value if isinstance(value, str) else ", ".join(value) for key, value in proposal.entries.items()}
+        named = {key: ", ".join(map(str, np.atleast_1d(value))) for key, value in proposal.entries.items()}
         counted = {key for key, value in named.items() if value.startswith(COUNTED)}
         shown = {key: value for key, value in named.items() if key.removesuffix("_unit") not in counted}
         said = "columns: " + "; ".join(f"{key} = {value}" for key, value in shown.items())
         remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
-        maps.append(msgspec.convert({**proposal.entries, "rate_hz": proposal.rate_hz, "topic": topic}, TableMap))
+        maps.append(msgspec.convert({"topic": topic, **proposal.entries, "rate_hz": proposal.rate_hz}, TableMap))
     return maps
 
 
-def _mapped(columns: Columns, mapping: Path) -> list[TableMap]:
-    """Map of a file, or one for each IMU where it names no gyro and accel; without a time each IMU has its own.
+def _mapped(columns: Columns, given: Entries, place: Path) -> list[TableMap]:
+    """Map that needs nothing from the table, or one for each IMU that the names of its columns show; else none.
 
     Raises:
-        ConfigError: the file is no map, or it names no columns and they show no IMUs or times.
+        ConfigError: the map names no times, and an IMU's table shows none.
     """
-    table = read_map(mapping)
-    if table.gyro:
-        return [table]
+    if is_whole(given):
+        return [msgspec.convert(given, TableMap)]
+    if not {"gyro_unit", "accel_unit"} <= given.keys() or given.keys() & {"gyro", "accel"}:
+        return []
     named = {topic: propose(part).entries for topic, part in imus_apart(columns).items()}
-    if not named:
-        what = "names no gyro and accel, and the columns' names do not show several IMUs"
-        raise ConfigError(what, where=mapping, expected="gyro = [x, y, z] and accel = [x, y, z]")
-    own = ("gyro", "accel") if table.time or table.rate_hz else ("gyro", "accel", "time")
+    own = ("gyro", "accel") if given.keys() & {"time", "rate_hz"} else ("gyro", "accel", "time")
     for topic, entries in named.items():
         if not {*own} <= entries.keys():
-            raise ConfigError(f"names no time, and {topic} shows none", where=mapping, expected="`time`, or `rate_hz`")
+            raise ConfigError(f"names no time, and {topic} shows none", where=place, expected="`time`, or `rate_hz`")
     return [
-        msgspec.convert(msgspec.structs.asdict(table) | {s: entries[s] for s in own} | {"topic": topic}, TableMap)
-        for topic, entries in named.items()
+        msgspec.convert({**given, **{s: entries[s] for s in own}, "topic": topic}, TableMap) for topic, entries in named.items()
     ]
 
 
-def _proposal(columns: Columns) -> Proposal:
-    """Map of one IMU and its poses, by names, magnitudes and motion."""
-    proposal = known_layout(columns) or propose(columns)
+def _proposal(columns: Columns, given: Entries) -> Proposal:
+    """Map of one IMU and its poses, by what is given, names, magnitudes and motion."""
+    proposal = known_layout(columns) or propose(columns, given)
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
-        proposal.entries |= group_entries(columns, proposal.entries, proposal.reasons)
+        beside = group_entries(columns, proposal.entries, proposal.reasons)
+        proposal.entries |= {name: beside[name] for name in beside if name == "accel_time" or not given.keys() & TURNS}
         tries = {"poses": proposal.entries, "orientations": turned(columns, proposal.entries)}
         units = (
             {kind: unit_by_poses(columns, entries) for kind, entries in tries.items()} if "gyro_unit" in proposal.open else {}
@@ -163,6 +175,7 @@ def _proposal(columns: Columns) -> Proposal:
         for kind, unit in [*filter(lambda each: each[1], units.items())][:1]:
             proposal.settle_unit("gyro", unit, f"the {kind} turn as far as a gyro in {unit} says")
     settle_accel_unit(proposal, columns)
+    proposal.state(given)
     return proposal
 
 

@@ -43,9 +43,19 @@ def load(cls: type[S], path: Path | None = None, overrides: Iterable[str] = ()) 
         ConfigError: file unreadable or not TOML, unknown key (the nearest is named), wrong type, out of range.
     """
     values = {} if path is None else toml(path, "settings")
-    for word in overrides:
-        _put(values, word)
-    return build(cls, values, where=path)
+    return build(cls, entries(overrides, "set", values), where=path)
+
+
+def entries(words: Iterable[str], parameter: str, values: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Values with those of `key=value` words (dots for tables), given as this parameter.
+
+    Raises:
+        ConfigError: a word sets nothing.
+    """
+    values = {} if values is None else values
+    for word in words:
+        _put(values, word, parameter)
+    return values
 
 
 def toml(path: Path, what: str) -> dict[str, Any]:
@@ -125,22 +135,22 @@ def plain(settings: Settings) -> dict[str, Any]:
     return values
 
 
-def _put(values: dict[str, Any], word: str) -> None:
+def _put(values: dict[str, Any], word: str, parameter: str) -> None:
     """Put a `a.b=value` word into nested tables; the value is TOML, or else a string."""
     key, equals, text = word.partition("=")
     if not equals or not key:
-        raise ConfigError(f"{word!r} sets nothing", where="set", expected="key=value")
+        raise ConfigError(f"{word!r} sets nothing", where=parameter, expected="key=value")
     try:
         (value,) = tomllib.loads(f"value = {text}").values()
     except (ValueError, RecursionError):  # no TOML, more than one line of it, or nested too deeply to be any setting's
         value = text
     *tables, last = key.split(".")
     if len(tables) > MOST_NESTED:
-        raise ConfigError(f"the key has {len(tables)} dots", where="set", expected="the name of a setting")
+        raise ConfigError(f"the key has {len(tables)} dots", where=parameter, expected="the name of a setting")
     for table in tables:
         values = values.setdefault(table, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"{table!r} is a value, not a table", where=f"set={word}")
+            raise ConfigError(f"{table!r} is a value, not a table", where=f"{parameter}={word}")
     values[last] = value
 
 

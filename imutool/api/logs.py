@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from imutool.api import NamedProgress, checked
 from imutool.conversion import run as conversion
@@ -113,7 +114,7 @@ def convert(
     overwrite: bool = False,
     sensor: str = "",
     kinds: str | Sequence[str] = (),
-    mapping: str | Path | None = None,
+    mapping: str | Path | Mapping[str, Any] | None = None,
     imu: str = "",
     correct: str | Sequence[str] = (),
     workers: int | None = None,
@@ -131,7 +132,7 @@ def convert(
         overwrite: Replace existing logs.
         sensor: Name of the IMU, where the recording does not state it.
         kinds: Kind of the poses by topic, as `TOPIC=truth|estimate|odometry|unknown`.
-        mapping: TOML file with the meaning and units of a table's columns.
+        mapping: Meaning and units of a table's columns: a TOML file, or entries of one such as `{"gyro_unit": "deg/s"}`.
         imu: Two topics that become one IMU: `gyro=TOPIC,accel=TOPIC`.
         correct: `conventions`: wrong units, axes and frames, as the motion shows; `stamps`: late stamps of the IMU.
         workers: Processes; by default one per core. A script that uses several needs `if __name__ == "__main__":`.
@@ -156,7 +157,7 @@ def convert(
         overwrite=overwrite,
         sensor=sensor,
         kinds=several(kinds),
-        mapping=None if mapping is None else local(mapping, "mapping"),
+        mapping=mapping if mapping is None or isinstance(mapping, Mapping) else local(mapping, "mapping"),
         imu=imu,
         correct=several(correct),
         workers=workers,

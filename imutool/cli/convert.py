@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from imutool.cli.app import COMMON, Common, Written, app, listing
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import say, tell_error, tell_warning
+from imutool.config import entries
 from imutool.conversion import Failure
 from imutool.errors import LOST, DataError
 from imutool.report import Report
@@ -66,7 +67,10 @@ def convert(
     ] = None,
     imu: Annotated[str, typer.Option(metavar="gyro=T,accel=T", help="Two topics that become one IMU.")] = "",
     map_: Annotated[
-        Path | None, typer.Option("--map", metavar="F.toml", help="Meaning and units of a table's columns.")
+        list[str] | None,
+        typer.Option(
+            "--map", metavar="F.toml|KEY=VALUE", help="Meaning and units of a table's columns, as gyro_unit=deg/s. Repeatable."
+        ),
     ] = None,
     fix: Annotated[bool, typer.Option("--fix", help="Correct units, axes and frames shown wrong by the motion.")] = False,
     restamp: Annotated[bool, typer.Option("--restamp", help="Put late stamps on the clock of the IMU.")] = False,
@@ -87,13 +91,20 @@ def convert(
             overwrite=common.overwrite,
             sensor=sensor,
             kinds=kind or (),
-            mapping=map_,
+            mapping=_mapping(map_ or []),
             imu=imu,
             correct=[name for name, asked in (("conventions", fix), ("stamps", restamp)) if asked],
             workers=workers,
             progress=tell,
         )
     _tell(report, common)
+
+
+def _mapping(words: list[str]) -> Path | dict[str, Any] | None:
+    """A map file, or the entries that `KEY=VALUE` words state."""
+    if len(words) == 1 and ("=" not in words[0] or Path(words[0]).exists()):
+        return Path(words[0])
+    return entries(words, "mapping") if words else None
 
 
 def _tell(report: ConvertReport, common: Common) -> None:

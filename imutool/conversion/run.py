@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from imutool import registry
 from imutool.conversion import Failure
@@ -69,7 +70,7 @@ def convert(
     overwrite: bool = False,
     sensor: str = "",
     kinds: Sequence[str] = (),
-    mapping: Path | None = None,
+    mapping: Path | Mapping[str, Any] | None = None,
     imu: str = "",
     correct: Sequence[str] = (),
     workers: int | None = None,
@@ -78,7 +79,7 @@ def convert(
     """Convert one sequence to the file `out`, or several to the folder `out`.
 
     `sensor` names the IMU where the data set does not, and `kinds` (`TOPIC=truth|estimate|odometry|unknown`) says what poses
-    are worth. `mapping` is a file that states what the columns of a table mean. `out` with a slash at its end is a folder.
+    are worth. `mapping` (a file, or its entries) states what a table's columns mean. `out` with a slash at its end is a folder.
     `imu` (`gyro=TOPIC,accel=TOPIC`) joins two sensors to one IMU; pairs that differ in name by the sensor alone join unasked.
     `correct` names what is corrected: `conventions` that the log's motion shows to be wrong, and `stamps`.
     `workers` is the number of processes, by default one a processor; with 1, or for one sequence, all happens here.

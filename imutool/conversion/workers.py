@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,7 +34,7 @@ class Job:
     images: bool = True
     overwrite: bool = False
     labels: Labels = field(default_factory=Labels)
-    mapping: Path | None = None  # what the columns of a table mean
+    mapping: Path | Mapping[str, Any] | None = None  # what the columns of a table mean
     correct: tuple[str, ...] = ()  # `conventions`, `stamps`
 
 

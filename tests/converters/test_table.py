@@ -179,6 +179,8 @@ def test_what_is_in_doubt_is_asked_for_and_the_answer_settles_it(convert, imutoo
     (tmp_path / "map.toml").write_text(proposed.replace('gyro_unit = "?"', 'gyro_unit = "deg/s"'))
     assert convert(path, tmp_path / "out.mcap", "--map", tmp_path / "map.toml").returncode == 0
     same(tmp_path / "out.mcap", 1e-12)
+    assert convert(path, tmp_path / "word.mcap", "--map", "gyro_unit=deg/s", "--map", "time_unit=ns").returncode == 0
+    same(tmp_path / "word.mcap", 1e-12)
     assert imutool("debias", "out.mcap", "d.mcap", cwd=tmp_path).returncode == 0  # three commands, no Python
 
 

@@ -420,11 +420,44 @@ def test_one_map_holds_for_several_imus_whose_unit_is_open(tmp_path):
     np.testing.assert_allclose(log.imus["/right/imu"].gyro, 2.0 * GYRO)
 
 
-def test_a_map_without_columns_needs_names_that_show_several_imus(tmp_path):
-    path = write_csv(tmp_path / "one.csv", ["t_ns", *IMU_NAMES], [T_NS, *GYRO.T, *ACCEL.T])
-    (tmp_path / "map.toml").write_text('time = "t_ns"\ntime_unit = "ns"\ngyro_unit = "rad/s"\naccel_unit = "m/s^2"\n')
-    with pytest.raises(ConfigError, match="do not show several IMUs"):
-        table.read_sequence(table.sequences(path)[0], mapping=tmp_path / "map.toml")
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"gyro_unit": "deg/s"},
+        {"gyro_unit": "deg/s", "accel_unit": "m/s^2", "time": "t_ns", "time_unit": "ns"},
+        {"gyro_unit": "deg/s", "gyro": "wx,-wy,wz"},
+        {"gyro_unit": "deg/s", "rate_hz": 200.0},
+    ],
+)
+def test_a_map_states_what_is_open_and_the_table_shows_the_rest(tmp_path, stated):
+    """As a user answers one question: `--map gyro_unit=deg/s`."""
+    path = write_csv(tmp_path / "one.csv", ["t_ns", "wx", "wy", "wz", "ax", "ay", "az"], [T_NS, *GYRO.T, *ACCEL.T])
+    with pytest.raises(ConfigError, match="state no unit of the gyro") as refused:
+        table.read_sequence(table.sequences(path)[0])
+    assert "what is open (gyro_unit=rad/s or deg/s or mdeg/s)" in refused.value.fix
+    imu = table.read_sequence(table.sequences(path)[0], mapping=stated).imus["/imu0"]
+    signs = [1.0, -1.0, 1.0] if "gyro" in stated else 1.0
+    np.testing.assert_allclose(imu.gyro, np.deg2rad(GYRO) * signs, atol=1e-9)
+    np.testing.assert_allclose(imu.accel, ACCEL, atol=1e-9)
+    assert imu.t_ns[1] - imu.t_ns[0] == (5_000_000 if "rate_hz" in stated else T_NS[1] - T_NS[0])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"gyro": "wx,wy,wq"}, "no column 'wq'"),
+        ({"time": "t"}, "no column 't'"),
+        ({"gyro": ["wx", "wy"]}, "gyro names 2 columns"),
+        ({"gyro_unit": "rpm"}, "gyro_unit is 'rpm'"),
+        ({"gyro_unit": ""}, "state no unit of the gyro"),
+        ({"rate_hz": float("nan")}, "a positive rate_hz"),
+        ({"gyro_unti": "deg/s"}, "did you mean"),
+    ],
+)
+def test_what_a_map_states_wrongly_is_said(tmp_path, wrong, said):
+    path = write_csv(tmp_path / "one.csv", ["t_ns", "wx", "wy", "wz", "ax", "ay", "az"], [T_NS, *GYRO.T, *ACCEL.T])
+    with pytest.raises(ConfigError, match=f"(?i){said}"):
+        table.read_sequence(table.sequences(path)[0], mapping=wrong)
 
 
 @pytest.mark.parametrize(

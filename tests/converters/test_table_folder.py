@@ -269,3 +269,13 @@ def test_poses_whose_clock_was_set_back_keep_their_own_times(tmp_path):
     (tmp_path / "headpose.csv").write_text("t_ns,px,py,pz,qx,qy,qz,qw\n" + rows(later, np.zeros((COUNT, 3)), turns))
     (poses,) = table.read_sequence(table.sequences(tmp_path)[0]).poses.values()
     assert poses.t_ns[0] == 4_000_000_000
+
+
+def test_a_file_with_arrays_of_different_lengths_beside_tables_is_left_out(tmp_path):
+    from scipy.io import savemat
+
+    names = ["t_s", *(f"gyro_{axis} [rad/s]" for axis in "xyz"), *(f"acc_{axis} [m/s^2]" for axis in "xyz")]
+    (tmp_path / "imu.csv").write_text(",".join(names) + "\n" + rows(T_S, GYRO, ACCEL))
+    savemat(tmp_path / "gps.mat", {f"channel{n}": np.arange(10.0 + n) for n in range(8)})
+    (sequence,) = table.sequences(tmp_path)
+    np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].gyro, GYRO)

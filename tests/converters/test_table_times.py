@@ -130,7 +130,7 @@ def test_a_rate_in_a_group_is_that_of_its_own_sensor(tmp_path):
 
 def test_a_rate_is_kept_where_the_gyro_is_not_recognised(tmp_path):
     scipy.io.savemat(tmp_path / "trial.mat", {"turning": GYRO, "imu_acc": ACCEL, "fs": RATE_HZ})
-    with pytest.raises(ConfigError, match="0 triples of columns look like the gyro") as refused:
+    with pytest.raises(ConfigError, match="no columns look like the gyro") as refused:
         read(tmp_path / "trial.mat")
     assert "rate_hz = 250.0" in refused.value.fix
 
@@ -237,7 +237,7 @@ def test_a_table_without_any_time_is_read_by_a_map_with_a_rate(tmp_path):
     assert np.array_equal(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns, NEXT_NS * np.arange(COUNT))
 
 
-@pytest.mark.parametrize("wrong", ['time_unit = "s"\n', "rate_hz = -5\n", 'rate_hz = 100\ntime = "t"\ntime_unit = "s"\n'])
+@pytest.mark.parametrize("wrong", ["rate_hz = -5\n", 'rate_hz = 100\ntime = "t"\ntime_unit = "s"\n'])
 def test_a_map_has_a_time_or_a_positive_rate(tmp_path, wrong):
     names = ["t", *(f"acc_{a}" for a in "xyz"), *(f"gyr_{a}" for a in "xyz")]
     path = write_csv(tmp_path / "bare.csv", names, [T_S, *ACCEL.T, *GYRO.T])

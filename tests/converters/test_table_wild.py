@@ -298,7 +298,7 @@ def test_imus_on_a_body_become_one_each_and_statistics_none(tmp_path):
     columns = [1e3 * T_S, *(part for _ in places for part in (*ACCEL_G.T, *(COUNTS * 0.07).T))]
     assert {*read(write_csv(tmp_path / "body.csv", names, columns)).imus} == {f"/{place}/imu" for place in places}
     names = [name.replace("chest", "mean").replace("leg", "std") for name in names]
-    with pytest.raises(ConfigError, match="0 triples of columns look like the gyro"):
+    with pytest.raises(ConfigError, match="no columns look like the gyro"):
         read(write_csv(tmp_path / "features.csv", names, columns))
 
 

@@ -1,0 +1,152 @@
+"""Time of a table's samples: a column and its unit, or a rate at which they are counted."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from ._table_groups import shared_group
+from ._table_map import Entries, Proposal, column_named
+from ._table_names import TIME_WORDS, XSENS_TIME, spaced_name, unit_named
+from ._table_text import Columns
+from ._table_times import (
+    MOST_SKIPPED,
+    PLAUSIBLE_HZ,
+    count_times,
+    counters_of,
+    counts_others,
+    goes_on,
+    rate_of_rows,
+    rises,
+    said_steps,
+    share_skipped,
+    stated_rate,
+    units_of_time,
+)
+from ._table_units import TIME_NS
+
+MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
+OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
+
+
+def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns: Columns, given: Entries) -> None:
+    """Column of the time and its unit, as stated, from its name or from a plausible rate."""
+    gyro = proposal.unsigned("gyro", columns)
+    length = len(columns.values[gyro[0]]) if gyro else None
+    if "rate_hz" in given:
+        proposal.rate_hz = given["rate_hz"]
+        counter = given.get("counter", "")
+        if length:
+            proposal.entries |= {"time": count_times(columns, proposal.rate_hz, length, counter), "time_unit": "s"}
+        return
+    if "time" in given:
+        column_named(columns, given["time"], "mapping")
+        proposal.entries["time"] = given["time"]
+        _propose_time_unit(proposal, given["time"], names, columns)
+        return
+    spelled = {c: (name or unit, spaced_name(c)) for c, (name, unit) in names.items()}
+    found = [c for c, each in spelled.items() if any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", name) for name in each)]
+    found = [c for c in found if length in (None, len(columns.values[c]))]
+    still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
+    if gyro:
+        found.sort(key=lambda c: (_table_of(c) != _table_of(gyro[0]), -shared_group(c, gyro[0])))
+        found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
+    found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
+    shown = (proposal.unsigned("accel", columns) or [*names])[:1]
+    counters = counters_of(columns, length or len(columns.values[shown[0]]) if shown else 0)
+    measured = {*counters, *gyro, *proposal.unsigned("accel", columns)}
+    if not found:
+        # of each table, without a count of rows; further columns may rise as a temperature does
+        firsts = {_table_of(c): c for c in reversed(names) if c not in counters}.values()
+        fits = [c for c in names if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])]
+        clocks = [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS]
+        rising = [c for c in fits if c in firsts]
+        found = clocks if len(clocks) == 1 else rising if len(rising) == 1 else []
+        why = "alone rises in a unit of time" if len(clocks) == 1 else "is the first column and rises"
+        proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
+    if not found:
+        for column in still:
+            values = columns.values[column]
+            counts = f"{len(np.unique(values))} different values in {len(values)} rows"
+            proposal.reasons.append(f"{column!r} is named as a time and does not rise: {counts}")
+            proposal.hints += rate_of_rows(column, values, columns.units.get(column, "") or names[column][1])
+        _propose_rate(proposal, columns, next(iter(counters), ""), length)
+        return
+    column = proposal.entries["time"] = found[0]
+    if re.match(OWN_TIME["gyro"], spelled[column][1]):
+        own = [c for c in found if re.match(OWN_TIME["accel"], spelled[c][1]) and names[c][1] == names[column][1]]
+        proposal.entries |= {"accel_time": own[0]} if own else {}
+    _propose_time_unit(proposal, column, names, columns)
+    if column in counters and "time_unit" in proposal.open:
+        proposal.hints.append(
+            f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
+        )
+
+
+def _table_of(column: str) -> str:
+    """Table of a folder that a column is of; a unit behind its name may hold a slash."""
+    return re.sub(r"[\[(][^\])]*[\])]\s*$", "", column).rpartition("/")[0]
+
+
+def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[str, str]], columns: Columns) -> None:
+    """Unit of the time, as stated or by a plausible rate that no other time contradicts."""
+    if (unit := unit_named(columns.units.get(column, "")) or names[column][1]) in TIME_NS:  # a calendar's is not the header's
+        proposal.entries["time_unit"] = unit
+        return
+    values = columns.values[column].astype(float)
+    step = float(np.nanmedian(np.diff(values)))
+    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
+        counts = "100us" if step * TIME_NS["100us"] <= 1e9 / PLAUSIBLE_HZ[0] else "us"
+        proposal.entries["time_unit"] = counts
+        proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")
+        return
+    certain = units_of_time(float(values[0]), step)
+    if len(certain) == 1 and (other := _another_pace(columns, column, certain[0], names)):
+        proposal.open.append("time_unit")
+        proposal.reasons.append(f"{column!r} would count {certain[0]}, but {other}")
+        return
+    if len(certain) == 1:
+        proposal.entries["time_unit"] = certain[0]
+        proposal.reasons.append(f"{column!r} counts {certain[0]}: {1e9 / (step * TIME_NS[certain[0]]):.1f} samples a second")
+    else:
+        proposal.open.append("time_unit")
+        proposal.reasons.append(f"{column!r} states no unit, and a step of {step:.4g} fits {' and '.join(certain) or 'none'}")
+
+
+def _another_pace(columns: Columns, column: str, unit: str, names: dict[str, tuple[str, str]]) -> str:
+    """How another time, whose unit is stated, contradicts the unit of this one; empty if none does."""
+    span = float(columns.values[column][-1] - columns.values[column][0]) * TIME_NS[unit]
+    for other, (_, unit_in_name) in names.items():
+        values, stated = columns.values[other], unit_named(columns.units.get(other, "")) or unit_in_name
+        if other != column and stated in TIME_NS and len(values) == len(columns.values[column]) and goes_on(values):
+            passed = float(values[-1] - values[0]) * TIME_NS[stated]
+            if abs(passed - span) > MOST_APART * passed + WHOLE_NS:
+                return f"by {other!r} {passed * 1e-9:.4g} s pass and not {span * 1e-9:.4g} s"
+    return ""
+
+
+def _propose_rate(proposal: Proposal, columns: Columns, counter: str, length: int | None) -> None:
+    """Sampling rate of samples that are counted, in place of a time."""
+    counted = f"{counter!r} counts the samples" if counter else "no column holds the time: rows are counted"
+    rate = stated_rate(columns, (proposal.unsigned("gyro", columns) or [""])[0])
+    used = counter
+    if counter and counts_others(columns.values[counter]):
+        used = ""
+        counted = f"{counter!r} counts more than the samples ({said_steps(columns.values[counter])}): rows are counted"
+    elif counter and share_skipped(columns.values[counter]) > MOST_SKIPPED:
+        proposal.open.append("counter")
+        proposal.reasons.append(
+            f"{said_steps(columns.values[counter])} in {counter!r}: are samples missing, or does it count packets of other"
+            " sensors, too? For the second, leave it out of the map"
+        )
+    proposal.entries |= {"counter": used} if used else {}
+    if rate is None:
+        proposal.open += ["rate_hz"] if counter else ["time", "time_unit"]
+        what = counted if counter else "no column that rises looks like a time"
+        proposal.reasons.append(f"{what}, and no number in the file is named as a sampling rate")
+        return
+    proposal.rate_hz = rate[1]
+    proposal.reasons.append(f"{counted}, at the {rate[0]!r} of {rate[1]:.6g} Hz that the file states")
+    if length:
+        proposal.entries |= {"time": count_times(columns, rate[1], length, used), "time_unit": "s"}
