@@ -10,7 +10,7 @@ import json
 import re
 from collections import Counter
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -66,6 +66,20 @@ def perhaps(columns: Columns) -> list[str]:
         return []
     triples = zip(halves.sensors, (halves.columns[:3], halves.columns[3:]), strict=True)
     return [f"perhaps {sensor} = {json.dumps(triple)}" for sensor, triple in triples]
+
+
+def in_an_array(columns: Columns) -> dict[str, Any]:
+    """Entries of an IMU in one array of six columns, behind a time or not, whose one half shows gravity."""
+    arrays: dict[str, list[str]] = {}
+    for name in columns.values:
+        if match := re.fullmatch(r"(.*)\[\d\]", name):
+            arrays.setdefault(match[1], []).append(name)
+    found = [halves for names in arrays.values() if len(names) in (6, 7) and (halves := _halves(columns, names))]
+    if len(found) != 1 or len(arrays[found[0].columns[0][:-3]]) != 6 + len(found[0].time):
+        return {}
+    (halves,) = found
+    triples = dict(zip(halves.sensors, (halves.columns[:3], halves.columns[3:]), strict=True))
+    return triples | ({"time": halves.time[0]} if halves.time else {})
 
 
 def _halves(columns: Columns, names: list[str]) -> _Halves | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ._table_clock import propose_time
 from ._table_groups import is_true
-from ._table_headerless import perhaps
+from ._table_headerless import in_an_array, perhaps
 from ._table_map import IN_WHOLE, NO_UNIT, Entries, Proposal, column_named
 from ._table_motion import doubt_gravity, unit_by_motion
 from ._table_names import (
@@ -45,8 +45,12 @@ def propose(columns: Columns, given: Entries = NOTHING) -> Proposal:
     """
     proposal = Proposal({}, [], [])
     names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values if not is_true(column)}
+    sensors = {sensor: _triples(sensor, names, columns) for sensor in ("gyro", "accel")}
+    if not any(sensors.values()) and (array := in_an_array(columns)):
+        proposal.reasons.append(f"{', '.join(array['accel'])} show gravity and count as the accel")
+        given = array | given
     for sensor, units in (("gyro", GYRO_SI), ("accel", ACCEL_SI)):
-        _propose_sensor(proposal, sensor, units, names, columns, given)
+        _propose_sensor(proposal, sensor, units, sensors[sensor], names, columns, given)
     proposal.state({name: value for name, value in given.items() if name in IN_WHOLE})
     propose_time(proposal, names, columns, given)
     proposal.state(given)
@@ -70,6 +74,7 @@ def _propose_sensor(
     proposal: Proposal,
     sensor: str,
     units: dict[str, float],
+    found: Sequence[dict[str, str]],
     names: dict[str, tuple[str, str]],
     columns: Columns,
     given: Entries,
@@ -81,22 +86,14 @@ def _propose_sensor(
         proposal.entries[sensor] = given[sensor]
         _propose_stated(proposal, sensor, units, names, columns)
         return
-    plain = {column: name for column, (name, _) in names.items()}
-    spaced = {column: spaced_name(column) for column in names}
-    every = [*triples(sensor, plain, spaced).values()]
-    found = [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
-    whole = _with_gravity(found, spaced, columns) if sensor == "accel" else found
+    whole = _with_gravity(found, columns) if sensor == "accel" else found
     if len(whole) < len(found):
         proposal.reasons.append(f"of {len(found)} accelerations {whole[0]['x']}/y/z is the one with gravity")
     if len(whole) != 1:
         proposal.open += [sensor] if whole else [sensor, f"{sensor}_unit"]
         shown = ", ".join(f"{triple['x']}/y/z" for triple in whole[:MOST_SHOWN])
-        said = (
-            f"{len(whole)} triples of columns look like the {sensor}: {shown}"
-            if whole
-            else f"no columns look like the {sensor}"
-        )
-        proposal.reasons.append(said)
+        how_many = f"{len(whole)} triples of" if whole else "no"
+        proposal.reasons.append(f"{how_many} columns look like the {sensor}{': ' * bool(shown)}{shown}")
     if not whole:
         return
     proposal.entries[sensor] = [whole[0][axis] for axis in "xyz"]
@@ -121,9 +118,17 @@ def _propose_stated(
         _propose_unit(proposal, sensor, columns)
 
 
-def _with_gravity(found: Sequence[dict[str, str]], spaced: dict[str, str], columns: Columns) -> Sequence[dict[str, str]]:
+def _triples(sensor: str, names: dict[str, tuple[str, str]], columns: Columns) -> Sequence[dict[str, str]]:
+    """Columns x, y and z that are named as a sensor's, measured ones before estimated ones."""
+    plain = {column: name for column, (name, _) in names.items()}
+    spaced = {column: spaced_name(column) for column in names}
+    every = [*triples(sensor, plain, spaced).values()]
+    return [triple for triple in every if not re.search(ESTIMATED, spaced[triple["x"]])] or every
+
+
+def _with_gravity(found: Sequence[dict[str, str]], columns: Columns) -> Sequence[dict[str, str]]:
     """The one of several accelerations that has gravity, by its name or by its size; all where none stands out."""
-    named = [triple for triple in found if not re.search(WITHOUT_GRAVITY, spaced[triple["x"]])]
+    named = [triple for triple in found if not re.search(WITHOUT_GRAVITY, spaced_name(triple["x"]))]
     sized = [triple for triple in named if gravity_units(columns, list(triple.values()))[1]]
     return next((each for each in (named, sized) if len(each) == 1), found)
 

@@ -576,3 +576,25 @@ def test_a_row_of_devices_below_the_units_hides_no_names(tmp_path):
     np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro))
     np.testing.assert_allclose(imu.accel, 9.80665 * accel)
     assert imu.t_ns[0] == 1_767_150_797 * 10**9
+
+
+@pytest.mark.parametrize("with_time", [False, True])
+@pytest.mark.parametrize("accel_first", [False, True])
+def test_an_array_of_six_columns_is_an_imu_where_one_half_shows_gravity(tmp_path, with_time, accel_first):
+    """As in the files of learning challenges: imu (n, 6), ts, pos, quat."""
+    halves = [ACCEL, GYRO] if accel_first else [GYRO, ACCEL]
+    t_s = T_NS[:, None] * 1e-9
+    arrays = {"imu": np.hstack([t_s, *halves])} if with_time else {"imu": np.hstack(halves), "ts": t_s[:, 0]}
+    np.savez(tmp_path / "drone_0.npz", **arrays, vel=np.zeros((len(T_NS), 3)), platform=2)
+    (sequence,) = table.sequences(tmp_path / "drone_0.npz")
+    imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO)
+    np.testing.assert_allclose(imu.accel, ACCEL)
+
+
+def test_an_array_of_six_columns_beside_named_sensors_is_no_imu(tmp_path):
+    six = np.hstack([ACCEL, GYRO])
+    np.savez(tmp_path / "log.npz", features=six, gyro=2.0 * GYRO, acc=ACCEL, t=T_NS * 1e-9)
+    (sequence,) = table.sequences(tmp_path / "log.npz")
+    imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, 2.0 * GYRO)
