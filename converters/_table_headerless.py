@@ -69,7 +69,7 @@ def perhaps(columns: Columns) -> list[str]:
 
 
 def in_an_array(columns: Columns) -> dict[str, Any]:
-    """Entries of an IMU in one array: a time or none, and six columns of which half show gravity."""
+    """Entries of an IMU in one array of six columns, behind a time or not."""
     arrays: dict[str, list[str]] = {}
     for name in columns.values:
         if match := re.fullmatch(r"(.*)\[\d\]", name):
