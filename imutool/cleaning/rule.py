@@ -76,6 +76,7 @@ class TopicSummary:
     Attributes:
         scale: factors from the log's units to rad/s and m/s², gyro then accel.
         axes: signed permutations that lead from the log's axes to right ones, gyro then accel.
+        mount: that which leads from the IMU's axes to the body of the poses; no defect, and only the poses may be turned.
         world: rotation of the poses' world after which z is up.
         position_unit: of the poses' positions.
         quaternions: what is wrong with those of the poses; empty where nothing is.
@@ -91,6 +92,7 @@ class TopicSummary:
     truth: Truth | None
     scale: Float64[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
     axes: Float64[np.ndarray, "2 3 3"] = field(default_factory=lambda: np.stack([np.eye(3)] * 2))
+    mount: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     world: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     position_unit: str = "m"
     quaternions: str = ""

@@ -43,6 +43,7 @@ class Survey:
         dropped: whether each message, in file order, is left out.
         scale: factors from the log's units to rad/s and m/s², gyro then accel.
         axes: signed permutations from the log's axes to right ones, gyro then accel; other than the identity only with `fix`.
+        mount: signed permutation from the IMU's axes to the body of the poses.
         world: rotation of the poses' world after which z is up.
         position_unit: of the poses' positions.
         quaternions: what is wrong with those of the poses; empty where nothing is.
@@ -62,6 +63,7 @@ class Survey:
     dropped: Bool[np.ndarray, " n"]
     scale: Float64[np.ndarray, "6"]
     axes: Float64[np.ndarray, "2 3 3"]
+    mount: Float64[np.ndarray, "3 3"]
     world: Float64[np.ndarray, "3 3"]
     position_unit: str
     quaternions: str
@@ -218,7 +220,7 @@ def examine(
     counts = whole.messages, start_ns, end_ns, missing, surplus
     pose_topic = "" if truth is None else truth.topic
     poses = whole.world, whole.position_unit, whole.quaternions, pose_topic, whole.pose_delay_ns
-    return Survey(where, topic, settings, *counts, dropped, whole.scale, whole.axes, *poses, findings, reasons)
+    return Survey(where, topic, settings, *counts, dropped, whole.scale, whole.axes, whole.mount, *poses, findings, reasons)
 
 
 def _through(

@@ -53,9 +53,11 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
             kept += [f"{topic}: {step}" for step in survey.clock_steps]
-            mount = survey.axes[0] if not frame_id and _is_mount(log, survey, before) else None
-            if mount is not None or frame_id:  # the next round judges by the corrected poses
+            mount = None if frame_id or (survey.mount == np.eye(3)).all() else survey.mount
+            if frame_id:  # the next round judges by the corrected poses
                 survey = replace(survey, axes=AS_RECORDED)
+            elif mount is not None and _one_is_straight(log, before, survey.pose_topic):
+                survey, mount = replace(survey, axes=np.stack([mount] * 2)), None
             before.append(topic)
             patched = described.reflected is None or isinstance(described.reflected, Reflected)
             if not patched or described.message_encoding not in ENCODINGS:
@@ -84,11 +86,9 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
     return Corrections(imus, *poses, stamps, own_types, said, kept)
 
 
-def _is_mount(log: Log, survey: Survey, before: Sequence[str]) -> bool:
-    """Whether gyro and accel are turned alike against the poses, which no IMU before shows to be right."""
-    gyro, accel = survey.axes
-    alike = survey.pose_topic and (gyro == accel).all() and (gyro != np.eye(3)).any() and np.linalg.det(gyro) > 0.0
-    return bool(alike) and not any(is_straight(log, sound_samples(log, topic), survey.pose_topic) for topic in before)
+def _one_is_straight(log: Log, imus: Sequence[str], pose_topic: str) -> bool:
+    """Whether an IMU lies as the body of the poses does."""
+    return any(is_straight(log, sound_samples(log, topic), pose_topic) for topic in imus)
 
 
 def _imu_note(survey: Survey) -> str:

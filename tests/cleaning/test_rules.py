@@ -358,9 +358,13 @@ def test_axes_that_contradict_the_poses_are_named_and_not_mended(sensor, columns
     assert (survey.scale == 1.0).all()
 
 
-def test_a_sensor_mounted_otherwise_than_the_body_of_the_poses_is_no_defect(made, truth):
-    survey = look(made._replace(gyro=made.gyro[:, [2, 0, 1]], accel=made.accel[:, [2, 0, 1]]), truth)
+@pytest.mark.parametrize("fix", [False, True])
+def test_a_sensor_mounted_otherwise_than_the_body_of_the_poses_is_no_defect_and_keeps_its_axes(made, truth, fix):
+    turned = made._replace(gyro=made.gyro[:, [2, 0, 1]], accel=made.accel[:, [2, 0, 1]])
+    survey = look(turned, truth, CleaningSettings(fix=fix))
     assert (only(survey, "axes").severity, survey.verdict) == ("note", "good")
+    assert (survey.matrices == np.eye(3)).all()
+    np.testing.assert_array_equal(survey.mount @ [1.0, 2.0, 3.0], [2.0, 3.0, 1.0])
 
 
 def test_a_mirrored_sensor_is_a_defect(made, truth):

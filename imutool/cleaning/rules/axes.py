@@ -43,6 +43,8 @@ class Axes(Rule):
             return
         fixed = whole.settings.fix
         for finding, gyro, accel in _sensors(found):
+            if found.gyro is not None and "mount" in finding.values:
+                whole.mount = found.gyro.axes
             proposed = gyro is not None or accel is not None
             if fixed and proposed:
                 whole.axes[0] = whole.axes[0] if gyro is None else gyro
@@ -108,7 +110,7 @@ def _sensors(found: Conventions) -> Iterator[Proposal]:
         if gyro.wrong:
             names = axis_names(gyro.axes)
             what = f"the body of the true poses is not the IMU's: its x, y, z seem to be the IMU's {names}"
-            yield Finding("axes", "note", what, 3, values={"mount": names, "fix": names}, confidence=0.8), gyro.axes, gyro.axes
+            yield Finding("axes", "note", what, 3, values={"mount": names, "fix": names}, confidence=0.8), None, None
         return
     if gyro.wrong:  # where nothing is known of the other sensor, it may still be the mount
         known = accel is not None or (relative is not None and (relative.axes == gyro.axes).all())
