@@ -269,13 +269,13 @@ def _imu_warnings(
     counts: Mapping[str, int], imu: Imu, whole: TopicSummary, stamps: Stamps, jumps: Sequence[tuple[int, float]]
 ) -> list[str]:
     words = {
-        "out_of_order": "samples out of order",
-        "duplicated": "samples with a repeated stamp",
-        "missing": "samples missing",
-        "not_finite": "samples that are not finite, or beyond any sensor",
-        "saturated": "samples saturated",
+        "out_of_order": "out of order",
+        "duplicated": "with a repeated stamp",
+        "missing": "missing",
+        "not_finite": "not finite, or beyond any sensor",
+        "saturated": "saturated",
     }
-    warnings = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    warnings = [f"{n} sample{'s' * (n != 1)} {text}" for key, text in words.items() if (n := counts[key])]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.faults]
     warnings += jump_warnings(jumps)
     if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S and not stamps.faults:

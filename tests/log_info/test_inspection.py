@@ -146,7 +146,7 @@ def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused
     (found,) = described(path)["imu"]
     assert (found["out_of_order"], found["duplicated"], found["not_finite"]) == (1, 1, 1)
     assert found["samples"] == 1000
-    assert {"1 samples out of order", "1 samples with a repeated stamp"} <= set(found["warnings"])
+    assert {"1 sample out of order", "1 sample with a repeated stamp"} <= set(found["warnings"])
 
 
 def test_clipping_is_seen_and_noise_and_coarse_steps_are_not(tmp_path):
