@@ -24,7 +24,7 @@ from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.estimation.observability import unobservable, with_free, without_second_orders
+from imutool.diagnosis.estimation.observability import in_forms, unobservable, with_free, without_second_orders
 from imutool.diagnosis.estimation.significance import scatter
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.whitening import WhitenedImu
@@ -58,7 +58,7 @@ from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
-from imutool.sensor.effects import clock_wander, gyro_bias_drift, low_pass
+from imutool.sensor.effects import clock_wander, gyro_bias_drift
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
@@ -227,7 +227,7 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     exact = all(pair.exact for pair in pairs)  # poses know nothing of a millisecond: `late_stamps`
     left_out = {*SHOWN_BY_SAMPLES, NEEDS_POSES if exact else NEEDS_SIMULATION}
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
-    effects = [form for effect in effects for form in low_pass.forms(effect, each_sensor=exact)]
+    effects = in_forms(effects, exact=exact)
     end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
     effects = [*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]

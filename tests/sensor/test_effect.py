@@ -378,7 +378,7 @@ def test_a_low_pass_of_one_sensor_leaves_the_other(name: str) -> None:
     felt, (both,) = lively(), catalogue.effects([name])
     theta = np.array([10.0] if name == "low_pass" else [10.0, 0.7])
     for sensor, other in (("gyro", "accel"), ("accel", "gyro")):
-        one = next(form for form in low_pass.forms(both, each_sensor=True) if form.sensors == (sensor,))
+        one = next(form for form in low_pass.forms(both, exact=True) if form.sensors == (sensor,))
         for forward in ("forward", "lagless"):
             out, of_both = (getattr(effect, forward)(felt, theta) for effect in (one, both))
             np.testing.assert_array_equal(getattr(out, sensor), getattr(of_both, sensor))

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.estimation.aligned_log import Pair, split
 from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.observability import in_forms
 from imutool.diagnosis.estimation.whitening import WhitenedImu, Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording
 from imutool.sensor import catalogue as _catalogue
 from imutool.sensor.effect import Acting, Effect, SignalState, in_stage_order
-from imutool.sensor.effects import low_pass
 from imutool.sensor.made_up_flight import FlightSettings, trajectory
 from imutool.sensor.samples import IdealMotion, SensorSamples, Times
 
@@ -75,18 +75,14 @@ def shaken(seed: int = 1, duration_s: float = DURATION_S) -> IdealMotion:
 def acting(effects: Mapping[str, Sequence[float]]) -> Chosen:
     """Effects of the catalogue by name, with their parameters; a low-pass without all is analog."""
     found = ((_catalogue.diagnosed([name])[0], np.array(theta, dtype=float)) for name, theta in effects.items())
-    return tuple((one if len(theta) == len(one.parameters) else _analog(one), theta) for one, theta in found)
-
-
-def _analog(effect: Effect) -> Effect:
-    return low_pass.forms(effect, each_sensor=False)[0]
+    return tuple((one if len(theta) == len(one.parameters) else in_forms([one], exact=False)[0], theta) for one, theta in found)
 
 
 def catalogue() -> tuple[Effect, ...]:
     """All that a fit can find beside a simulation, without another channel of the log."""
     others = {*SHOWN_BY_SAMPLES, "clock_wander"}
     found = (one for one in _catalogue.diagnosed() if set(one.needs) <= {"attitude"} and one.name not in others)
-    return tuple(form for one in found for form in low_pass.forms(one, each_sensor=True))
+    return tuple(in_forms(found, exact=True))
 
 
 def simulate_samples(motion: IdealMotion, stamp_s: Times, acting: Acting) -> SensorSamples:

@@ -32,6 +32,7 @@ from imutool.diagnosis.estimation.trial.lag_start import (
     beside_offset,
     with_delay_of_accel,
     with_form_of_low_pass,
+    with_form_of_resonance,
     without_unseen_low_pass,
 )
 from imutool.diagnosis.estimation.trial.model_error import LowPassError
@@ -103,6 +104,7 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
             if better.chosen[-1][0].name in LOW_PASSES:
                 better = with_form_of_low_pass(search.logs, better, search.named)
                 better = with_delay_of_accel(search.logs, better, search.named)
+            better = with_form_of_resonance(search.logs, better, search.named)
             before, now = now.objective, search.pruned(search.exchanged(better))
         elif waiting:
             search = replace(search, unnamed=(*search.unnamed, *waiting.pop(0)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, combinations
 from typing import Any
@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.effects import low_pass, vibration
+from imutool.sensor.effects import gyro_hysteresis, low_pass, mount_resonance, vibration
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 LOW_PASSES = ("low_pass", "second_order_low_pass")
@@ -40,6 +40,13 @@ Starts = Mapping[str, Sequence[Theta]]
 
 
 # ── what the motion can show ──
+
+
+def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
+    """Effects in the forms that a diagnosis tries; an `exact` simulation shows more."""
+    for forms in (low_pass.forms, gyro_hysteresis.forms, mount_resonance.forms):
+        found = [form for effect in found for form in forms(effect, exact=exact)]
+    return [*found]
 
 
 def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:
@@ -235,7 +242,7 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
     hertz = [value for parameter, value in zip(effect.parameters, theta, strict=True) if parameter.unit == "Hz"]
     outside = bool(reach and hertz and (max(hertz) > min(reach) or min(hertz) < settings.slowest_hz))
     if effect.name == "mount_resonance":
-        takes_back = bool(theta[2:].sum() < 0.0)  # as no spring does
+        takes_back = bool(theta[2:5].sum() < 0.0)  # as no spring does
         overdamped = bool(theta[1] > 1.0)  # a lag, which does not ring
         return outside or takes_back or overdamped or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]

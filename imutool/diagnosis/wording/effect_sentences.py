@@ -113,6 +113,16 @@ def _near(gain: float, other: float) -> bool:
     return abs(gain - other) < OF_CONVENTION * abs(other)
 
 
+def _hysteresis(w: Words) -> str:
+    """Of the whole reading, of a share of it, or of a material that is stiffer to small motions (a negative share)."""
+    share = w.finding.parameters.get("share")
+    if share is None:
+        return f"{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind"
+    if share.value < 0.0:
+        return f"{w.it} shows what moves by less than {w.main} larger than what moves more"
+    return f"{w.rest[0] if w.rest else 'a part'} of it follows only once {w.other} has moved by {w.main}"
+
+
 def _mount_resonance(w: Words) -> str:
     """A resonance that the motion excites, or one that shocks excite, which no sample predicts."""
     if has_gain(w.finding):
@@ -162,8 +172,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "clock_jump": _clock_jump,
     "clock_wander": "the clock of the recording wanders, by {w.main}",
     "gyro_delay": _gyro_delay,
-    "gyro_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
-    "accel_hysteresis": "{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind",
+    "gyro_hysteresis": _hysteresis,
+    "accel_hysteresis": _hysteresis,
     "gyro_dead_band": "{w.it} reads zero below {w.main}",
     "low_pass": _low_pass,
     "second_order_low_pass": "{w.it} is too slow for fast motion, {w.main.labelled} (second-order low-pass)",

@@ -173,6 +173,8 @@ def _step(several: Sequence[Estimate]) -> tuple[float, str]:
     largest = max(abs(estimate.value) for estimate in several)
     if largest == 0.0 or not math.isfinite(largest):
         largest = max((estimate.std for estimate in several if math.isfinite(estimate.std)), default=0.0)
+    if largest == 0.0:  # a form, such as an order
+        return 1.0, unit
     for least, size, name in STEPS.get(unit or "-", ()):
         if largest >= least:
             return size, name

@@ -2,10 +2,13 @@
 
 It stays where it is until the rate has moved on by that width.
 The play operator, y = clip(y before, omega - width, omega + width) (Krasnosel'skii and Pokrovskii, Systems with Hysteresis,
-1989, ch. 1); hysteresis error: IEEE 528. It lags by a width, and a `gyro_delay` by a time.
+1989, ch. 1); hysteresis error: IEEE 528. It lags by a width, and a `gyro_delay` by a time. Of a material that gives, a share of
+the reading does so alone, from a wide width on: one element of Prandtl's model, and nearly that of Bouc and Wen.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,33 +19,67 @@ from imutool.units import Sensor
 
 LEAST = 1e-4  # of the plausible width, where a fit starts at least
 LOG_STEP = 0.02  # of the derivative by the width
+SHARE = Parameter("share", "-", 0.3, null_value=1.0)  # of the reading that lags
+WIDTHS = 0.3, 1.0, 3.0  # of the motion's standard deviation, from where the fit of a share starts
 
 
 def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observable_if: str) -> Effect:
-    """Hysteresis of either sensor, of one width on all axes."""
-    part = 0 if sensor == "gyro" else 1
+    """Hysteresis of either sensor, of one width and share on all axes."""
 
-    def forward(samples: SensorSamples, width: Theta) -> SensorSamples:
-        reading = play(getattr(samples, sensor), float(width[0]))
+    def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
+        ideal, share = getattr(samples, sensor), float(theta[1]) if len(theta) > 1 else 1.0
+        reading = ideal + share * (play(ideal, float(theta[0])) - ideal)
         return samples.with_readings(gyro=reading) if sensor == "gyro" else samples.with_readings(accel=reading)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """The width by which the samples lag on the way up and on the way down."""
-        error, ideal = residual(motion, samples)[part], getattr(motion.sample(samples.stamp_s, samples.stamp_s), sensor)
-        behind = -float(np.mean((error - error.mean(axis=0)) * np.sign(np.gradient(ideal, axis=0))))
-        return [np.array([max(behind, LEAST * plausible)])]
+        error, ideal = _error(sensor, motion, samples)
+        behind = -float(np.mean(error * np.sign(np.gradient(ideal, axis=0))))
+        return [np.array([max(behind, LEAST * plausible), SHARE.null_value])]
 
     return Effect(
         f"{sensor}_hysteresis",
         Stage.SENSOR,
         (sensor,),
-        f"{sensor}(t) = {symbol} where it moves by less than width, else width behind it, on every axis",
-        (Parameter("width", unit, plausible, positive=True, step=LOG_STEP),),
+        f"{sensor}(t) = {symbol} where it moves by less than width, else width behind it, on every axis (or a share of it)",
+        (Parameter("width", unit, plausible, positive=True, step=LOG_STEP), SHARE),
         observable_if,
         forward,
         linear=False,
         starts=starts,
     )
+
+
+def forms(effect: Effect, *, exact: bool) -> list[Effect]:
+    """A hysteresis of the whole reading, and with `exact` one of a share; another effect itself."""
+    if SHARE not in effect.parameters:
+        return [effect]
+    (sensor,), whole_starts = effect.sensors, effect.starts
+    assert whole_starts is not None, "a hysteresis has starts"
+
+    def of_share(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+        """Widths of the size of the motion, and the share that each explains best."""
+        error, ideal = _error("gyro" if sensor == "gyro" else "accel", motion, samples)
+        widths = [factor * float(np.sqrt(ideal.var(axis=0).mean())) for factor in WIDTHS]
+        behind = [play(ideal, width) - ideal for width in widths]
+        lags = [(lag - lag.mean(axis=0)) for lag in behind]
+        return [
+            np.array([max(width, LEAST * effect.plausible[0]), (error * lag).sum() / max((lag**2).sum(), 1e-300)])
+            for width, lag in zip(widths, lags, strict=True)
+        ]
+
+    whole = replace(
+        effect, parameters=effect.parameters[:1], starts=lambda motion, at: [theta[:1] for theta in whole_starts(motion, at)]
+    )
+    return [whole, *([replace(effect, variant="share", starts=of_share)] if exact else [])]
+
+
+def _error(
+    sensor: Sensor, motion: IdealMotion, samples: SensorSamples
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+    """Error of the readings without its mean, and the ideal readings."""
+    error = residual(motion, samples)[0 if sensor == "gyro" else 1]
+    return error - error.mean(axis=0), getattr(motion.sample(samples.stamp_s, samples.stamp_s), sensor)
 
 
 def play(x: Float64[np.ndarray, "n 3"], width: float) -> Float64[np.ndarray, "n 3"]:

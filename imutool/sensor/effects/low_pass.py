@@ -261,15 +261,15 @@ def of_signal(effect: Effect, signal: str) -> Effect:
     return effect if effect.lagless is None or sensor is None else of_one(effect, sensor)
 
 
-def forms(effect: Effect, *, each_sensor: bool) -> list[Effect]:
+def forms(effect: Effect, *, exact: bool) -> list[Effect]:
     """Forms of a low-pass without a rate; another effect itself.
 
-    Beside a simulation a low-pass may be of each sensor alone, or of another order.
+    With `exact`, beside a simulation, a low-pass may be of each sensor alone, or of another order.
     """
     if effect.lagless is None:
         return [effect]
     both, higher = analog(effect), HIGHER if ORDER in effect.parameters else ()
-    if not each_sensor:
+    if not exact:
         return [both]
     return [both, *(of_one(both, sensor) for sensor in SENSORS), *(of_order(both, order) for order in higher)]
 

@@ -9,13 +9,13 @@ from support import planted
 
 from imutool.diagnosis.compare_findings import shared
 from imutool.diagnosis.estimation.model_selection import select_effects
+from imutool.diagnosis.estimation.observability import in_forms
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.held_out import noise_floor
 from imutool.diagnosis.reference.another_motion import compared
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.summarize import finding_of
 from imutool.sensor import catalogue
-from imutool.sensor.effects import low_pass
 
 SECONDS, FILTER_HZ = 15.0, 30.0
 FILTER, OTHER_FILTER = {"low_pass": [FILTER_HZ]}, {"low_pass": [2.0 * FILTER_HZ]}
@@ -25,7 +25,7 @@ SCALE, SMALL_SCALE = {"gyro_scale": [0.02, 0.0, -0.015]}, {"gyro_scale": [1e-3, 
 def searched(effects: Mapping[str, Sequence[float]], seed: int, words: Sequence[str], *, still: bool = False) -> Selection:
     """What a search among some words of the catalogue selects for a log with some effects."""
     motion = planted.planar(SECONDS) if still else planted.rich(seed, SECONDS)
-    candidates = [low_pass.forms(effect, each_sensor=False)[0] for effect in catalogue.diagnosed(words)]
+    candidates = in_forms(catalogue.diagnosed(words), exact=False)
     return select_effects([planted.weighed(planted.pair(motion, effects, seed))], candidates)
 
 

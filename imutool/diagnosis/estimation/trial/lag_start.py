@@ -1,4 +1,4 @@
-"""Low-pass: beside a clock offset, which may take its lag, and as a digital filter."""
+"""Forms of filters: a low-pass beside a clock offset, or digital; a resonance."""
 
 from __future__ import annotations
 
@@ -78,6 +78,18 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
         trial = fit(logs, two, near=now) if two else now
         if bic(trial) < bic(now) - settings.model_error_low_pass / error * max(settings.clearly_better, errs):
             return with_form_of_low_pass(logs, trial, named)
+    return now
+
+
+def with_form_of_resonance(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+    """Fit with a resonance whose damper is elsewhere, where that is clearly better (BIC)."""
+    if not all(log.pair.exact for log in logs):
+        return now
+    for k, (effect, theta) in enumerate(now.chosen):
+        for other in [one for one in named if one.name == effect.name == "mount_resonance" and one.key != effect.key]:
+            trial = fit(logs, (*now.chosen[:k], (other, theta), *now.chosen[k + 1 :]), near=now, give_up_above=now.objective)
+            if bic(trial) < bic(now) - logs[0].pair.settings.search.clearly_better:
+                return trial
     return now
 
 
