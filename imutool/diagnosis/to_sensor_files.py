@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 
 from imutool.diagnosis.estimation.jacobians import Chosen
+from imutool.diagnosis.estimation.trial.effect_forms import at_rate
 from imutool.diagnosis.result import CONVENTIONS, Diagnosis, Estimate, Finding
 from imutool.noise.colour import measured
 from imutool.noise.datasheet import Noise
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.effects.low_pass import RATE, digital
 from imutool.sensor.physics_file import Bias, Curve, Entry, PhysicsFile, Term, Value
 from imutool.units import AXES, SENSORS, Sensor, three
 
@@ -41,8 +41,8 @@ def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> C
 
 
 def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect, Theta]:
-    """An effect with found values; a low-pass is digital if its rate was found."""
-    effect = digital(effect) if effect.lagless is not None and RATE.name in parameters else effect
+    """An effect with found values; a low-pass is digital, or smoothing, if its rate was found."""
+    effect = at_rate(effect, parameters) if effect.lagless is not None else effect
     values = [parameters[of.name].value if of.name in parameters else of.null_value for of in effect.parameters]
     return effect, np.array(values)
 

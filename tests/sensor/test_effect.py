@@ -364,6 +364,17 @@ def test_a_low_pass_of_higher_order_and_a_moving_average_are_those_of_scipy(orde
         np.testing.assert_allclose(values[200:-200], exact[200:-200], atol=1e-6)
 
 
+@pytest.mark.parametrize("cutoff_hz", [5.0, 30.0])
+def test_exponential_smoothing_is_its_recursion_on_the_samples(cutoff_hz: float) -> None:
+    felt = lively()
+    felt = replace(felt, gyro=felt.gyro + np.random.default_rng(1).normal(size=felt.gyro.shape))
+    k = 1.0 - math.exp(-2.0 * math.pi * cutoff_hz / felt.rate_hz)
+    out = act("low_pass", felt, cutoff_hz, math.inf, 1.0, felt.rate_hz)
+    np.testing.assert_allclose(out.gyro[200:-200], lfilter([k], [1.0, k - 1.0], felt.gyro, axis=0)[200:-200], atol=1e-6)
+    design, f_hz = low_pass.Design(cutoff_hz, smoothing_hz=felt.rate_hz), np.array([0.01])
+    assert design.lag_s == pytest.approx(-np.angle(design.answer(f_hz))[0] / (2.0 * np.pi * f_hz[0]), rel=1e-4)
+
+
 @pytest.mark.parametrize("order", [0.0, 1.0, 3.0, 4.0])
 @pytest.mark.parametrize("rate_hz", [math.inf, 200.0])
 def test_the_lag_of_a_low_pass_is_that_of_slow_motion(order: float, rate_hz: float) -> None:
@@ -378,7 +389,7 @@ def test_a_low_pass_of_one_sensor_leaves_the_other(name: str) -> None:
     felt, (both,) = lively(), catalogue.effects([name])
     theta = np.array([10.0] if name == "low_pass" else [10.0, 0.7])
     for sensor, other in (("gyro", "accel"), ("accel", "gyro")):
-        one = next(form for form in low_pass.forms(both, exact=True) if form.sensors == (sensor,))
+        one = low_pass.of_one(both, sensor)
         for forward in ("forward", "lagless"):
             out, of_both = (getattr(effect, forward)(felt, theta) for effect in (one, both))
             np.testing.assert_array_equal(getattr(out, sensor), getattr(of_both, sensor))
@@ -423,6 +434,13 @@ def test_a_hysteresis_holds_a_reading_until_the_rate_has_moved_on() -> None:
     close(act("gyro_hysteresis", samples, 0.25).gyro, np.stack([held, 0.0 * rate, -held]).T)
 
 
+def test_a_share_of_a_reading_holds_and_the_rest_follows() -> None:
+    felt = lively()
+    samples = felt.sample(felt.t_s, felt.t_s)
+    whole, share = (act("gyro_hysteresis", samples, 0.2, *more).gyro for more in ([], [0.25]))
+    close(share, 0.75 * samples.gyro + 0.25 * whole)
+
+
 def test_a_hysteresis_starts_at_its_width_beside_a_bias_and_noise() -> None:
     felt = lively()
     read = act("accel_hysteresis", felt.sample(felt.t_s, felt.t_s), 0.1)
@@ -450,11 +468,12 @@ def test_a_dead_band_starts_at_its_width_beside_a_bias_and_noise(width: float) -
 
 @pytest.mark.parametrize("f_hz", [0.5, 3.0, 11.0, 27.0, 50.0])
 @pytest.mark.parametrize(("f0_hz", "zeta"), [(4.0, 0.1), (11.0, 0.05), (30.0, 0.3), (60.0, 0.1), (20.0, 1.4)])
-def test_a_soft_mount_has_the_gain_and_phase_of_its_formula(f_hz: float, f0_hz: float, zeta: float) -> None:
+@pytest.mark.parametrize("damper", [1.0, 0.0])
+def test_a_soft_mount_has_the_gain_and_phase_of_its_formula(f_hz: float, f0_hz: float, zeta: float, damper: float) -> None:
     felt = sine(f_hz)
-    out = act("mount_resonance", felt, f0_hz, zeta, 1.0, 0.5, 0.0)
+    out = act("mount_resonance", felt, f0_hz, zeta, 1.0, 0.5, 0.0, *([] if damper else [damper]))
     x = f_hz / f0_hz
-    exact = (1.0 + 2j * zeta * x) / (1.0 - x**2 + 2j * zeta * x)
+    exact = (1.0 + 2j * damper * zeta * x) / (1.0 - x**2 + 2j * zeta * x)
     assert abs(response(out.accel[:, 0], f_hz, felt.t_s) / exact - 1.0) < promised(f_hz)
     assert abs(response(out.accel[:, 1], f_hz, felt.t_s) - (0.5 + 0.5 * exact)) < promised(f_hz) * abs(exact)
     np.testing.assert_array_equal(out.accel[:, 2], felt.accel[:, 2])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.estimation.aligned_log import Pair, split
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.estimation.observability import in_forms
+from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.whitening import WhitenedImu, Whitener
 from imutool.inertial.kinematics import Trajectory
 from imutool.recording import Imu, Poses, Recording

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, combinations
 from typing import Any
@@ -19,7 +19,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.effects import gyro_hysteresis, low_pass, mount_resonance, vibration
+from imutool.sensor.effects import low_pass, vibration
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 LOW_PASSES = ("low_pass", "second_order_low_pass")
@@ -40,13 +40,6 @@ Starts = Mapping[str, Sequence[Theta]]
 
 
 # ── what the motion can show ──
-
-
-def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
-    """Effects in the forms that a diagnosis tries; an `exact` simulation shows more."""
-    for forms in (low_pass.forms, gyro_hysteresis.forms, mount_resonance.forms):
-        found = [form for effect in found for form in forms(effect, exact=exact)]
-    return [*found]
 
 
 def unobservable(logs: Sequence[WhitenedLog], candidates: Sequence[Effect], settings: SearchSettings) -> tuple[str, ...]:

@@ -8,8 +8,6 @@ the reading does so alone, from a wide width on: one element of Prandtl's model,
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from imutool.array_types import Float64
@@ -20,7 +18,6 @@ from imutool.units import Sensor
 LEAST = 1e-4  # of the plausible width, where a fit starts at least
 LOG_STEP = 0.02  # of the derivative by the width
 SHARE = Parameter("share", "-", 0.3, null_value=1.0)  # of the reading that lags
-WIDTHS = 0.3, 1.0, 3.0  # of the motion's standard deviation, from where the fit of a share starts
 
 
 def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observable_if: str) -> Effect:
@@ -33,7 +30,7 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         """The width by which the samples lag on the way up and on the way down."""
-        error, ideal = _error(sensor, motion, samples)
+        error, ideal = error_and_ideal(sensor, motion, samples)
         behind = -float(np.mean(error * np.sign(np.gradient(ideal, axis=0))))
         return [np.array([max(behind, LEAST * plausible), SHARE.null_value])]
 
@@ -50,31 +47,7 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
     )
 
 
-def forms(effect: Effect, *, exact: bool) -> list[Effect]:
-    """A hysteresis of the whole reading, and with `exact` one of a share; another effect itself."""
-    if SHARE not in effect.parameters:
-        return [effect]
-    (sensor,), whole_starts = effect.sensors, effect.starts
-    assert whole_starts is not None, "a hysteresis has starts"
-
-    def of_share(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-        """Widths of the size of the motion, and the share that each explains best."""
-        error, ideal = _error("gyro" if sensor == "gyro" else "accel", motion, samples)
-        widths = [factor * float(np.sqrt(ideal.var(axis=0).mean())) for factor in WIDTHS]
-        behind = [play(ideal, width) - ideal for width in widths]
-        lags = [(lag - lag.mean(axis=0)) for lag in behind]
-        return [
-            np.array([max(width, LEAST * effect.plausible[0]), (error * lag).sum() / max((lag**2).sum(), 1e-300)])
-            for width, lag in zip(widths, lags, strict=True)
-        ]
-
-    whole = replace(
-        effect, parameters=effect.parameters[:1], starts=lambda motion, at: [theta[:1] for theta in whole_starts(motion, at)]
-    )
-    return [whole, *([replace(effect, variant="share", starts=of_share)] if exact else [])]
-
-
-def _error(
+def error_and_ideal(
     sensor: Sensor, motion: IdealMotion, samples: SensorSamples
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
     """Error of the readings without its mean, and the ideal readings."""

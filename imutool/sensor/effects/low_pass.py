@@ -40,20 +40,20 @@ SLOW, FALL = 0.02, 3  # of half the sample rate, from where on, and by which pow
 WEIGHT = 1.0 / (SLOW**FALL + (OMEGA / np.pi) ** FALL)
 RATE = Parameter("rate", "Hz", 200.0, positive=True, null_value=math.inf)  # of a digital filter
 ORDER = Parameter("order", "-", 1.0, null_value=1.0)  # of a Butterworth filter; 0: a moving average
+SMOOTHING = Parameter("smoothing_rate", "Hz", 200.0, positive=True, null_value=math.inf)  # of y += k (x - y) at each sample
 AVERAGE = 0.4429  # f_c T of a moving average: there it has lost half of the power
-HIGHER = 0, 4  # orders that a diagnosis tries, beside the first and the second
 WAVES = np.exp(-1j * OMEGA[:, None] * np.arange(-AHEAD, BEHIND + 1))
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """f_c (Hz), the rate of a digital filter, and the order.
+    """f_c (Hz), the rate of a digital filter, the order, and the rate of exponential smoothing.
 
     The filter starts settled; an infinite cut-off frequency lets everything pass.
     """
     if math.isinf(theta[0]):
         return motion
     design = _design(theta)
-    if math.isfinite(design.rate_hz) or design.order != 1.0:
+    if math.isfinite(min(design.rate_hz, design.smoothing_hz)) or design.order != 1.0:
         return behind_gain(motion, design, lag=True)
     a = 2.0 * math.pi * float(theta[0]) / motion.rate_hz  # rad a sample
     gyro, accel, alpha = (slowed(motion, x, _first_order(a)) for x in (motion.gyro, motion.accel, motion.alpha))
@@ -61,25 +61,37 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
 
 
 class Design(NamedTuple):
-    """Design of a low-pass: of second order if it has a damping, digital if it has a rate."""
+    """Design of a low-pass: of second order if it has a damping, digital if it has a rate.
+
+    Exponential smoothing, y += k (x - y) with k = 1 - exp(-2 pi f_c / rate), lags by half a sample less than the analog filter.
+    """
 
     cutoff_hz: float
     zeta: float | None = None
     rate_hz: float = math.inf
     order: float = 1.0
+    smoothing_hz: float = math.inf
 
     @classmethod
     def of(cls, effect: Effect, theta: Theta) -> Design:
         """Design of an effect of this or of second order."""
         values = dict(zip((parameter.name for parameter in effect.parameters), theta.tolist(), strict=True))
         values |= {parameter.name: value for parameter, value in effect.constants}
-        return cls(float(theta[0]), values.get("zeta"), values.get(RATE.name, math.inf), values.get(ORDER.name, 1.0))
+        rates = (values.get(one.name, math.inf) for one in (RATE, SMOOTHING))
+        return cls(float(theta[0]), values.get("zeta"), next(rates), values.get(ORDER.name, 1.0), next(rates))
+
+    @property
+    def kept(self) -> float:
+        """What exponential smoothing keeps of the sample before."""
+        return math.exp(-2.0 * math.pi * self.cutoff_hz / self.smoothing_hz)
 
     @property
     def lag_s(self) -> float:
         """Lag far below the cut-off."""
         if not self.order:
             return 0.5 * (AVERAGE / self.cutoff_hz - (1.0 / self.rate_hz if math.isfinite(self.rate_hz) else 0.0))
+        if math.isfinite(self.smoothing_hz):
+            return self.kept / (1.0 - self.kept) / self.smoothing_hz
         twice_zeta = float(-self.poles.real.sum()) if self.zeta is None else 2.0 * self.zeta
         cutoff = math.pi * self.cutoff_hz
         if math.isfinite(self.rate_hz):
@@ -98,6 +110,8 @@ class Design(NamedTuple):
             window_s = AVERAGE / self.cutoff_hz
             own = np.sinc(np.clip(f_hz / self.rate_hz, 0.0, 0.5))  # of a mean of samples, up to half of their rate
             return np.asarray(np.sinc(f_hz * window_s) / own * np.exp(-2j * np.pi * f_hz * self.lag_s))
+        if math.isfinite(self.smoothing_hz):
+            return np.asarray((1.0 - self.kept) / (1.0 - self.kept * np.exp(-2j * np.pi * f_hz / self.smoothing_hz)))
         x = f_hz / self.cutoff_hz
         if math.isfinite(self.rate_hz):
             x = _folded_tan(f_hz / self.rate_hz) / math.tan(math.pi * min(self.cutoff_hz / self.rate_hz, MOST))
@@ -217,28 +231,6 @@ def digital_starts(
     return starts
 
 
-def analog(effect: Effect) -> Effect:
-    """A low-pass without the rate of a digital one, of its lowest order."""
-    starts, kept = effect.starts, tuple(one for one in effect.parameters if one not in (RATE, ORDER))
-    assert starts is not None, "a low-pass has starts"
-    return replace(effect, parameters=kept, starts=lambda motion, at: [theta[: len(kept)] for theta in starts(motion, at)])
-
-
-def of_order(first: Effect, order: float) -> Effect:
-    """An analog low-pass of another order."""
-
-    def full(theta: Theta) -> Theta:
-        return np.array([theta[0], theta[1] if len(theta) > 1 else math.inf, order])
-
-    return replace(
-        first,
-        variant=f"order {order:g}",
-        constants=((ORDER, float(order)),),
-        forward=lambda motion, theta: _forward(motion, full(theta)),
-        lagless=lambda motion, theta: _without_lag(motion, full(theta)),
-    )
-
-
 def of_one(effect: Effect, sensor: Sensor) -> Effect:
     """A low-pass of one sensor alone: many chips have a filter for each."""
 
@@ -261,33 +253,15 @@ def of_signal(effect: Effect, signal: str) -> Effect:
     return effect if effect.lagless is None or sensor is None else of_one(effect, sensor)
 
 
-def forms(effect: Effect, *, exact: bool) -> list[Effect]:
-    """Forms of a low-pass without a rate; another effect itself.
-
-    With `exact`, beside a simulation, a low-pass may be of each sensor alone, or of another order.
-    """
-    if effect.lagless is None:
-        return [effect]
-    both, higher = analog(effect), HIGHER if ORDER in effect.parameters else ()
-    if not exact:
-        return [both]
-    return [both, *(of_one(both, sensor) for sensor in SENSORS), *(of_order(both, order) for order in higher)]
-
-
-def digital(of_analog: Effect) -> Effect:
-    """The low-pass with the rate of a digital one."""
-    return replace(of_analog, parameters=(*of_analog.parameters, RATE))
-
-
 EFFECT = Effect(
     "low_pass",
     Stage.BANDWIDTH,
     ("gyro", "accel"),
-    "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel (at a rate: bilinear)",
-    (Parameter("f_c", "Hz", 20.0, positive=True, null_value=math.inf), RATE, ORDER),
+    "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel (at a rate: bilinear, or y += k (x - y))",
+    (Parameter("f_c", "Hz", 20.0, positive=True, null_value=math.inf), RATE, ORDER, SMOOTHING),
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,
     linear=False,
-    starts=digital_starts(*([hz] for hz in START_HZ), order=[1.0]),
+    starts=digital_starts(*([hz] for hz in START_HZ), order=[1.0, math.inf]),
     lagless=_without_lag,
 )

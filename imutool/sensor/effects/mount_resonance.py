@@ -40,24 +40,6 @@ def _spring(a: float, zeta: float, damper: float) -> Filter:
     return Filter.of(gain, np.array([1.0, -(pole + other).real, (pole * other).real]))
 
 
-def forms(effect: Effect, *, exact: bool) -> list[Effect]:
-    """A resonance with its damper on the base, and with `exact` at rest; another effect itself."""
-    if DAMPER not in effect.parameters:
-        return [effect]
-    starts = effect.starts
-    assert starts is not None, "a resonance has starts"
-    on_base = replace(
-        effect, parameters=effect.parameters[:-1], starts=lambda motion, at: [theta[:-1] for theta in starts(motion, at)]
-    )
-    at_rest = replace(
-        on_base,
-        variant="damper at rest",
-        constants=((DAMPER, 0.0),),
-        forward=lambda motion, theta: effect.forward(motion, np.append(theta, 0.0)),
-    )
-    return [on_base, at_rest] if exact else [on_base]
-
-
 EFFECT = Effect(
     "mount_resonance",
     Stage.MOUNT,

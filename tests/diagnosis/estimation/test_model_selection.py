@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import msgspec
@@ -76,6 +77,32 @@ def test_a_sensor_may_be_mounted_in_any_direction(turned: list[float]) -> None:
 def sure(found: Selection, name: str, truth: list[float]) -> bool:
     one = next(one for one in found.selected if one.effect.key == name)
     return bool((np.abs(one.theta - truth) < SURE * one.std).all())
+
+
+FORMS = {
+    "exponential smoothing": ("low_pass", {"f_c": 9.0, "rate": math.inf, "order": 1.0, "smoothing_rate": planted.RATE_HZ}),
+    "a share that lags": ("gyro_hysteresis", {"width": 0.3, "share": 0.1}),
+    "a damper at rest": (
+        "mount_resonance",
+        {"f0": 12.0, "zeta": 0.15, "share_x": 0.6, "share_y": 0.4, "share_z": 0.8, "damper": 0.0},
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_effect_of_another_form_is_no_sum_of_others(form: str) -> None:
+    """A hysteresis of a tenth of the reading was a scale, a delay and a low-pass that cancelled a clock's offset."""
+    name, truth = FORMS[form]
+    motion, f_hz = planted.rich(), np.linspace(2.0, 25.0, 24)
+    trembles = np.sin(2.0 * np.pi * f_hz * motion.t_s[:, None] + f_hz**2) @ np.full((24, 3), 0.3)
+    motion = replace(motion, accel=motion.accel + trembles)
+    (one,) = asked(planted.pair(motion, {name: list(truth.values())}, 4), beyond=False).selected
+    assert one.effect.name == name
+    fitted = [parameter.name for parameter in one.effect.parameters]
+    assert one.theta == pytest.approx([truth[parameter] for parameter in fitted], rel=0.1)
+    assert {parameter.name: value for parameter, value in one.effect.constants} == {
+        key: value for key, value in truth.items() if key == "damper"
+    }
 
 
 def test_nothing_is_found_where_there_is_nothing_to_try() -> None:

@@ -19,10 +19,11 @@ from imutool.diagnosis.estimation.observability import (
     with_steady_clock,
 )
 from imutool.diagnosis.estimation.significance import bic, parameter_cost
+from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.whitening import WhitenedLog, Whitener
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor import catalogue
-from imutool.sensor.effects import clock_wander, low_pass
+from imutool.sensor.effects import clock_wander
 
 SETTINGS = SearchSettings()
 STEPS_HZ = 5.9  # a harmonic of a walk
@@ -200,5 +201,5 @@ def test_a_drift_that_follows_the_logs_temperature_has_that_name() -> None:
 def test_a_positive_number_is_unidentified_if_it_is_as_unsure_as_it_is_large(std: float, vague: tuple[str, ...]) -> None:
     """A cut-off of 20 Hz, certain to 2 Hz, was told as one that the logs cannot show."""
     (effect,) = catalogue.effects(["low_pass"])
-    first = low_pass.analog(effect)
+    first = in_forms([effect], exact=False)[0]
     assert tuple(unidentified(first, np.array([20.0]), np.array([std]), curve=False)) == vague

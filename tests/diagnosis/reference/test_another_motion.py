@@ -9,7 +9,7 @@ from support import planted
 
 from imutool.diagnosis.compare_findings import shared
 from imutool.diagnosis.estimation.model_selection import select_effects
-from imutool.diagnosis.estimation.observability import in_forms
+from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.held_out import noise_floor
 from imutool.diagnosis.reference.another_motion import compared

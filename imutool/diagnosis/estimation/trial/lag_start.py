@@ -11,10 +11,11 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.observability import LOW_PASSES, beyond_the_band, exclude_each_other
 from imutool.diagnosis.estimation.significance import bic
+from imutool.diagnosis.estimation.trial.effect_forms import digital, exponential
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
-from imutool.sensor.effects.low_pass import RATE, Design, digital
+from imutool.sensor.effects.low_pass import RATE, SMOOTHING, Design
 from imutool.sensor.effects.second_order_low_pass import BUTTERWORTH
 
 SLOWEST = 0.9  # samples of a digital filter for one that is recorded
@@ -64,7 +65,7 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
     settings, period_s = logs[0].pair.settings.search, logs[0].pair.period_s
     error = settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
     for k, (effect, _) in enumerate(now.chosen):
-        if effect.name not in LOW_PASSES or RATE in effect.parameters:
+        if effect.name not in LOW_PASSES or {RATE, SMOOTHING} & {*effect.parameters}:
             continue
         errs, best = error * _taken(now, k), now
         for chosen in _forms(now, k, named, 1.0 / period_s):
@@ -135,13 +136,15 @@ def _forms(now: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterato
 
 
 def _starts(other: Effect, effect: Effect, theta: Theta | None, lag_s: float, rate_hz: float) -> list[tuple[Effect, Theta]]:
-    """A low-pass, analog if it is another one than the fitted, and digital, with a lag."""
+    """A low-pass with a lag: analog if it is another one than the fitted, digital, and of first order as smoothing."""
     cutoff_hz = Design.of(other, np.array([1.0, BUTTERWORTH])[: len(other.parameters)]).lag_s / lag_s
     start = [cutoff_hz, BUTTERWORTH][: len(other.parameters)]
     if theta is not None and (other.name, other.constants) == (effect.name, effect.constants):
         start = theta.tolist()
     analog = [] if theta is not None and other.key == effect.key else [(other, np.array(start))]
-    return [*analog, (digital(other), np.array([*start, rate_hz]))]
+    at_rate = np.array([*start, rate_hz])
+    smoothing = [(exponential(other), at_rate)] if other.name == LOW_PASSES[0] and not other.constants else []
+    return [*analog, (digital(other), at_rate), *smoothing]
 
 
 def _of_each_sensor(now: Fit, k: int, named: Sequence[Effect]) -> Chosen:
@@ -162,5 +165,10 @@ def _taken(found: Fit, k: int) -> float:
 
 def _folds(found: Fit, period_s: float) -> bool:
     """Whether a digital filter is slower than the samples, which it would give twice."""
-    slowest = (value for effect, theta in found.chosen for p, value in zip(effect.parameters, theta, strict=True) if p is RATE)
+    slowest = (
+        value
+        for effect, theta in found.chosen
+        for p, value in zip(effect.parameters, theta, strict=True)
+        if p in (RATE, SMOOTHING)
+    )
     return min(slowest, default=np.inf) * period_s < SLOWEST

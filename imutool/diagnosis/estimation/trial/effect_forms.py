@@ -1,0 +1,133 @@
+"""Forms of effects that a diagnosis tries: orders, digital filters, shares, one sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effects.gyro_hysteresis import LEAST, SHARE, error_and_ideal, play
+from imutool.sensor.effects.low_pass import ORDER, RATE, SMOOTHING, of_one
+from imutool.sensor.effects.mount_resonance import DAMPER
+from imutool.sensor.samples import IdealMotion, SensorSamples
+from imutool.units import SENSORS
+
+HIGHER = 0, 4  # orders that a diagnosis tries, beside the first and the second
+WIDTHS = 0.3, 1.0, 3.0  # of the motion's standard deviation, from where the fit of a share starts
+
+
+def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
+    """Effects in the forms that a diagnosis tries; an `exact` simulation shows more."""
+    for forms in (_of_low_pass, _of_hysteresis, _of_resonance):
+        found = [form for effect in found for form in forms(effect, exact=exact)]
+    return [*found]
+
+
+def at_rate(effect: Effect, names: Collection[str]) -> Effect:
+    """A low-pass in the form that has parameters of these names: digital, smoothing, or as it is."""
+    if RATE.name in names:
+        return digital(effect)
+    return exponential(effect) if SMOOTHING.name in names else effect
+
+
+def digital(of_analog: Effect) -> Effect:
+    """The low-pass with the rate of a digital one."""
+    return replace(of_analog, parameters=(*of_analog.parameters, RATE))
+
+
+def exponential(of_analog: Effect) -> Effect:
+    """The low-pass of first order as exponential smoothing, with its rate."""
+    lagless = of_analog.lagless
+    assert lagless is not None, "a low-pass has a lag"
+
+    def full(theta: Theta) -> Theta:
+        return np.array([theta[0], RATE.null_value, ORDER.null_value, theta[1]])
+
+    return replace(
+        of_analog,
+        parameters=(*of_analog.parameters, SMOOTHING),
+        forward=lambda motion, theta: of_analog.forward(motion, full(theta)),
+        lagless=lambda motion, theta: lagless(motion, full(theta)),
+    )
+
+
+def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
+    """Forms of a low-pass without a rate; another effect itself.
+
+    With `exact`, beside a simulation, a low-pass may be of each sensor alone, or of another order.
+    """
+    if effect.lagless is None:
+        return [effect]
+    both, higher = analog(effect), HIGHER if ORDER in effect.parameters else ()
+    if not exact:
+        return [both]
+    return [both, *(of_one(both, sensor) for sensor in SENSORS), *(of_order(both, order) for order in higher)]
+
+
+def analog(effect: Effect) -> Effect:
+    """A low-pass without the rate of a digital one, of its lowest order."""
+    starts, kept = effect.starts, tuple(one for one in effect.parameters if one not in (RATE, ORDER, SMOOTHING))
+    assert starts is not None, "a low-pass has starts"
+    return replace(effect, parameters=kept, starts=lambda motion, at: [theta[: len(kept)] for theta in starts(motion, at)])
+
+
+def of_order(first: Effect, order: float) -> Effect:
+    """An analog low-pass of another order."""
+    lagless = first.lagless
+    assert lagless is not None, "a low-pass has a lag"
+
+    def full(theta: Theta) -> Theta:
+        return np.array([theta[0], theta[1] if len(theta) > 1 else math.inf, order])
+
+    return replace(
+        first,
+        variant=f"order {order:g}",
+        constants=((ORDER, float(order)),),
+        forward=lambda motion, theta: first.forward(motion, full(theta)),
+        lagless=lambda motion, theta: lagless(motion, full(theta)),
+    )
+
+
+def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
+    """A hysteresis of the whole reading, and with `exact` one of a share; another effect itself."""
+    if SHARE not in effect.parameters:
+        return [effect]
+    (sensor,), whole_starts = effect.sensors, effect.starts
+    assert whole_starts is not None, "a hysteresis has starts"
+
+    def of_share(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+        """Widths of the size of the motion, and the share that each explains best."""
+        error, ideal = error_and_ideal("gyro" if sensor == "gyro" else "accel", motion, samples)
+        widths = [factor * float(np.sqrt(ideal.var(axis=0).mean())) for factor in WIDTHS]
+        behind = [play(ideal, width) - ideal for width in widths]
+        lags = [(lag - lag.mean(axis=0)) for lag in behind]
+        return [
+            np.array([max(width, LEAST * effect.plausible[0]), (error * lag).sum() / max((lag**2).sum(), 1e-300)])
+            for width, lag in zip(widths, lags, strict=True)
+        ]
+
+    whole = replace(
+        effect, parameters=effect.parameters[:1], starts=lambda motion, at: [theta[:1] for theta in whole_starts(motion, at)]
+    )
+    return [whole, *([replace(effect, variant="share", starts=of_share)] if exact else [])]
+
+
+def _of_resonance(effect: Effect, *, exact: bool) -> list[Effect]:
+    """A resonance with its damper on the base, and with `exact` at rest; another effect itself."""
+    if DAMPER not in effect.parameters:
+        return [effect]
+    starts = effect.starts
+    assert starts is not None, "a resonance has starts"
+    on_base = replace(
+        effect, parameters=effect.parameters[:-1], starts=lambda motion, at: [theta[:-1] for theta in starts(motion, at)]
+    )
+    at_rest = replace(
+        on_base,
+        variant="damper at rest",
+        constants=((DAMPER, 0.0),),
+        forward=lambda motion, theta: effect.forward(motion, np.append(theta, 0.0)),
+    )
+    return [on_base, at_rest] if exact else [on_base]
