@@ -226,7 +226,8 @@ def digital_starts(
     """Starts of a digital filter that runs at the rate of the samples."""
 
     def starts(_motion: IdealMotion, samples: SensorSamples) -> Sequence[Theta]:
-        return [np.array([*theta, 1.0 / float(np.median(np.diff(samples.stamp_s))), *order]) for theta in analog]
+        rate_hz = 1.0 / float(np.median(np.diff(samples.stamp_s)))
+        return [np.array([*theta, rate_hz, *order]) for theta in analog]
 
     return starts
 
@@ -262,6 +263,6 @@ EFFECT = Effect(
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,
     linear=False,
-    starts=digital_starts(*([hz] for hz in START_HZ), order=[1.0, math.inf]),
+    starts=digital_starts(*([hz] for hz in START_HZ), order=[1.0, SMOOTHING.plausible]),
     lagless=_without_lag,
 )

@@ -99,7 +99,8 @@ class Trial:
         if (error := LowPassError.of(tested)) is None:
             return selection
         now, count = self._with_own_noise(tested), self.settings.fitted_each_round
-        clear = (one for one in self.candidates.ranked(now, self.named, count)[:count] if one.log_p < self.threshold)
+        plain = tuple(effect for effect in self.named if not effect.variant)
+        clear = (one for one in self.candidates.ranked(now, plain, count)[:count] if one.log_p < self.threshold)
         return with_low_pass_error(selection, error, {one.effect.name: one.gain for one in clear if of_motion(one.effect)})
 
     def rivals(self, k: int, now: Fit) -> dict[str, Fit]:
