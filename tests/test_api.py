@@ -72,7 +72,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_the_types_that_tools_see_are_the_names_that_are_imported() -> None:
     """What stands under TYPE_CHECKING is what `__getattr__` gives."""
     tree = ast.parse(Path(imutool.__file__).read_text(encoding="utf-8"))
-    (block,) = (node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
     seen = {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
     assert seen == imutool._HOME
     assert {*seen, "__version__"} == set(imutool.__all__)
@@ -355,6 +355,30 @@ def test_a_live_sensor_may_count_its_time_from_anywhere(logs: Path, set_back_ns:
         rows.append([online(*sample)[2] for sample in zip((start_ns + t_ns).tolist(), imu.gyro, imu.accel, strict=True)])
     np.testing.assert_array_equal(rows[1], rows[0])
     np.testing.assert_array_equal(rows[2], rows[0])
+
+
+def test_a_debiased_recording_is_not_debiased_again(logs: Path, tmp_path: Path) -> None:
+    """In a log of its own it looked like a raw one."""
+    raw = imutool.read(logs / "flight_2.mcap")
+    once = imutool.debias(raw, logs / "linear.safetensors").recording
+    imutool.write(tmp_path / "once.mcap", once)
+    for again in (once, imutool.read(tmp_path / "once.mcap")):
+        with pytest.raises(imutool.DataError, match="debiased already, by linear"):
+            imutool.debias(again, "static")
+        assert imutool.debias(again, "static", force=True).model == "static"
+    with pytest.raises(imutool.LogError, match=r"once.mcap: its IMU is debiased already, by linear"):
+        imutool.debias(tmp_path / "once.mcap", tmp_path / "twice.mcap", model="static")
+    assert not (tmp_path / "twice.mcap").exists()
+    assert imutool.debias(raw, "static").model == "static"
+
+
+def test_results_print_briefly(logs: Path) -> None:
+    log, model = logs / "flight_2.mcap", imutool.load_model(logs / "linear.safetensors")
+    still = imutool.read(log).imu.rows(slice(0, 400))
+    results = imutool.clean(log), imutool.load_run(log, models=["static"]), imutool.bias_at_rest(model, still)
+    for result in (*results, imutool.OnlineDebiaser(model)):
+        assert len(repr(result)) < 500
+        assert "array(" not in repr(result)
 
 
 @pytest.mark.parametrize(("unit_ns", "told"), [(1_000_000_000, "have 2 stamps, 1 ns apart"), (10**18, "have one stamp")])

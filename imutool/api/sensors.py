@@ -118,8 +118,8 @@ def diagnose(
     """Find the physics that a simulation lacks: name, size, uncertainty and place.
 
     Args:
-        reals: Recordings. Several share the physics, with one constant bias each.
-        sim: Simulation; by default each recording is compared with its own true poses.
+        reals: MCAP logs of recordings. Several share the physics, with one constant bias each.
+        sim: MCAP log of a simulation; by default each recording is compared with its own true poses.
         imu: IMU topic; needed where a log has several.
         truth: Topic of the true poses; by default the first.
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.

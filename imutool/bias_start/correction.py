@@ -6,7 +6,7 @@ Causal: after the initial bias, the bias at a sample depends on that sample and 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from operator import index
 from typing import NamedTuple
@@ -116,8 +116,8 @@ class OnlineDebiaser:
     def __call__(
         self,
         stamp_ns: int,
-        gyro: Float64[np.ndarray, "3"],
-        accel: Float64[np.ndarray, "3"],
+        gyro: Float64[np.ndarray, "3"] | Sequence[float],
+        accel: Float64[np.ndarray, "3"] | Sequence[float],
         temperature: float | None = None,
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
         """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias.
