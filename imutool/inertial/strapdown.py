@@ -201,7 +201,7 @@ def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: fl
 
 
 def with_velocity(poses: Poses) -> Poses:
-    """Trajectory with velocity: its own, or `truth_velocity` if it has none that follows its positions."""
+    """Trajectory with velocity: its own if it follows the positions, else `truth_velocity`."""
     own = poses.v_w is not None and velocity_follows(poses)
     return poses if own else replace(poses, v_w=truth_velocity(poses))
 
