@@ -422,6 +422,7 @@ def test_the_covariance_of_live_samples_is_that_of_the_recording(logs: Path) -> 
     recording, model = imutool.read(logs / "flight_2.mcap"), imutool.load_model(logs / "linear.safetensors")
     batch, imu = imutool.debias(recording, model, init="prior"), recording.imu
     online, plain = imutool.OnlineDebiaser(model, batch.start, with_covariance=True), imutool.OnlineDebiaser(model, batch.start)
+    assert np.isnan(online.covariance).all()
     for k in range(1500):
         sample = int(imu.t_ns[k]), imu.gyro[k], imu.accel[k]
         np.testing.assert_allclose(online(*sample)[2], plain(*sample)[2], rtol=0, atol=1e-12)

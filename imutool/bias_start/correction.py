@@ -104,7 +104,7 @@ class OnlineDebiaser:
         self._u, self._most, self._left_out = np.full(6, np.nan), USUAL_MOST, 0
         self._drift = OnlineDrift(model) if model.temperature_parameters() else None
         self._first: list[tuple[int, Float64[np.ndarray, "3"]]] | None = []  # None once they are checked
-        self._with_covariance, self._covariance = with_covariance, np.zeros((6, 6))
+        self._with_covariance, self._covariance = with_covariance, np.full((6, 6), np.nan)
         if with_covariance and self._drift is not None:
             raise ConfigError("the model follows the temperature", where="with_covariance", expected="another model, or False")
 
@@ -164,7 +164,9 @@ class OnlineDebiaser:
 
     @property
     def covariance(self) -> Float64[np.ndarray, "6 6"]:
-        """Covariance of the last bias: gyro (rad/s), then accel (m/s²); the white noise of a sample is not in it.
+        """Covariance of the last bias: gyro (rad/s), then accel (m/s²); NaN before the first measured sample.
+
+        The white noise of a sample is not in it.
 
         Raises:
             ConfigError: the debiaser was not made with `with_covariance`.
