@@ -125,6 +125,12 @@ class OnlineDebiaser:
         A sample that is no measurement (NaN, for instance), or the one before again, changes nothing: the bias is that of the
         sample before.
 
+        Args:
+            stamp_ns: Time of the sample in nanoseconds, on any clock.
+            gyro: Measured angular rate (rad/s).
+            accel: Measured specific force (m/s²); at rest it is +g up.
+            temperature: Of the sensor (°C), for a model that follows it.
+
         Raises:
             DataError: not one sample of three and three values, a stamp that is not an integer, or first samples whose stamps
                 are not in nanoseconds, or never set.
