@@ -43,6 +43,9 @@ from imutool.recording import seconds
 
 SUFFIX = "/debiased"
 CLEAN_RECORD = "imutool_clean"
+DEBIASED_BY = (
+    "debiased_by"  # entry of the record `imutool`: the IMU of the log is a debiased one, of `imutool.debias` of arrays
+)
 
 logger = logging.getLogger(__name__)
 
@@ -236,6 +239,8 @@ def _debias(
     given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
     topics = model_choice.choose_imus(log, options.imus, given)
     check_new_topics(log, {topic: new_topics(topic) for topic in topics})
+    if (by := log.metadata().get("imutool", {}).get(DEBIASED_BY)) and not options.force:
+        raise LogError(f"its IMU is debiased already, by {by}", where=source, fix="Start from the raw log, or set `force`")
     log.keep(topics)
     surveys = {} if options.clean is None else {topic: look(log, topic, options.clean).trusted() for topic in topics}
     derived, starts, models, records, fits = [], {}, {}, {}, {}

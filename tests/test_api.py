@@ -72,7 +72,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 def test_the_types_that_tools_see_are_the_names_that_are_imported() -> None:
     """What stands under TYPE_CHECKING is what `__getattr__` gives."""
     tree = ast.parse(Path(imutool.__file__).read_text(encoding="utf-8"))
-    (block,) = (node for node in tree.body if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
     seen = {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
     assert seen == imutool._HOME
     assert {*seen, "__version__"} == set(imutool.__all__)
@@ -311,6 +311,7 @@ def test_a_live_sample_of_another_kind_is_refused() -> None:
     call = inspect.unwrap(imutool.OnlineDebiaser.__call__)  # as users call it: without the check of annotations
     still, none, texts = np.ones(3), None, ["0", "0", "1"]
     wrong: list[tuple[Any, Any, Any]] = [(0.5, still, still), (5, np.zeros((2, 3)), np.ones((2, 3))), (5, np.zeros(6), [0.0])]
+    wrong += [(5, np.zeros(4), np.ones(2)), (5, np.ones(6), [])]
     for stamp, gyro, accel in [*wrong, (5, none, none), (5, still, none), (5, still, texts), (5, still + 1j, still)]:
         with pytest.raises(imutool.DataError, match="expected one sample of 3 numbers each, at integer nanoseconds"):
             call(imutool.OnlineDebiaser(STATIC), stamp, gyro, accel)
@@ -354,6 +355,81 @@ def test_a_live_sensor_may_count_its_time_from_anywhere(logs: Path, set_back_ns:
         rows.append([online(*sample)[2] for sample in zip((start_ns + t_ns).tolist(), imu.gyro, imu.accel, strict=True)])
     np.testing.assert_array_equal(rows[1], rows[0])
     np.testing.assert_array_equal(rows[2], rows[0])
+
+
+def test_a_debiased_recording_is_not_debiased_again(logs: Path, tmp_path: Path) -> None:
+    """In a log of its own it looked like a raw one."""
+    raw = imutool.read(logs / "flight_2.mcap")
+    once = imutool.debias(raw, logs / "linear.safetensors").recording
+    imutool.write(tmp_path / "once.mcap", once)
+    for again in (once, imutool.read(tmp_path / "once.mcap")):
+        with pytest.raises(imutool.DataError, match="debiased already, by linear"):
+            imutool.debias(again, "static")
+        assert imutool.debias(again, "static", force=True).model == "static"
+    with pytest.raises(imutool.LogError, match=r"once.mcap: its IMU is debiased already, by linear"):
+        imutool.debias(tmp_path / "once.mcap", tmp_path / "twice.mcap", model="static")
+    assert not (tmp_path / "twice.mcap").exists()
+    assert imutool.debias(raw, "static").model == "static"
+
+
+def test_results_print_briefly(logs: Path) -> None:
+    log, model = logs / "flight_2.mcap", imutool.load_model(logs / "linear.safetensors")
+    still = imutool.read(log).imu.rows(slice(0, 400))
+    results = imutool.clean(log), imutool.load_run(log, models=["static"]), imutool.bias_at_rest(model, still)
+    for result in (*results, imutool.OnlineDebiaser(model)):
+        assert len(repr(result)) < 500
+        assert "array(" not in repr(result)
+
+
+@pytest.mark.parametrize(("unit_ns", "told"), [(1_000_000_000, "have 2 stamps, 1 ns apart"), (10**18, "have one stamp")])
+def test_stamps_of_whole_seconds_or_never_set_are_refused(logs: Path, unit_ns: int, told: str) -> None:
+    """No time went by, so that the bias was another one, without a word."""
+    imu, model = imutool.read(logs / "flight_2.mcap").imu.rows(slice(0, 400)), imutool.load_model(logs / "linear.safetensors")
+    online = imutool.OnlineDebiaser(model)
+    for t_ns, gyro, accel in zip(imu.t_ns[:-1].tolist(), imu.gyro, imu.accel, strict=False):
+        online(t_ns // unit_ns, gyro, accel)
+    with pytest.raises(imutool.DataError, match=told):
+        online(int(imu.t_ns[-1]) // unit_ns, imu.gyro[-1], imu.accel[-1])
+
+
+def test_stamps_of_batches_are_warned_of(logs: Path, caplog: pytest.LogCaptureFixture) -> None:
+    imu, model = imutool.read(logs / "flight_2.mcap").imu.rows(slice(0, 600)), imutool.load_model(logs / "linear.safetensors")
+    online = imutool.OnlineDebiaser(model)
+    for k, (gyro, accel) in enumerate(zip(imu.gyro, imu.accel, strict=True)):
+        online(int(imu.t_ns[k // 32 * 32]), gyro, accel)
+    assert caplog.text.count("387 of the first 400 samples have the stamp of another") == 1
+
+
+def test_a_sample_that_comes_twice_counts_once(logs: Path) -> None:
+    imu, model = imutool.read(logs / "flight_2.mcap").imu.rows(slice(0, 1000)), imutool.load_model(logs / "linear.safetensors")
+    once, twice = imutool.OnlineDebiaser(model), imutool.OnlineDebiaser(model)
+    for sample in zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True):
+        twice(*sample)
+        np.testing.assert_array_equal(twice(*sample)[2], once(*sample)[2])
+
+
+def test_rates_in_degrees_and_a_dead_accelerometer_are_warned_of(logs: Path, caplog: pytest.LogCaptureFixture) -> None:
+    imu, model = imutool.read(logs / "flight_2.mcap").imu, imutool.load_model(logs / "linear.safetensors")
+    degrees, dead = imutool.OnlineDebiaser(model), imutool.OnlineDebiaser(model)
+    for t_ns, gyro, accel in zip(imu.t_ns.tolist(), imu.gyro, imu.accel, strict=True):
+        degrees(t_ns, np.rad2deg(gyro), accel)
+        dead(t_ns, gyro, np.zeros(3))
+    assert caplog.text.count("gyro looks like deg/s") == 1
+    assert caplog.text.count("no sample of the first 400 is a measurement") == 1
+
+
+def test_the_covariance_of_live_samples_is_that_of_the_recording(logs: Path) -> None:
+    recording, model = imutool.read(logs / "flight_2.mcap"), imutool.load_model(logs / "linear.safetensors")
+    batch, imu = imutool.debias(recording, model, init="prior"), recording.imu
+    online, plain = imutool.OnlineDebiaser(model, batch.start, with_covariance=True), imutool.OnlineDebiaser(model, batch.start)
+    assert np.isnan(online.covariance).all()
+    for k in range(1500):
+        sample = int(imu.t_ns[k]), imu.gyro[k], imu.accel[k]
+        np.testing.assert_allclose(online(*sample)[2], plain(*sample)[2], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.sqrt(online.covariance.diagonal()), batch.std[k], rtol=1e-9)
+    assert np.array_equal(online.covariance, online.covariance.T)
+    with pytest.raises(imutool.ConfigError, match="with_covariance=True"):
+        _ = plain.covariance
 
 
 def test_a_copy_of_a_live_debiaser_goes_its_own_way(logs: Path) -> None:

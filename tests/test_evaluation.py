@@ -417,3 +417,26 @@ def test_runs_come_in_the_order_asked_for(recording: Recording, model: Path) -> 
     found: list[tuple[str, Any]] = [(name, start) for name, _, start in runs(recording, [model, "static"], "truth", "here")]
     assert [name for name, _ in found] == ["raw", "linear_1", "static"]
     assert found[0][1] is None
+
+
+@pytest.mark.parametrize("wrong", ["body", "mm/s", "right", "drift of 2 %"])
+def test_velocities_that_do_not_follow_the_positions_are_not_used(
+    wrong: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A start with the body's velocities had a path that is off by kilometres, without a word."""
+    flown = flight(1, FlightSettings())
+    truth = flown.truth
+    assert truth.v_w is not None
+    stated = {
+        "body": Rotation.from_quat(truth.q_wb_wxyz.copy(), scalar_first=True).inv().apply(truth.v_w.copy()),
+        "mm/s": 1000.0 * truth.v_w,
+        "right": truth.v_w,
+        "drift of 2 %": 1.02 * truth.v_w,
+    }
+    topic = next(iter(flown.truths))
+    for name, v_w in (("stated", stated[wrong]), ("none", None)):
+        write(replace(flown, truths={topic: replace(truth, v_w=v_w)}), tmp_path / f"{name}.mcap")
+    (with_it,), (without,) = (evaluate(tmp_path / f"{name}.mcap", init="auto") for name in ("stated", "none"))
+    unused = wrong in ("body", "mm/s")
+    assert caplog.text.count("do not follow its positions") == unused
+    assert (with_it["ape_m"] == without["ape_m"]) == unused

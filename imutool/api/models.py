@@ -24,7 +24,7 @@ from imutool.bias_start.fitness import CHECKED_S, judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
 from imutool.bias_start.model_choice import bound_to, check_smooth, find_initial_bias, smooth_in_memory
 from imutool.bias_start.stretches import measured_imu, unusual_gravity
-from imutool.debiasing import DebiasReport
+from imutool.debiasing import DEBIASED_BY, DebiasReport
 from imutool.errors import ConfigError, DataError
 from imutool.file_location import Location, LogPath, location, several
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
@@ -99,7 +99,7 @@ class DebiasedRecording:
     """Recording with debiased samples, and the bias that was subtracted.
 
     Attributes:
-        recording: Input with the debiased IMU in place of the raw one.
+        recording: Input with the debiased IMU in place of the raw one; its metadata name the model, also in a log of it.
         bias: Subtracted bias at each sample: gyro (rad/s), then accel (m/s²).
         std: One standard deviation of `bias`.
         model: Name of the model.
@@ -241,15 +241,20 @@ def _debias_recording(recording: Recording, model: object, init: str, smooth: bo
     if not isinstance(model, Model | None):
         raise ConfigError(f"{type(model).__name__}", where="model", expected="one model: a file, a name or a loaded model")
     recording.imu.check_rate(recording.name)
+    about = recording.metadata.get("imutool", {})
+    if DEBIASED_BY in about and not force:
+        what = f"its IMU is debiased already, by {about[DEBIASED_BY]}"
+        raise DataError(what, where=recording.name, fix="Start from the raw recording, or set `force`")
     measured_imu(recording.imu, recording.name)  # warns of what is no measurement, and refuses a recording of nothing else
     first_ns = int(recording.imu.t_ns[0]) if len(recording.imu) else 0
     begun = recording.between(first_ns, first_ns + nanoseconds(CHECKED_S))  # as much as the command looks at
     wrong = [text for whole in warn_of_recordings([begun]) for text in contradictions(whole)]
     name, chosen, start = _model_and_start(recording, model, init, smooth)
-    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], recording.metadata.get("imutool", {})).beside(wrong)
+    fitness = judge(chosen, start, [model_samples(chosen, recording.imu)], about).beside(wrong)
     fitness.report(name, recording.name, force=force)
     debiased, std = apply_with_std(chosen, start, recording.imu)
-    return DebiasedRecording(replace(recording, imu=debiased.imu), debiased.bias, std, name, start, fitness)
+    marked = {**recording.metadata, "imutool": {**about, DEBIASED_BY: name}}
+    return DebiasedRecording(replace(recording, imu=debiased.imu, metadata=marked), debiased.bias, std, name, start, fitness)
 
 
 def _model_and_start(recording: Recording, model: Model | None, init: str, smooth: bool) -> tuple[str, BiasModel, InitialBias]:

@@ -16,6 +16,7 @@ from imutool.errors import ConfigError
 from imutool.file_location import LogPath, local, location, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
+from imutool.processes.blas_threads import one_blas_thread
 from imutool.recording import Recording
 from imutool.sensor.made_up_flight import FlightSettings, flight
 from imutool.sensor.simulate import Simulation
@@ -118,8 +119,8 @@ def diagnose(
     """Find the physics that a simulation lacks: name, size, uncertainty and place.
 
     Args:
-        reals: Recordings. Several share the physics, with one constant bias each.
-        sim: Simulation; by default each recording is compared with its own true poses.
+        reals: MCAP logs of recordings. Several share the physics, with one constant bias each.
+        sim: MCAP log of a simulation; by default each recording is compared with its own true poses.
         imu: IMU topic; needed where a log has several.
         truth: Topic of the true poses; by default the first.
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
@@ -148,16 +149,17 @@ def diagnose(
     if metric is not None and not callable(metric):
         raise ConfigError("`metric` is no function", expected="a function of the path of a simulated log")
     check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sim], overwrite=overwrite)
-    diagnosis, _ = diagnosis_output.diagnose(
-        logs,
-        None if sim is None else location(sim),
-        folder,
-        imu=imu,
-        truth=truth,
-        signals=several(signals),
-        close=close,
-        metric=metric,
-        overwrite=overwrite,
-        tell=progress,
-    )
+    with one_blas_thread():
+        diagnosis, _ = diagnosis_output.diagnose(
+            logs,
+            None if sim is None else location(sim),
+            folder,
+            imu=imu,
+            truth=truth,
+            signals=several(signals),
+            close=close,
+            metric=metric,
+            overwrite=overwrite,
+            tell=progress,
+        )
     return diagnosis

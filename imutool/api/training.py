@@ -35,7 +35,7 @@ def train(
     """Train a bias model on logs of one sensor with true poses, and write it.
 
     Args:
-        logs: MCAP logs.
+        logs: MCAP logs; `imutool.write` makes one of arrays.
         out: Model file to write, `FILE.safetensors`.
         method: `hybrid`, `neural_ode`, `conv` or `linear`.
         settings: Training settings by name, for example `{"steps": 300, "seed": 1}`.
@@ -94,7 +94,7 @@ def evaluate(
     """Score pure integration against the true poses, raw and with each model.
 
     Args:
-        log: MCAP log with true poses.
+        log: MCAP log with true poses; `imutool.write` makes one of arrays.
         models: Model files, names of models that ship, or `static`; one, or several.
         init: Initial bias, as in `debias`.
         smooth: Smoothing, as in `debias`.
@@ -106,13 +106,14 @@ def evaluate(
         overwrite: Replace existing trajectories.
 
     Returns:
-        One result for `raw` and one per model: `aoe_deg`, `ape_m`, `roe_deg`, `rpe_m`, velocity error, and others.
+        One result for `raw` and one per model: `aoe_deg`, `ape_m`, `roe_deg`, `rpe_m`, velocity error, and others; `fit` says
+        whether the model fits the log.
 
     Raises:
         ConfigError: Contradictory options, two models of one name, or files that exist.
         LogError: No IMU or no truth.
         DataError: IMU and truth share no time.
-        ModelError: A model that does not fit the log.
+        ModelError: A model that cannot be read, or for another rate.
 
     Examples:
         >>> import imutool

@@ -60,7 +60,7 @@ def load_run(
     Raises:
         ConfigError: A file cannot be read, or options contradict each other.
         LogError: No IMU, or no part of the log is sound.
-        ModelError: A model that does not fit the log.
+        ModelError: A model that cannot be read, or for another rate.
 
     Examples:
         >>> import imutool

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from functools import partial
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -60,11 +61,23 @@ class Model(BiasModel):
         effects: Mapping[Sensor, tuple[LinearForm, ...]] | None = None,
     ) -> None:
         super().__init__(config, rate_hz, tensors)
-        self.effects = effects or {sensor: forms(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
+        self._given = effects
+        self.effects = self._forms()
         self.ode: neural_ode.Model | None = None
         if self.config.remainder:
             held = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
             self.ode = neural_ode.Model(self.config.ode, rate_hz, held)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for a copy or a pickle: effects are functions, which do not pickle, and the settings name them."""
+        return {name: value for name, value in self.__dict__.items() if name != "effects"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.effects = self._forms()
+
+    def _forms(self) -> Mapping[Sensor, tuple[LinearForm, ...]]:
+        return self._given or {sensor: forms(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:
@@ -118,18 +131,7 @@ class Model(BiasModel):
             root = vectors * np.sqrt(np.maximum(values, 0.0))
             roots[sensor] = patterns(effects) @ root
         filter_ = SignalFilter(self.rate_hz, max(self._compiled(sensor).wanted for sensor in SENSORS), self.load_before)
-
-        def root_at(
-            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-        ) -> dict[Sensor, Float64[np.ndarray, "n 3 p"]]:
-            signals, out = filter_(t_s, gyro, accel), {}
-            for sensor, (effects, _) in of_samples.items():
-                if effects:
-                    terms = np.concatenate([effect.terms(signals) for effect in effects], axis=1)
-                    out[sensor] = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
-            return out
-
-        return root_at
+        return partial(_roots_at, filter_, {sensor: effects for sensor, (effects, _) in of_samples.items()}, roots)
 
     def _compiled(self, sensor: Sensor) -> CompiledEffects:
         effects, own = self._of_samples(sensor)
@@ -139,3 +141,20 @@ class Model(BiasModel):
         """Effects that follow from the samples, and where their parameters stand."""
         effects = self.effects[sensor]
         return samples_alone(effects), columns_of(effects, temperature=False)
+
+
+def _roots_at(
+    filter_: SignalFilter,
+    effects: Mapping[Sensor, tuple[LinearForm, ...]],
+    roots: Mapping[Sensor, Float64[np.ndarray, "3 q p"]],
+    t_s: Float64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+) -> dict[Sensor, Float64[np.ndarray, "n 3 p"]]:
+    """Roots at each sample; a closure's filter would be shared by a copy."""
+    signals, out = filter_(t_s, gyro, accel), {}
+    for sensor, forms_of in effects.items():
+        if forms_of:
+            terms = np.concatenate([effect.terms(signals) for effect in forms_of], axis=1)
+            out[sensor] = np.einsum("nq,iqp->nip", terms, roots[sensor], optimize=True)
+    return out

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -49,15 +50,7 @@ class Model(BiasModel):
 
     def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Bias rest + W u at every sample."""
-        W_gyro, W_accel = (self.tensors[f"W.{sensor}"] for sensor in SENSORS)
-
-        def affine(
-            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-        ) -> Float64[np.ndarray, "n 6"]:
-            bias: Float64[np.ndarray, "n 6"] = rest + np.concatenate([gyro @ W_gyro.T, accel @ W_accel.T], axis=1)
-            return bias
-
-        return affine
+        return partial(_affine, rest, *(self.tensors[f"W.{sensor}"].T for sensor in SENSORS))
 
     def calibration_covariance(self) -> CovarianceModel | None:
         """Covariance of W u, from that of W."""
@@ -75,3 +68,16 @@ class Model(BiasModel):
             return {sensor: np.einsum("nj,ijp->nip", u, roots[sensor]) for sensor, u in samples.items()}
 
         return root_at
+
+
+def _affine(
+    rest: Vector6,
+    by_gyro: Float64[np.ndarray, "3 3"],
+    by_accel: Float64[np.ndarray, "3 3"],
+    t_s: Float64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+) -> Float64[np.ndarray, "n 6"]:
+    """Bias rest + W u; a function of the module, so that a stream can be pickled."""
+    bias: Float64[np.ndarray, "n 6"] = rest + np.concatenate([gyro @ by_gyro, accel @ by_accel], axis=1)
+    return bias

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -134,6 +135,11 @@ class _Buffers:
         self.b_gyro, self.b_accel = self.b[: width + 1], self.b[width:]
         self.c_gyro, self.c_accel = self.c[:width], self.c[width:]
         self.units = units.reshape(6, *(1 for _ in samples))
+        self._made_of = width, samples, units
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Copy and pickle as new buffers: copied one by one, the views would no longer share their memory."""
+        return type(self), self._made_of
 
 
 class NeuralStream:
@@ -160,8 +166,17 @@ class NeuralStream:
             np.zeros((2, 6)),
             np.zeros((2, 6)),
         )  # filtered inputs of curve and drift, and their increments
-        self._slow, self._drift_input = self._state
+        self._cut()
         self._before, self._t_step, self._count, self._began = np.zeros(6), 0.0, -1, False
+
+    def _cut(self) -> None:
+        """Views of the state."""
+        self._slow, self._drift_input = self._state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Cut the views anew: a copy or a pickle has copied them, too."""
+        self.__dict__.update(state)
+        self._cut()
 
     @property
     def rest(self) -> Vector6:

@@ -13,6 +13,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -89,13 +90,17 @@ class Model(hybrid.Model):
         """Covariance from the parameters' standard deviations, taken as independent."""
         root_at = super().calibration_covariance()
         assert root_at is not None
+        return partial(_shifted, root_at, self._b)
 
-        def shifted(
-            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-        ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
-            return root_at(t_s, gyro - self._b[:3], accel - self._b[3:])
 
-        return shifted
+def _shifted(
+    root_at: CovarianceModel,
+    b: Vector6,
+    t_s: Float64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
+    return root_at(t_s, gyro - b[:3], accel - b[3:])
 
 
 class _ShiftedStream:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -44,13 +45,7 @@ class Model(BiasModel):
 
     def stretch(self, rest: Vector6, start_s: float = math.nan) -> Stream:
         """Rest bias at every sample."""
-
-        def constant(
-            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-        ) -> Float64[np.ndarray, "n 6"]:
-            return np.broadcast_to(rest, (len(t_s), 6)).copy()
-
-        return constant
+        return partial(_constant, rest)
 
     def calibration_covariance(self) -> CovarianceModel | None:
         """Covariance of an unknown scale and misalignment, which the model does not correct.
@@ -69,3 +64,10 @@ class Model(BiasModel):
             return {sensor: np.einsum("ip,nj->nipj", spread, u).reshape(len(u), 3, 9) for sensor, u in samples.items()}
 
         return root_at
+
+
+def _constant(
+    rest: Vector6, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 6"]:
+    """The rest bias in each row; a function of the module, so that a stream can be pickled."""
+    return np.broadcast_to(rest, (len(t_s), 6)).copy()

@@ -6,6 +6,7 @@ Causal: after the initial bias, the bias at a sample depends on that sample and 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from functools import partial
 from operator import index
 from typing import NamedTuple
@@ -22,7 +23,9 @@ from imutool.bias_start.stretches import LEAST_FORCE_M_S2, MOST, measured, unusu
 from imutool.errors import ConfigError, DataError
 from imutool.recording import LEAST_PERIOD_S, Imu, nanoseconds
 from imutool.recording.columns import MOST_GAP_S, median
+from imutool.units import FULL_SCALE_RAD_S
 
+USUAL_MOST = np.minimum(MOST, [FULL_SCALE_RAD_S] * 3 + [np.inf] * 3)
 CHECKED = 400  # first samples of a stream whose rate and gravity are checked: 2 s at 200 Hz
 logger = logging.getLogger(__name__)
 
@@ -82,10 +85,13 @@ class OnlineDebiaser:
 
     `start` is a bias of `imutool.bias_at_rest`, over the first seconds for instance. Without `start` it begins at the prior and
     tracks the rest bias, as `init="auto"` does. If the model's bias follows the temperature, give it (°C) with the samples that
-    have one.
+    have one. With `with_covariance` each sample has a `covariance`, for an estimator of yours, and takes several times as long.
+
+    Raises:
+        ConfigError: another type, or the covariance of a model that follows the temperature.
     """
 
-    def __init__(self, model: BiasModel, start: InitialBias | None = None) -> None:
+    def __init__(self, model: BiasModel, start: InitialBias | None = None, *, with_covariance: bool = False) -> None:
         given: tuple[object, object] = model, start
         if not isinstance(given[0], BiasModel):
             what = f"of type {type(given[0]).__name__}"
@@ -95,34 +101,56 @@ class OnlineDebiaser:
             raise ConfigError(what, where="start", expected="a bias of `imutool.bias_at_rest`, or None")
         self._model, self._start, self._begun = model, start, False
         self._start_ns, self._before_ns, self._bias = 0, 0, np.zeros(6)
+        self._u, self._most, self._left_out = np.full(6, np.nan), USUAL_MOST, 0
         self._drift = OnlineDrift(model) if model.temperature_parameters() else None
         self._first: list[tuple[int, Float64[np.ndarray, "3"]]] | None = []  # None once they are checked
+        self._with_covariance, self._covariance = with_covariance, np.full((6, 6), np.nan)
+        if with_covariance and self._drift is not None:
+            raise ConfigError("the model follows the temperature", where="with_covariance", expected="another model, or False")
+
+    def __repr__(self) -> str:
+        """The model, and what was subtracted last."""
+        last = f"last bias {np.array2string(self._bias, precision=5)}" if self._begun else "no sample yet"
+        return f"<online debiaser of {self._model!r}: {last}>"
 
     def __call__(
         self,
         stamp_ns: int,
-        gyro: Float64[np.ndarray, "3"],
-        accel: Float64[np.ndarray, "3"],
+        gyro: Float64[np.ndarray, "3"] | Sequence[float],
+        accel: Float64[np.ndarray, "3"] | Sequence[float],
         temperature: float | None = None,
     ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "6"]]:
         """Corrected angular rate (rad/s), specific force (m/s²), and the subtracted bias.
 
-        A sample that is no measurement (NaN, for instance) changes nothing: the bias is that of the sample before.
+        A sample that is no measurement (NaN, for instance), or the one before again, changes nothing: the bias is that of the
+        sample before.
+
+        Args:
+            stamp_ns: Time of the sample in nanoseconds, on any clock.
+            gyro: Measured angular rate (rad/s).
+            accel: Measured specific force (m/s²); at rest it is +g up.
+            temperature: Of the sensor (°C), for a model that follows it.
 
         Raises:
             DataError: not one sample of three and three values, a stamp that is not an integer, or first samples whose stamps
-                are not in nanoseconds.
+                are not in nanoseconds, or never set.
             ModelError: first samples at another rate than the model's training logs.
         """
         try:
             u, stamp_ns = np.concatenate((gyro, accel), dtype=np.float64, casting="safe"), index(stamp_ns)
         except (TypeError, ValueError):
             u = np.zeros(0)
-        if u.shape != (6,):
-            what = f"gyro and accel of shape {list(np.shape(gyro))}, {list(np.shape(accel))} at {stamp_ns!r}"
+        if u.shape != (6,) or len(gyro) != 3:
+            what = f"gyro and accel of shape {list(np.shape(gyro))}, {list(np.shape(accel))} at {stamp_ns!r:.60}"
             raise DataError(what, where="OnlineDebiaser", expected="one sample of 3 numbers each, at integer nanoseconds")
         size = np.abs(u)
-        if (size <= MOST).all() and size[3:].max() >= LEAST_FORCE_M_S2:  # false for NaN
+        measured = (size <= self._most).all()  # false for NaN
+        if not measured and (size <= MOST).all():
+            logger.warning("OnlineDebiaser: gyro looks like deg/s, not rad/s: it reaches %.4g", size[:3].max())
+            measured, self._most = True, MOST
+        repeats = stamp_ns == self._before_ns and np.array_equal(u, self._u)
+        if measured and size[3:].max() >= LEAST_FORCE_M_S2 and not repeats:
+            self._u = u
             if self._first is not None:
                 self._check_first(stamp_ns, u[3:])
             if self._drift is None:
@@ -132,9 +160,26 @@ class OnlineDebiaser:
                 self._warn_without(stamp_ns, temperature)
                 drift, t_s = self._drift(stamp_ns, temperature), self._seconds(stamp_ns)
                 self._bias = self._correct(t_s, u - drift) + drift
+        elif not repeats:
+            self._left_out += 1
+            if self._left_out == CHECKED and not self._begun:
+                logger.warning("OnlineDebiaser: no sample of the first %d is a measurement: nothing is subtracted", CHECKED)
         bias = self._bias.copy()
         clean = u - bias
         return clean[:3], clean[3:], bias
+
+    @property
+    def covariance(self) -> Float64[np.ndarray, "6 6"]:
+        """Covariance of the last bias: gyro (rad/s), then accel (m/s²); NaN before the first measured sample.
+
+        The white noise of a sample is not in it.
+
+        Raises:
+            ConfigError: the debiaser was not made with `with_covariance`.
+        """
+        if not self._with_covariance:
+            raise ConfigError("it is not computed", where="covariance", expected="OnlineDebiaser(..., with_covariance=True)")
+        return self._covariance.copy()
 
     def _check_first(self, stamp_ns: int, accel: Float64[np.ndarray, "3"]) -> None:
         """Check rate and gravity once, by the first samples; they may come in batches, or a moment late.
@@ -147,15 +192,21 @@ class OnlineDebiaser:
         if len(self._first) < CHECKED:
             return
         first, self._first = self._first, None
-        t_ns = np.unique(np.array([stamp_ns for stamp_ns, _ in first], np.int64))
-        if len(t_ns) > CHECKED // 2:
-            steps = np.diff(t_ns) * 1e-9
-            periods = [float(steps.mean()), float(median(steps))]
-            if max(periods) < LEAST_PERIOD_S:
-                what = f"{1.0 / max(periods):.3g} samples a second: the stamps are not in nanoseconds"
-                raise DataError(what, where="OnlineDebiaser", expected=f"steps of at least {LEAST_PERIOD_S * 1e9:.0f} ns")
-            rates = [1.0 / period_s for period_s in periods]
-            check_rate(self._model, min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz))), "OnlineDebiaser")
+        t_ns, counts = np.unique(np.array([stamp_ns for stamp_ns, _ in first], np.int64), return_counts=True)
+        steps = np.diff(t_ns) * 1e-9
+        periods = [float(steps.mean()), float(median(steps))] if len(steps) else [0.0]
+        if max(periods) < LEAST_PERIOD_S:
+            what = f"the first {len(first)} samples have {len(t_ns)} stamps, {max(periods) * 1e9:.3g} ns apart"
+            what = (
+                f"{what}: the stamps are not in nanoseconds" if len(steps) else f"the first {len(first)} samples have one stamp"
+            )
+            raise DataError(what, where="OnlineDebiaser", expected=f"steps of at least {LEAST_PERIOD_S * 1e9:.0f} ns")
+        if repeated := len(first) - len(t_ns):
+            what = "OnlineDebiaser: %d of the first %d samples have the stamp of another: give each its own time"
+            logger.warning(what, repeated, len(first))
+            periods.append(float(t_ns[-1] - t_ns[0]) * 1e-9 / int(counts[:-1].sum()))
+        rates = [1.0 / period_s for period_s in periods]
+        check_rate(self._model, min(rates, key=lambda hz: abs(hz - (self._model.rate_hz or hz))), "OnlineDebiaser")
         if wrong := unusual_gravity(np.array([accel for _, accel in first])):
             logger.warning("OnlineDebiaser: %s", wrong)
 
@@ -169,8 +220,8 @@ class OnlineDebiaser:
         """Seconds since the first sample; a jump of the clock counts as at most `stretches.MOST_GAP_S`."""
         if not self._begun:
             self._begun, self._start_ns, self._before_ns = True, stamp_ns, stamp_ns
-            stream = (self._start or tracked_from_prior(self._model, stamp_ns)).stream(self._model)
-            self._correct = stream.one if isinstance(stream, SampleStream) else partial(_one_as_block, stream)
+            start = self._start or tracked_from_prior(self._model, stamp_ns)
+            self._correct = self._correction(start)
         step_ns = stamp_ns - self._before_ns
         if -GAP_NS < step_ns < 0:  # out of order: no time passes
             self._start_ns += step_ns
@@ -178,6 +229,19 @@ class OnlineDebiaser:
             self._start_ns += step_ns - MOST_GAP_NS
         self._before_ns = stamp_ns
         return (stamp_ns - self._start_ns) * 1e-9
+
+    def _correction(self, start: InitialBias) -> Callable[[float, Vector6], Vector6]:
+        """Bias at one sample, from a start."""
+        if self._with_covariance:
+            return partial(self._estimated, BiasEstimator(self._model, start))
+        stream = start.stream(self._model)
+        return stream.one if isinstance(stream, SampleStream) else partial(_one_as_block, stream)
+
+    def _estimated(self, estimator: BiasEstimator, t_s: float, u: Vector6) -> Vector6:
+        """Bias at one sample; its covariance is kept."""
+        bias, covariance = estimator(np.array([t_s]), u[None, :3], u[None, 3:])
+        self._covariance = covariance[0]
+        return np.asarray(bias[0])
 
 
 def _one_as_block(stream: Stream, t_s: float, u: Vector6) -> Vector6:

@@ -60,7 +60,7 @@ class NoRestError(DataError):
     """No rest in the log, and an untrained model: nothing determines the bias."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class InitialBias:
     """Rest bias (gyro rad/s, accel m/s²) with standard deviation, and its source in words.
 
@@ -80,10 +80,12 @@ class InitialBias:
 
     def __post_init__(self) -> None:
         for name in ("rest", "std", "noise"):
-            value = converted(getattr(self, name), f"InitialBias.{name}")
-            if value.shape != (6,):
+            if (value := converted(getattr(self, name), f"InitialBias.{name}")).shape != (6,):
                 raise DataError(f"InitialBias.{name} is {value.dtype}{list(value.shape)}", expected="float64[6]")
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"InitialBias({self.how}: rest {self.rest.round(5).tolist()}, std {self.std.round(5).tolist()})"
 
     def stream(self, model: BiasModel) -> Stream:
         """Bias stream of a model from this start."""

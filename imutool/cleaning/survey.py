@@ -35,7 +35,7 @@ class UntrustedError(LogError):
     """The log's IMU cannot be cleaned without guessing."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Survey:
     """Findings in one IMU, and the messages to leave out.
 
@@ -71,6 +71,10 @@ class Survey:
     pose_delay_ns: int
     findings: tuple[Finding, ...]
     reasons: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        found = ", ".join(dict.fromkeys(finding.rule for finding in self.findings)) or "nothing"
+        return f"Survey({self.topic}: {self.verdict}, score {self.score:.3g}, {self.messages} messages; found {found})"
 
     @cached_property
     def valid(self) -> int:

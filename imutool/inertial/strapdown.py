@@ -20,10 +20,12 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
 from imutool.recording import GAP_FACTOR, GRAVITY_M_S2, MIN_GAP_S, Imu, Poses, Times, seconds
+from imutool.recording.columns import median
 
 GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
 VELOCITY_ORDER = 3
+COMPARED_S, LEAST_SPEED_M_S, MOST_OFF = 1.0, 0.05, 0.5  # of velocities and positions: over a second, in motion, by the median
 SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
 Vectors = Float64[np.ndarray, "n 3"]
@@ -199,8 +201,29 @@ def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: fl
 
 
 def with_velocity(poses: Poses) -> Poses:
-    """Trajectory with velocity: its own, or `truth_velocity` if it has none."""
-    return poses if poses.v_w is not None else replace(poses, v_w=truth_velocity(poses))
+    """Trajectory with velocity: its own if it follows the positions, else `truth_velocity`."""
+    own = poses.v_w is not None and velocity_follows(poses)
+    return poses if own else replace(poses, v_w=truth_velocity(poses))
+
+
+def velocity_follows(poses: Poses) -> bool:
+    """Whether the velocities of poses are those of their positions: of the world's axes, in m/s.
+
+    By the median over a second; also true without velocities, or where the positions hardly move.
+    """
+    if poses.v_w is None or len(poses) < 2:
+        return True
+    t = seconds(poses.t_ns, int(poses.t_ns[0]))
+    last = np.searchsorted(t, t + COMPARED_S)
+    first = np.flatnonzero(last < len(t))
+    dt = (t[last[first]] - t[first])[:, None]
+    steps = 0.5 * (poses.v_w[1:] + poses.v_w[:-1]) * np.diff(t)[:, None]
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    moved, stated = ((x[last[first]] - x[first]) / dt for x in (poses.p_wb, path))
+    if not len(moved):
+        return True
+    speed, off = (float(median(np.linalg.norm(x, axis=1))) for x in (moved, moved - stated))
+    return speed < LEAST_SPEED_M_S or off < MOST_OFF * speed
 
 
 def truth_velocity(poses: Poses) -> Vectors:

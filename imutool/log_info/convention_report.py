@@ -20,7 +20,7 @@ from imutool.cleaning.samples import BLOCK, Motion, Samples
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
-from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings, unlike
+from imutool.log_info.pose_imu_rotation import CORRECTION, agreement, body_warnings, motion_warnings, unlike, velocities_judged
 from imutool.log_info.report import Convention, TruthInfo
 from imutool.mcap_io.log import Log
 from imutool.recording import GAP_FACTOR, MIN_GAP_S, Imu, Recording, nanoseconds
@@ -140,6 +140,8 @@ def check_poses(recording: Recording, *, world: bool = True) -> None:
         if "poses" in finding.values and (world or whole.quaternions or whole.position_unit != "m"):
             expected = "quaternions as w, x, y, z from body to world, z up, and metres"
             raise DataError(finding.what, where=recording.name, expected=expected, fix=CORRECTION)
+    for warning in _warnings(recording.imu, whole):
+        logger.warning("%s: %s", recording.name, warning)
 
 
 def warn_of_conventions(imu: Imu, truth: Truth | None, where: str) -> TopicSummary:
@@ -166,7 +168,7 @@ def check_one_sensor(recordings: Sequence[Recording]) -> None:
 
 def warn_of_recordings(recordings: Iterable[Recording]) -> list[TopicSummary]:
     """Log those warnings for recordings in memory."""
-    return [warn_of_conventions(r.imu, truth_of(r), f"{r.name} {r.imu_topic}") for r in recordings]
+    return [warn_of_conventions(r.imu, truth_of(r), f"{r.name} {r.imu_topic}") for r in map(velocities_judged, recordings)]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of one sample of 1e160, as a broken driver writes it
@@ -176,7 +178,7 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
     Raises:
         DataError: what `convert --fix` corrects.
     """
-    for recording in recordings:
+    for recording in map(velocities_judged, recordings):
         for warning in _warnings(recording.imu, convention_summary(recording.imu, truth_of(recording))):
             where = f"{recording.name} {recording.imu_topic}"
             if warning.endswith(CORRECTION):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,10 +11,13 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning.truth import Truth, read_truth, turning
 from imutool.geometry import quaternion
+from imutool.inertial.strapdown import velocity_follows
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.log import Log
-from imutool.recording import GAP_FACTOR, Imu, seconds
+from imutool.recording import GAP_FACTOR, Imu, Recording, seconds
 from imutool.recording.columns import median
+
+logger = logging.getLogger(__name__)
 
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
@@ -203,3 +207,12 @@ def frames_of_copies(log: Log, topic: str) -> frozenset[str]:
             same = len(mine) > 0 and np.array_equal(poses.p_wb[mine], batch.p_wb[theirs])
             (alike if same else other).add(batch.child_frame_id)
     return frozenset(alike - other)
+
+
+def velocities_judged(recording: Recording) -> Recording:
+    """The recording; a warning of velocities that `strapdown.with_velocity` does not use."""
+    for topic, poses in [*recording.truths.items()][:1]:
+        if not velocity_follows(poses):
+            what = "%s: the velocities of %s do not follow its positions (body axes, another unit); the positions give them"
+            logger.warning(what, recording.name, topic)
+    return recording

@@ -11,7 +11,7 @@ from itertools import pairwise
 from numbers import Real
 from operator import index
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,8 @@ MOST_GAP_S = 3600.0  # of a pause of the recorder: a longer step of the stamps i
 SET_BACK_NS = 1_000_000_000  # by which stamps go back at a jump; less is a sample that came late
 MOST_TOLD = 5  # jumps
 MOST_EXACT = {"f": 2**53, "i": 2**63 - 1}  # integers that float64 and int64 hold exactly
+
+Rows = TypeVar("Rows", bound="Columns")
 
 
 class Columns:
@@ -87,7 +89,7 @@ class Columns:
         """Pickle through the constructor: it makes the unpickled arrays read-only again."""
         return type(self), tuple(getattr(self, c.name) for c in fields(self))  # type: ignore[arg-type]
 
-    def rows(self, index: slice | Bool[np.ndarray, " n"]) -> Any:
+    def rows(self: Rows, index: slice | Bool[np.ndarray, " n"]) -> Rows:
         """Columns at some rows."""
         cut = {
             c.name: value[index]
@@ -96,7 +98,7 @@ class Columns:
         }
         return replace(self, **cut)  # type: ignore[type-var]
 
-    def between(self, start_ns: int, end_ns: int) -> Any:
+    def between(self: Rows, start_ns: int, end_ns: int) -> Rows:
         """Rows with `start_ns <= t_ns <= end_ns`.
 
         Raises:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -120,14 +121,24 @@ class SignalFilter:
         self._lead = np.full(3, (1.0 / self._gain[6] - 1.0) / self._lag_s)  # from the filter's last step to what it lags by
         self._least_s = LEAST_PERIODS * self._period_s
         self._t_s = math.nan
-        row, step = np.zeros(COUNT), np.zeros(12)  # numpy takes as long to cut a piece out as to add two: cut once
-        self._row, self._u, self._y, self._dots, self._alpha = row, row[SAMPLES], row[FILTERED], row[DOTS], row[ALPHA]
-        self._gyro, self._slow, self._turn, self._power = row[GYRO], row[SLOW], row[TURN], row[VIBRATION]
-        self._step, self._step_slow, self._step_turn, self._step_power = step, step[:6], step[6:9], step[9:]
-        self._fast = step[3:6]  # the force without its mean, until it is a step
-        self._load = row[LOAD].reshape(len(LOAD_TAU_S), LOADS)
+        self._row, self._step = np.zeros(COUNT), np.zeros(12)
+        self._cut()
         if load is not None:
             self._load[:] = load
+
+    def _cut(self) -> None:
+        """Views of the state: numpy takes as long to cut a piece out as to add two."""
+        row, step = self._row, self._step
+        self._u, self._y, self._dots, self._alpha = row[SAMPLES], row[FILTERED], row[DOTS], row[ALPHA]
+        self._gyro, self._slow, self._turn, self._power = row[GYRO], row[SLOW], row[TURN], row[VIBRATION]
+        self._step_slow, self._step_turn, self._step_power = step[:6], step[6:9], step[9:]
+        self._fast = step[3:6]  # the force without its mean, until it is a step
+        self._load = row[LOAD].reshape(len(LOAD_TAU_S), LOADS)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Cut the views anew: a copy or a pickle has copied them, too."""
+        self.__dict__.update(state)
+        self._cut()
 
     def __call__(self, t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Signals:
         """The signals at each sample of a block."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import pickle
 from collections.abc import Callable
@@ -150,6 +151,30 @@ def test_the_stream_does_not_touch_what_it_is_given_and_two_streams_are_apart(mo
     rest_of_it = first(t[60:], gyro[60:], accel[60:])
     expected = model.stream(rest)(t, gyro, accel)
     np.testing.assert_allclose(np.concatenate([kept, rest_of_it]), expected, rtol=0, atol=BLOCKS)
+
+
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda stream: pickle.loads(pickle.dumps(stream))], ids=["copy", "pickle"]
+)
+def test_a_copied_stream_goes_on_as_the_stream_does(
+    model: BiasModel, segment: MakeSegment, duplicate: Callable[[Any], Any]
+) -> None:
+    """A copy of an array and of a view into it no longer share memory: the state of the filters stood still."""
+    seen = segment(12, 1, 400)
+    t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
+    stream = model.stream(seen.rest[0].numpy())
+    for k in range(0, 200):
+        stream.one(float(t[k]), np.concatenate([gyro[k], accel[k]]))
+    other = duplicate(stream)
+    for k in range(200, 400):
+        u = np.concatenate([gyro[k], accel[k]])
+        np.testing.assert_array_equal(other.one(float(t[k]), u), stream.one(float(t[k]), u))
+
+
+def test_a_model_goes_to_another_process(model: BiasModel, segment: MakeSegment) -> None:
+    seen = segment(13, 1, 200)
+    back = pickle.loads(pickle.dumps(model))
+    np.testing.assert_array_equal(streamed(back, seen, [70]), streamed(model, seen, [70]))
 
 
 # ── at rest, in a file ───────────────────────────────────────────────────────────────────────────────────────────────

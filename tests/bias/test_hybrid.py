@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -241,3 +243,16 @@ def test_every_known_effect_can_be_held_at_once(build: MakeModel, seen: Segment,
     save(model.frozen(), tmp_path / "all.safetensors")
     assert np.isfinite(streamed(load(tmp_path / "all.safetensors"), seen)).all()
     assert (tmp_path / "all.safetensors").stat().st_size < 2 << 20
+    loaded = load(tmp_path / "all.safetensors")
+    for sent in (pickle.loads(pickle.dumps(loaded)), copy.deepcopy(loaded)):  # to another process
+        np.testing.assert_array_equal(streamed(sent, seen), streamed(loaded, seen))
+
+
+def test_a_copied_stream_keeps_its_own_filters(build: MakeModel, seen: Segment) -> None:
+    t, gyro, accel = (value[0].numpy() for value in (seen.t, seen.gyro, seen.accel))
+    stream = model_of(build).frozen().stream(seen.rest[0].numpy())
+    stream(t[:200], gyro[:200], accel[:200])
+    copied = copy.deepcopy(stream)
+    for k in range(200, len(t)):
+        u = np.concatenate([gyro[k], accel[k]])
+        np.testing.assert_array_equal(copied.one(float(t[k]), u), stream.one(float(t[k]), u))

@@ -15,11 +15,11 @@ from imutool.cleaning.finding import Finding, Severity
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.unit_evidence import FORCES, MOVING_TOLERANCE, RATES, accel_reading, rate_ratio
 from imutool.recording import GRAVITY_M_S2
+from imutool.units import FULL_SCALE_RAD_S
 
 FREE_OF_GRAVITY_M_S2 = 0.5
 BAND = (0.45, 2.2)  # for the ratio of the measured to the true rate in a unit; 0.97 to 1.05 on real recordings
 SURE_BAND = (0.9, 1.1)
-FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common MEMS gyros
 BIASED = 0.15  # of gravity: so far off, a reading is a bias or a scale, which a model takes off
 
 

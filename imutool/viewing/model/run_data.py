@@ -124,7 +124,7 @@ class LogTimes:
         return times
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunData:
     """Data of one log for viewing: traces in the order of the runs, events, provenance.
 
@@ -145,6 +145,9 @@ class RunData:
     provenance: Mapping[str, str] = field(default_factory=dict)
     source: Path | None = None
     logged: LogTimes | None = None
+
+    def __repr__(self) -> str:
+        return f"RunData({self.name!r}: {', '.join(trace.name for trace in self.traces)}; {self.duration_s:.3f} s)"
 
     @property
     def duration_s(self) -> float:
