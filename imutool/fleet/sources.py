@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from imutool.errors import ConfigError, redact
-from imutool.file_location import Location, identity, io_errors, reason, size_and_etag, to_location
+from imutool.file_location import Location, exists, identity, io_errors, is_file, is_folder, reason, size_and_etag, to_location
 from imutool.fleet.task import Source
 
 logger = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
-            if about is None and Path(where).exists() and not Path(where).is_file():
+            if about is None and exists(Path(where)) and not Path(where).is_file():
                 raise ConfigError("is a pipe, a socket or a device", expected="a file", fix="Remove it")
             logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
@@ -100,7 +100,7 @@ def simulation(folder: Location, name: str) -> Location:
         ConfigError: there is none.
     """
     found = folder if _ends(folder.name, (LOG,)) else folder / name
-    if not found.is_file():
+    if not is_file(found):
         raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
     return found
 
@@ -154,10 +154,10 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     where = to_location(text)
     if not isinstance(where, Path):
         return _in_store(text, endings)
-    if where.is_dir():
+    if is_folder(where):
         root = where.absolute()
         return str(root), _walk(root, endings, frozenset())
-    if where.exists():
+    if exists(where):
         return str(where.absolute().parent), iter([_File(str(where.absolute()))])
     if not PATTERN.search(str(where)):
         raise ConfigError("is not there", where=redact(text), expected="a log, a folder with logs, or a pattern")
@@ -215,16 +215,22 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
             found = {root.path: {}}  # one file: to list it, the library would fetch the whole log and look for links in it
         else:
             found = root.fs.find(root.path, detail=True)
-        for path, about in found.items():
-            if about.get("size") is None and _ends(path, endings):  # a web server lists names alone
-                found[path] = root.fs.info(path)
     except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
+    unread = dict[str, str]()
+    for path, about in found.items():
+        if about.get("size") is None and _ends(path, endings):  # a web server lists names alone
+            try:
+                found[path] = root.fs.info(path)
+            except io_errors(root) as error:
+                unread[path] = reason(error)
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
-    files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
-    return whole, (
-        file for file in files if _ends(file.where, endings) and file.about and file.about.get("type", "file") == "file"
-    )
+    files = [
+        _File(fixed + path[len(root.path.rstrip("/")) :], about, unread.get(path, ""))
+        for path, about in sorted(found.items())
+        if about and about.get("type", "file") == "file" and _ends(path, endings)
+    ]
+    return whole, iter(files)
 
 
 def within(out: Location, name: str) -> Location:

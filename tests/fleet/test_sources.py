@@ -103,6 +103,23 @@ def test_a_folder_that_cannot_be_read_is_told_and_the_others_go_on(tmp_path: Pat
     assert "cannot be read (Permission denied)" in found.refused[1][1]
 
 
+def test_a_log_in_a_folder_that_may_be_listed_only_is_told_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree(tmp_path, "good.mcap", "listed/a.mcap")
+    asked = Path.stat
+
+    def stat(path: Path, **options: Any) -> os.stat_result:
+        if path.name == "a.mcap":  # chmod does not stop root
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return asked(path, **options)
+
+    monkeypatch.setattr(Path, "stat", stat)
+    found = find(str(tmp_path), NOWHERE)
+    assert [log.name for log in found.logs] == ["good.mcap"]
+    assert [Path(where).name for where, _ in found.refused] == ["a.mcap"]
+
+
 def test_links_to_logs_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     tree(tmp_path / "disk", "x/log.mcap")
     fleet = tree(tmp_path / "fleet", "own.mcap")
@@ -245,12 +262,13 @@ class _WebServer(SimpleHTTPRequestHandler):
 
 def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> None:
     tree(tmp_path, "robots/a/log.mcap", "robots/b/notes.txt", "robots/b/other.mcap")
+    (tmp_path / "robots" / "latest.mcap").symlink_to("removed.mcap")
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_WebServer, directory=str(tmp_path))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
             root = f"http://127.0.0.1:{server.server_port}/robots"
-            found = find(root, NOWHERE).logs
+            found, refused = find(root, NOWHERE)
             (alone,) = find(f"{root}/b/other.mcap", NOWHERE).logs
             assert identity(to_location(alone.place)) == (alone.size, alone.stamp)
         finally:
@@ -260,5 +278,6 @@ def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> No
         (f"{root}/a/log.mcap", "a/log.mcap", len("robots/a/log.mcap")),
         (f"{root}/b/other.mcap", "b/other.mcap", len("robots/b/other.mcap")),
     ]
+    assert [where for where, _ in refused] == [f"{root}/latest.mcap"]
     assert alone.name == "other.mcap"
     assert alone.stamp  # of the last change: a log of the same size is another one
