@@ -260,12 +260,13 @@ def _diagnose(job: _Job) -> dict[str, Any]:
         for physics, theta in fixed.chosen
         for number, value, std in zip(physics.parameters, theta, fixed.std[physics.name], strict=True)
     )
-    entries: dict[str, Any] = {"robot": robot, "parameters": parameters}
+    entries: dict[str, Any] = {"robot": robot, "parameters": parameters, "warnings": fixed.remarks}
     diagnosis: dict[str, Any] | UnsetType = UNSET
     if not s.quick:
         found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
         diagnosis = json_values(found.report)
-        entries |= {"effects": tuple(finding.effect for finding in found.findings), "warnings": found.remarks}
+        entries["effects"] = tuple(finding.effect for finding in found.findings)
+        entries["warnings"] = tuple(dict.fromkeys((*fixed.remarks, *found.remarks)))
     write_json(UnitReport(robot, fixed.bias.tolist(), list(parameters), diagnosis), job.target)
     return entries
 

@@ -252,6 +252,9 @@ def test_a_robot_is_its_folder_or_what_the_pattern_says(logs: Path, tmp_path: Pa
     assert robot_of("site/robot 3/log.mcap", None, log) == "site/robot 3"
     assert robot_of("robot_3.mcap", None, log) == "robot_3"
     assert robot_of("site/r3_monday.mcap", r"(r\d+)_", log) == "r3"
+    assert robot_of("site/b_monday.mcap", r"(a)_|(b)_", log) == "b"
+    with pytest.raises(ConfigError, match="matches nothing"):
+        robot_of("site/monday.mcap", r"(r\d+)?", log)
     assert robot_of("any.mcap", "metadata:unit.serial", log) == "7"
     with pytest.raises(ConfigError, match="matches nothing"):
         robot_of("site/monday.mcap", r"(r\d+)_", log)
