@@ -274,6 +274,9 @@ def _provenance(settings: Settings) -> Iterator[str]:
         entries |= {"init": settings.init, "smooth": words[settings.smooth], "clean": words[settings.clean]}
         entries |= {"unfit models": "used" if settings.force else "refused"}
         entries["verified"] = f"structure, and contents: {settings.check}"
+    if settings.command == "diagnose":
+        entries |= {"robots": settings.robot_from or "by folder", "beside": settings.sim or "the true poses"}
+    entries |= {"IMU": settings.imu or "", "truth": settings.truth or ""}
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):
             yield f"<dt>{text(name)}</dt><dd>{text(value)}</dd>"

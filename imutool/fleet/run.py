@@ -136,7 +136,8 @@ def run(
     if not overwrite:
         _refuse_existing(target, page if page is None or not (resume and _is_page(page)) else None)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
-    found = with_simulations(find(source, target, bags=settings.command == "repair"), settings.sim)
+    logs = find(source, target, bags=settings.command == "repair", once=settings.command == "diagnose")
+    found = with_simulations(logs, settings.sim)
     progress = Progress(len(found.logs) + len(found.refused), sum(source.size for source in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
 

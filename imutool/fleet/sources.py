@@ -45,10 +45,11 @@ class _File(NamedTuple):
     unread: str = ""
 
 
-def find(text: str, out: Location, *, bags: bool = False) -> Found:
+def find(text: str, out: Location, *, bags: bool = False, once: bool = False) -> Found:
     """Find the logs of a path, a glob, a folder or a URL; logs below `out` are left out.
 
-    With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings.
+    With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings. With `once` a link to another of
+    these logs is left out.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
     keeps its own name. Links are followed, also to find what lies below `out`. A log without a usable name below OUT is
@@ -90,7 +91,19 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)
     logs.sort(key=lambda source: source.name)
-    return Found(logs, sorted(refused))
+    return Found(_without_links(logs, text) if once else logs, sorted(refused))
+
+
+def _without_links(logs: list[Source], text: str) -> list[Source]:
+    """Logs without those that are another one's file, by a link; a warning counts them."""
+    files = {log.place: log.place if "://" in log.place else os.path.realpath(log.place) for log in logs}
+    first = dict[str, str]()
+    for place in sorted(files, key=lambda place: files[place] != place):  # a file before the links to it
+        first.setdefault(files[place], place)
+    kept = [log for log in logs if first[files[log.place]] == log.place]
+    if len(kept) < len(logs):
+        logger.warning("%s: %d logs are links to others, and do not count again", redact(text), len(logs) - len(kept))
+    return kept
 
 
 def simulation(folder: Location, name: str) -> Location:

@@ -120,6 +120,17 @@ def test_a_log_in_a_folder_that_may_be_listed_only_is_told_and_the_others_go_on(
     assert [Path(where).name for where, _ in found.refused] == ["a.mcap"]
 
 
+def test_a_link_to_another_log_counts_once_where_logs_are_compared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    fleet = tree(tmp_path, "robot/monday.mcap", "robot/tuesday.mcap")
+    (fleet / "robot" / "latest.mcap").symlink_to("tuesday.mcap")
+    (fleet / "again").symlink_to("robot")
+    every = [log.name for log in find(str(fleet), NOWHERE).logs]
+    assert len(every) == 6
+    kept = [log.name for log in find(str(fleet), NOWHERE, once=True).logs]
+    assert kept == ["robot/monday.mcap", "robot/tuesday.mcap"]
+    assert "4 logs are links to others" in caplog.text
+
+
 def test_links_to_logs_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     tree(tmp_path / "disk", "x/log.mcap")
     fleet = tree(tmp_path / "fleet", "own.mcap")
