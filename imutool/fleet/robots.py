@@ -270,7 +270,7 @@ def robot_of(name: str, pattern: str | None, log: Location) -> str:
     texts = () if match is None else match.groups("") or (match[0],)
     found = next(filter(None, texts), "")  # of several groups, as in (a)|(b), the first that takes part
     if not found:
-        raise ConfigError(f"{fits.pattern!r} matches nothing in {name}", where="robot_from")
+        raise ConfigError(f"`robot_from` {fits.pattern!r} matches nothing in {name}")
     return found
 
 

@@ -122,10 +122,15 @@ def with_simulations(found: Found, sim: str | None) -> Found:
     """Logs with the identity of their simulations.
 
     A log whose simulation has changed is not done.
+
+    Raises:
+        ConfigError: there are no simulations.
     """
     if sim is None:
         return found
     folder = to_location(sim)
+    if not exists(folder):
+        raise ConfigError("is not there", where=folder, expected="a folder with simulations, or one simulation")
 
     def compared(source: Source) -> Source:
         with contextlib.suppress(ConfigError):  # the task of the log says why

@@ -217,6 +217,8 @@ def test_another_simulation_is_another_key(tmp_path: Path) -> None:
     assert keys(str(sims))[0] != before[0]
     assert keys(str(sims))[1] == before[1]
     assert keys(str(sims / "a.mcap"))[1] != before[1], "one for all"
+    with pytest.raises(ConfigError, match="is not there"):
+        keys(str(tmp_path / "none"))
 
 
 def test_another_content_is_another_identity(tmp_path: Path) -> None:
