@@ -27,7 +27,7 @@ from imutool.bias_start.stretches import Sieve
 from imutool.cleaning import Cleaner, CleaningSettings, Survey, look
 from imutool.config import plain
 from imutool.errors import ConfigError, LogError, ModelError
-from imutool.file_location import Location
+from imutool.file_location import Location, identity
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu, encode_twist, encode_vector3
@@ -187,11 +187,15 @@ def debias(
         raise ConfigError(f"{encoding!r}", where="encoding", expected=" or ".join(ENCODINGS))
     options = _Options(model, imus, init, smooth, clean, check, force, overwrite, encoding, watch)
     refusal: LogError | None = None
+    opened: tuple[int, str] | None = None
     try:
         if (log := _open_intact(source, max_chunk)) is not None:
             with log:
+                opened = log.index.source.identity
                 return _debias(log, source, Losses(), target, options, progress)
     except LogError as error:  # damage inside a chunk shows only here
+        if opened is not None and identity(source) != opened:  # no damage: it is still being written
+            raise
         refusal = error
     with repaired(source, target or source, max_chunk) as saved:
         if saved is None:

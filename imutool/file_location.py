@@ -10,7 +10,8 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
 from urllib.parse import urlsplit
@@ -154,6 +155,8 @@ def reason(error: Exception) -> str:
         return redact(error.strerror)
     if isinstance(error, FileNotFoundError):
         return "no such object, or no such bucket"
+    if isinstance(error, NotImplementedError):
+        return "files of this kind of URL can only be read"
     if isinstance(error, PermissionError):
         return redact(f"the store refuses access: {error}")
     return redact(str(error)) or type(error).__name__
@@ -199,13 +202,50 @@ def identity(where: Location) -> tuple[int, str]:
     Raises:
         ConfigError: it cannot be asked for.
     """
-    try:
+    with _asked(where):
         if isinstance(where, Path):
             status = where.stat()
             return status.st_size, str(status.st_mtime_ns)
         return size_and_etag(where.fs.info(where.path))
+
+
+def exists(where: Location) -> bool:
+    """Whether a file, folder or object is there.
+
+    Raises:
+        ConfigError: it cannot be asked for: no permission, no credentials, or no answer of the store.
+    """
+    with _asked(where):
+        return where.exists()
+
+
+def is_folder(where: Location) -> bool:
+    """Whether a folder is there.
+
+    Raises:
+        ConfigError: it cannot be asked for.
+    """
+    with _asked(where):
+        return where.is_dir()
+
+
+def is_file(where: Location) -> bool:
+    """Whether a file or object is there.
+
+    Raises:
+        ConfigError: it cannot be asked for.
+    """
+    with _asked(where):
+        return where.is_file()
+
+
+@contextmanager
+def _asked(where: Location) -> Iterator[None]:
+    try:
+        yield
     except io_errors(where) as error:
-        fix = "" if isinstance(error, FileNotFoundError) else "See who may read it"
+        fix = "See who may read it" if isinstance(where, Path) else "Check the address, and your access to the store"
+        fix = "" if isinstance(error, FileNotFoundError) else fix
         raise ConfigError(f"cannot be read ({reason(error)})", where=where, fix=fix) from error
 
 

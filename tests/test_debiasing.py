@@ -647,6 +647,18 @@ def test_a_topic_that_is_no_imu_is_refused(source: Path, model_file: Path, tmp_p
     assert not (tmp_path / "out.mcap").exists()
 
 
+def test_a_log_that_grows_meanwhile_is_refused_and_not_taken_for_a_damaged_one(
+    source: Path, model_file: Path, tmp_path: Path
+) -> None:
+    def grow(done: int, total: int) -> None:
+        with source.open("ab") as log:
+            log.write(b"no record")
+
+    with pytest.raises(LogError, match="changed while it was copied"):
+        debias(source, tmp_path / "out.mcap", model=model_file, progress=grow)
+    assert not (tmp_path / "out.mcap").exists()
+
+
 def test_ctrl_c_in_the_middle_leaves_nothing(source: Path, model_file: Path, tmp_path: Path) -> None:
     def stop(done: int, total: int) -> None:
         if done > total // 4:

@@ -372,6 +372,26 @@ def test_without_credentials_the_message_says_so(store: Any, imutool: Any, tmp_p
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("words", [["repair", "in.mcap", "s3://fleet/out.mcap"], ["fleet", "info", ".", "s3://fleet/out"]])
+def test_without_credentials_an_output_is_refused_with_a_message(
+    store: Any, imutool: Any, tmp_path: Path, flight: bytes, words: list[str]
+) -> None:
+    (tmp_path / "in.mcap").write_bytes(flight)
+    env = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": "", "AWS_EC2_METADATA_DISABLED": "true", "HOME": str(tmp_path)}
+    done = imutool(*words, cwd=tmp_path, apart=True, env=env)
+    assert done.returncode == ConfigError.exit_code
+    assert "Unable to locate credentials" in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+def test_a_command_that_takes_files_alone_says_so_of_a_url(imutool: Any, tmp_path: Path, logs: Path) -> None:
+    refused = imutool("view", "s3://fleet/in.mcap", "--html", "page.html", cwd=tmp_path)
+    assert refused.returncode == ConfigError.exit_code
+    assert "s3://fleet/in.mcap: is in an object store" in " ".join(refused.stderr.split())
+    taken = imutool("clean", f"file://{logs / 'flight_1.mcap'}", f"file://{tmp_path / 'out.mcap'}", cwd=tmp_path)
+    assert (taken.returncode, (tmp_path / "out.mcap").is_file()) == (0, True), taken.stderr
+
+
 def test_an_object_that_changes_while_it_is_read_is_said(store: Any, flight: bytes) -> None:
     source = Source(to_location(store.put("in.mcap", flight + bytes(2 * BLOCK_BYTES))))
     store.put("in.mcap", flight[::-1] + bytes(2 * BLOCK_BYTES))

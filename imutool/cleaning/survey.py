@@ -280,7 +280,9 @@ def _reasons(settings: CleaningSettings, whole: TopicSummary, invalid: int, find
     """Reasons not to trust the log."""
     if whole.motion.samples < FEWEST:
         yield f"valid samples: {whole.motion.samples} of {whole.messages}"
-        if whole.messages >= FEWEST and not whole.motion.end_ns:
+        unusable = [f"{finding.count} {finding.what}" for finding in findings if finding.rule == "not_finite"]
+        yield from unusable
+        if whole.messages >= FEWEST and not whole.motion.end_ns and not unusable:
             yield f"the stamps were never set: {RESTAMP}"
         return
     share = invalid / whole.messages

@@ -10,7 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from imutool.errors import ImutoolError
+from imutool.errors import ConfigError, ImutoolError
+from imutool.file_location import location
 
 # The library's name of a parameter, and this command line's where it is another.
 ALIASES = {
@@ -113,6 +114,14 @@ def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Col
     return type(error)(what, where=where, expected=expected, fix=fix)
 
 
+def _of_url(text: str) -> Path:
+    """File that a URL names, where only files are taken."""
+    place = location(text)
+    if not isinstance(place, Path):
+        raise ConfigError("is in an object store", where=text, expected="a file on this machine")
+    return place
+
+
 class PlainValue:
     """Conversion of texts and paths without pydantic.
 
@@ -132,7 +141,7 @@ class PlainValue:
         unreadable = self._kind is Path and any(Path(word).exists() and not os.access(word, os.R_OK) for word in words)
         if self._kind is None or unreadable or not all(isinstance(word, str | Path) for word in words):
             return self._otherwise().coerce(value, param=param, ctx=ctx)
-        found = [self._kind(word) for word in words]
+        found = [_of_url(word) if self._kind is Path and "://" in str(word) else self._kind(word) for word in words]
         return found if several else found[0]
 
     @staticmethod

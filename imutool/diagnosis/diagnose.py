@@ -51,7 +51,7 @@ from imutool.diagnosis.signals import check_signals, with_signals
 from imutool.diagnosis.to_sensor_files import NO_EFFECT, start_values
 from imutool.errors import ImutoolError
 from imutool.file_location import Location
-from imutool.log_info.convention_report import check_one_sensor, convention_warnings, warn_of_recordings
+from imutool.log_info.convention_report import check_one_sensor, check_units, convention_warnings, warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.processes.forked import Forked
@@ -252,15 +252,13 @@ EVERY_UNIT = (
 
 
 class EffectSizes(NamedTuple):
-    """Sizes of effects fitted together, with robust standard deviations and biases.
-
-    `information` is the Fisher information of the noise alone, over all parameters in order.
-    """
+    """Sizes of effects fitted together, with robust standard deviations and biases."""
 
     chosen: Chosen
     std: dict[str, Float64[np.ndarray, " p"]]
-    information: Float64[np.ndarray, "q q"]
+    information: Float64[np.ndarray, "q q"]  # Fisher information of the noise alone, over all parameters in order
     bias: Float64[np.ndarray, "stretches 6"]
+    remarks: tuple[str, ...]  # on units and axes of the recording
 
 
 def effect_sizes(
@@ -277,19 +275,20 @@ def effect_sizes(
     effects keeps the smoothing of poses, which looks like a scale, out of the others; a short log says less of them then.
 
     Raises:
-        ConfigError, LogError, DataError: as `diagnose`; or an effect that has nothing to be fitted to here.
+        ConfigError, LogError, DataError: as `diagnose`; an effect that has nothing to be fitted to here; another unit.
     """
     simulated, settings = None if sim is None else read_simulation(sim, imu=imu_in(sim, imu))[0], DiagnoseSettings()
-    aligned = align(with_channels(read_log(real, imu=imu, truth=truth), real).recording, simulated, truth, settings)
+    recording = with_channels(read_log(real, imu=imu, truth=truth), real).recording
+    (whole,) = warn_of_recordings([recording])
+    check_units(whole, f"{recording.name} {recording.imu_topic}")
+    aligned = align(recording, simulated, truth, settings)
     pairs = [without_unusable(pair, settings.reference) for pair in aligned]
     of_poses = {clock_wander.EFFECT.name, SMOOTHED.name} - set(effects)
     candidates = [effect for effect in candidates_for(pairs) if effect.name not in of_poses]
     logs = [whitened(pair, without_second_orders(candidates), settings.band) for pair in pairs]
     named = catalogue.diagnosed([name for name in effects if name != SMOOTHED.name])
-    wanted = [
-        *clock_wander.with_knots(named, max(float(pair.stamp_s[-1]) for pair in pairs)),
-        *((SMOOTHED,) if SMOOTHED.name in effects else ()),
-    ]
+    last_s = max(float(pair.stamp_s[-1]) for pair in pairs)
+    wanted = [*clock_wander.with_knots(named, last_s), *((SMOOTHED,) if SMOOTHED.name in effects else ())]
     hidden = set(unobservable(logs, wanted, settings.search))
     observable = []
     for effect in wanted:
@@ -297,4 +296,5 @@ def effect_sizes(
         observable += [with_free(effect, free)] if free else []
     fitted = fit(logs, tuple((effect, effect.null_value.astype(float)) for effect in observable), part="all")
     std = scatter(logs, fitted, "all", settings.search.robust_block_s).std if observable else {}
-    return EffectSizes(fitted.chosen, {key: np.asarray(s) for key, s in std.items()}, fitted.information, fitted.bias)
+    scatters = {key: np.asarray(s) for key, s in std.items()}
+    return EffectSizes(fitted.chosen, scatters, fitted.information, fitted.bias, tuple(convention_warnings(whole)))

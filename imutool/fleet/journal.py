@@ -275,7 +275,8 @@ class _Pieces:
         for piece in pieces:
             raw = piece.read_bytes()
             _write_whole(file, raw if raw.endswith(b"\n") or not raw else raw + b"\n")
-        self._number = 1 + max((int(piece.stem) for piece in pieces if piece.stem.isdecimal()), default=-1)
+        self._number = 1 + max((int(piece.stem[:8]) for piece in pieces if piece.stem[:8].isdecimal()), default=-1)
+        self._own = os.urandom(4).hex()  # two runs that begin at once do not write over each other's pieces
 
     def append(self, raw: bytes) -> None:
         """Write the piece again with one more line."""
@@ -283,7 +284,7 @@ class _Pieces:
             self._last.clear()
             self._number += 1
         self._last += raw
-        (self._folder / f"{self._number:08d}.jsonl").write_bytes(bytes(self._last))
+        (self._folder / f"{self._number:08d}-{self._own}.jsonl").write_bytes(bytes(self._last))
 
 
 def _difference(known: Run, settings: Settings) -> str:

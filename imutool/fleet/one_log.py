@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import platform
 import tempfile
@@ -15,7 +16,7 @@ import msgspec
 
 from imutool.cleaning import UntrustedError
 from imutool.errors import LOST, ConfigError, ImutoolError, LogError, ModelError
-from imutool.file_location import Location, identity, to_location
+from imutool.file_location import Location, exists, identity, is_file, to_location
 from imutool.fleet.sources import partial_files, remove_files, simulation, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
 from imutool.mcap_io.log import Log
@@ -66,6 +67,7 @@ def work(task: Task, model: bytes | None = None) -> Result:
         _refuse_changed(task, job.source)
         _clear(task, job.target)
         entries = COMMANDS[task.settings.command](job)
+        _refuse_changed(task, job.source, job.target)
         result = msgspec.structs.replace(result, **entries, **_measured(job.target))
     except UntrustedError as error:
         result = msgspec.structs.replace(result, status="quarantined", error=str(error), exit_code=error.exit_code)
@@ -76,8 +78,18 @@ def work(task: Task, model: bytes | None = None) -> Result:
         result = msgspec.structs.replace(result, status="failed", error=reason, exit_code=ConfigError.exit_code)
     except MemoryError:
         result = msgspec.structs.replace(result, status="failed", error="out of memory", exit_code=LogError.exit_code)
+    if result.status in {"failed", "quarantined"}:
+        result = msgspec.structs.replace(result, error=result.error + _left_behind(task))
     spent = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu_began}
     return msgspec.structs.replace(result, **spent, peak_bytes=peak_bytes())
+
+
+def _left_behind(task: Task) -> str:
+    """Sentence about a target that is there, although this run has not written it; nobody should take it for its result."""
+    with contextlib.suppress(ConfigError):
+        target = within(to_location(task.out), task.target)
+        return f" {target} is from an earlier run." if is_file(target) else ""
+    return ""
 
 
 def page_name(log: str) -> str:
@@ -98,7 +110,7 @@ def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
     if done.status == "quarantined":  # nothing was written
         return True
     try:
-        if identity(target)[0] != done.target_bytes or (done.page and not target.with_name(page_name(target.name)).is_file()):
+        if identity(target)[0] != done.target_bytes or (done.page and not is_file(target.with_name(page_name(target.name)))):
             return False
         if whole or target.suffix.lower() != ".mcap":
             return sha256(target) == done.target_sha256
@@ -126,9 +138,11 @@ def _at_hand(settings: Settings, model: bytes | None) -> Settings:
     return msgspec.structs.replace(settings, model=str(copy))
 
 
-def _refuse_changed(task: Task, source: Location) -> None:
-    """Refuse a log that is still being written."""
+def _refuse_changed(task: Task, source: Location, made: Location | None = None) -> None:
+    """Refuse a log that is still being written, and remove what was `made` of it."""
     if identity(source) != (task.source.size, task.source.stamp):
+        if made is not None:
+            remove_files([made])
         raise LogError("has changed since it was listed", where=source, fix="Go on with `resume` when it is complete")
 
 
@@ -184,7 +198,7 @@ def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[s
 
     path = job.target.with_name(page_name(job.target.name))
     try:
-        if path.exists() and not is_imutool_page(path):
+        if exists(path) and not is_imutool_page(path):
             raise ConfigError("the page exists, and no fleet has written it", where=path, fix="Move it, or choose another OUT")
         logs = [load(job.target, imu=topic) for topic in topics]
         report.write_page(report.name_by_topic(logs, topics), path, overwrite=True)
@@ -246,12 +260,13 @@ def _diagnose(job: _Job) -> dict[str, Any]:
         for physics, theta in fixed.chosen
         for number, value, std in zip(physics.parameters, theta, fixed.std[physics.name], strict=True)
     )
-    entries: dict[str, Any] = {"robot": robot, "parameters": parameters}
+    entries: dict[str, Any] = {"robot": robot, "parameters": parameters, "warnings": fixed.remarks}
     diagnosis: dict[str, Any] | UnsetType = UNSET
     if not s.quick:
         found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
         diagnosis = json_values(found.report)
-        entries |= {"effects": tuple(finding.effect for finding in found.findings), "warnings": found.remarks}
+        entries["effects"] = tuple(finding.effect for finding in found.findings)
+        entries["warnings"] = tuple(dict.fromkeys((*fixed.remarks, *found.remarks)))
     write_json(UnitReport(robot, fixed.bias.tolist(), list(parameters), diagnosis), job.target)
     return entries
 

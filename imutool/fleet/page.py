@@ -27,7 +27,7 @@ EQUAL = 1e-6  # of the largest of several values, by which they may differ
 BINS = 30
 OWN_STYLE = """
 .failed { color: var(--before); font-weight: 600; } .quarantined, .lost { color: var(--mark); font-weight: 600; }
-td.quarantined { white-space: nowrap; }
+td.quarantined { white-space: nowrap; } td.log { min-width: 24em; }
 """
 
 
@@ -133,12 +133,15 @@ def _trouble(statistics: Statistics) -> Iterator[str]:
     if not statistics.trouble:
         return
     yield "<h2>Not whole</h2>"
-    rows = []
+    alike = os.path.commonprefix([result.source for result in statistics.trouble])  # noqa: RUF071  commonpath takes no URL
+    below, rows = alike[: alike.rfind("/") + 1], []
+    yield f'<p class="note">Logs below {text(below)}</p>' if below else ""
     order = {name: k for k, name in enumerate(TROUBLE)}
     for result in sorted(statistics.trouble, key=lambda r: (order[r.earlier or r.status], r.source)):
         status = result.earlier or result.status
         why = result.error or "; ".join(result.losses) or "; ".join(result.warnings)
-        rows.append(f'<tr><td class="{status}">{status}</td><td>{text(result.source)}</td><td>{text(why)}</td></tr>')
+        name, why = result.source.removeprefix(below), why.removeprefix(result.source).lstrip(": ")
+        rows.append(f'<tr><td class="{status}">{status}</td><td class="log">{text(name)}</td><td>{text(why)}</td></tr>')
     yield f"<table><thead><tr><th>Status</th><th>Log</th><th>Why</th></tr></thead><tbody>{''.join(rows)}</tbody></table>"
     more = sum(statistics.statuses[name] for name in TROUBLE) - len(statistics.trouble)
     if more:
@@ -271,6 +274,9 @@ def _provenance(settings: Settings) -> Iterator[str]:
         entries |= {"init": settings.init, "smooth": words[settings.smooth], "clean": words[settings.clean]}
         entries |= {"unfit models": "used" if settings.force else "refused"}
         entries["verified"] = f"structure, and contents: {settings.check}"
+    if settings.command == "diagnose":
+        entries |= {"robots": settings.robot_from or "by folder", "beside": settings.sim or "the true poses"}
+    entries |= {"IMU": settings.imu or "", "truth": settings.truth or ""}
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):
             yield f"<dt>{text(name)}</dt><dd>{text(value)}</dd>"

@@ -85,8 +85,10 @@ def _check_inside(target: str, table: Path) -> None:
 def _log(folder: Path, row: Mapping[str, Any]) -> FleetLog:
     """Log of a row: the debiased one where the fleet wrote it, else its source."""
     target = folder / row["target"]
-    is_log = target.suffix.lower() == ".mcap" and target.is_file()
-    diagnosis = target if row["effects"] is not None and target.is_file() else None
+    failed = (row["earlier"] or row["status"]) in {"failed", "quarantined"}  # what lies there is from an earlier run
+    written = target.is_file() and not failed
+    is_log = written and target.suffix.lower() == ".mcap"
+    diagnosis = target if row["effects"] is not None and written else None
     place = str(target) if is_log else row["source"]
     name = str(Path(row["target"]).with_suffix("").as_posix())
     return FleetLog(name, place, f"{row['target_sha256']}{row['key']}", diagnosis, _facts(row))

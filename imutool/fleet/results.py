@@ -191,7 +191,7 @@ class Statistics:
         if status == "failed":
             return
         self.bytes_in, self.bytes_out = self.bytes_in + result.source_bytes, self.bytes_out + result.target_bytes
-        self.messages += result.messages
+        self.messages += result.messages or 0
         self.pages += bool(result.page)
         if result.page and len(self.drawn) < MOST_ROWS:
             self.drawn.append(result)

@@ -267,9 +267,11 @@ def robot_of(name: str, pattern: str | None, log: Location) -> str:
             raise ConfigError(f"has no {key!r} in its metadata {record!r}", where=log)
         return found
     match = fits.search(name)
-    if match is None:
-        raise ConfigError(f"{fits.pattern!r} matches nothing in {name}", where="robot_from")
-    return str(match[1] if fits.groups else match[0])
+    texts = () if match is None else match.groups("") or (match[0],)
+    found = next(filter(None, texts), "")  # of several groups, as in (a)|(b), the first that takes part
+    if not found:
+        raise ConfigError(f"`robot_from` {fits.pattern!r} matches nothing in {name}")
+    return found
 
 
 def robot_pattern(pattern: str | None) -> re.Pattern[str] | str | None:

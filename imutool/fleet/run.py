@@ -6,14 +6,14 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
 
 from imutool.errors import LOST, ConfigError
-from imutool.file_location import Location, to_location
+from imutool.file_location import Location, exists, is_file, to_location
 from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
 from imutool.fleet.journal import NAME as JOURNAL
@@ -136,7 +136,8 @@ def run(
     if not overwrite:
         _refuse_existing(target, page if page is None or not (resume and _is_page(page)) else None)
     model = None if settings.model is None or not Path(settings.model).is_absolute() else _bytes(Path(settings.model))
-    found = with_simulations(find(source, target, bags=settings.command == "repair"), settings.sim)
+    logs = find(source, target, bags=settings.command == "repair", once=settings.command == "diagnose")
+    found = with_simulations(logs, settings.sim)
     progress = Progress(len(found.logs) + len(found.refused), sum(source.size for source in found.logs))
     fleet = _Fleet(found, target, settings, overwrite, recheck)
 
@@ -156,11 +157,12 @@ def run(
                     else:
                         journal.finish(result)
                     progress.add(result)
-        except KeyboardInterrupt as interrupt:
-            raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from interrupt
-        finally:
-            if progress.statuses.total() < progress.logs:  # workers have been killed
+        except BaseException as error:  # workers have been killed
+            with suppress(ConfigError):  # of a store that is gone: the first error is raised
                 fleet.remove_partial()
+            if isinstance(error, KeyboardInterrupt):
+                raise KeyboardInterrupt(f"{progress.line()}; go on with `resume`") from error
+            raise
         return _report(fleet, journal, source, progress, began, page)
 
 
@@ -252,7 +254,7 @@ class _Fleet:
 
     def _blocked(self, source: Source, journal: Journal) -> bool:
         name = self._name(source)
-        return not (self._overwrite or journal.ours(name)) and (self.out / name).exists()
+        return not (self._overwrite or journal.ours(name)) and exists(self.out / name)
 
 
 def _refuse_existing(out: Location, page: Location | None) -> None:
@@ -261,16 +263,16 @@ def _refuse_existing(out: Location, page: Location | None) -> None:
     Raises:
         ConfigError: the page exists, or a table or comparison in an OUT that no fleet has begun.
     """
-    if page is not None and page.exists():
+    if page is not None and exists(page):
         raise ConfigError("the target exists", where=page, fix="Choose another `page`, or add `overwrite`")
     for name in (results.NAME, COMPARED):
-        if not (out / JOURNAL).exists() and (out / name).exists():
+        if not exists(out / JOURNAL) and exists(out / name):
             raise ConfigError("the target exists", where=out / name, fix="Choose another `out`, or add `overwrite`")
 
 
 def _is_page(path: Location) -> bool:
     """Whether a file is a page about a fleet."""
-    if not path.is_file():
+    if not is_file(path):
         return False
     with path.open("rb") as file:
         return TITLE in file.read(4096)
@@ -290,4 +292,8 @@ def _key(where: str) -> str:
 
 def _out(text: str) -> Location:
     out = to_location(text)
-    return out.absolute() if isinstance(out, Path) else out
+    if isinstance(out, Path):
+        return out.absolute()
+    if out.protocol == "memory":
+        raise ConfigError("is the memory of one process, which ends with it", where=text, expected="a folder, or a store's URL")
+    return out

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from imutool.errors import ConfigError, redact
-from imutool.file_location import Location, identity, io_errors, reason, size_and_etag, to_location
+from imutool.file_location import Location, exists, identity, io_errors, is_file, is_folder, reason, size_and_etag, to_location
 from imutool.fleet.task import Source
 
 logger = logging.getLogger(__name__)
@@ -45,10 +45,11 @@ class _File(NamedTuple):
     unread: str = ""
 
 
-def find(text: str, out: Location, *, bags: bool = False) -> Found:
+def find(text: str, out: Location, *, bags: bool = False, once: bool = False) -> Found:
     """Find the logs of a path, a glob, a folder or a URL; logs below `out` are left out.
 
-    With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings.
+    With `bags` ROS 1 bags are logs too. A warning counts the files that are other recordings. With `once` a link to another of
+    these logs is left out.
 
     The name of a log is its path from the folder, or from the last part of a pattern before its first wildcard; a single log
     keeps its own name. Links are followed, also to find what lies below `out`. A log without a usable name below OUT is
@@ -75,7 +76,7 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
             before = taken.setdefault(name.casefold(), where)  # one file on some systems, two on others
             if before != where:
                 raise ConfigError(f"would be called {name}, and so would {before}", fix="Rename one of the two")
-            if about is None and Path(where).exists() and not Path(where).is_file():
+            if about is None and exists(Path(where)) and not Path(where).is_file():
                 raise ConfigError("is a pipe, a socket or a device", expected="a file", fix="Remove it")
             logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
@@ -90,7 +91,19 @@ def find(text: str, out: Location, *, bags: bool = False) -> Found:
         kinds = ", ".join(f"{count} {ending}" for ending, count in passed_over.items())
         logger.warning("%s: files that are no MCAP logs are passed over (%s); %s", redact(text), kinds, CONVERT)
     logs.sort(key=lambda source: source.name)
-    return Found(logs, sorted(refused))
+    return Found(_without_links(logs, text) if once else logs, sorted(refused))
+
+
+def _without_links(logs: list[Source], text: str) -> list[Source]:
+    """Logs without those that are another one's file, by a link; a warning counts them."""
+    files = {log.place: log.place if "://" in log.place else os.path.realpath(log.place) for log in logs}
+    first = dict[str, str]()
+    for place in sorted(files, key=lambda place: files[place] != place):  # a file before the links to it
+        first.setdefault(files[place], place)
+    kept = [log for log in logs if first[files[log.place]] == log.place]
+    if len(kept) < len(logs):
+        logger.warning("%s: %d logs are links to others, and do not count again", redact(text), len(logs) - len(kept))
+    return kept
 
 
 def simulation(folder: Location, name: str) -> Location:
@@ -100,7 +113,7 @@ def simulation(folder: Location, name: str) -> Location:
         ConfigError: there is none.
     """
     found = folder if _ends(folder.name, (LOG,)) else folder / name
-    if not found.is_file():
+    if not is_file(found):
         raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
     return found
 
@@ -109,10 +122,15 @@ def with_simulations(found: Found, sim: str | None) -> Found:
     """Logs with the identity of their simulations.
 
     A log whose simulation has changed is not done.
+
+    Raises:
+        ConfigError: there are no simulations.
     """
     if sim is None:
         return found
     folder = to_location(sim)
+    if not exists(folder):
+        raise ConfigError("is not there", where=folder, expected="a folder with simulations, or one simulation")
 
     def compared(source: Source) -> Source:
         with contextlib.suppress(ConfigError):  # the task of the log says why
@@ -154,10 +172,10 @@ def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
     where = to_location(text)
     if not isinstance(where, Path):
         return _in_store(text, endings)
-    if where.is_dir():
+    if is_folder(where):
         root = where.absolute()
         return str(root), _walk(root, endings, frozenset())
-    if where.exists():
+    if exists(where):
         return str(where.absolute().parent), iter([_File(str(where.absolute()))])
     if not PATTERN.search(str(where)):
         raise ConfigError("is not there", where=redact(text), expected="a log, a folder with logs, or a pattern")
@@ -215,16 +233,22 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
             found = {root.path: {}}  # one file: to list it, the library would fetch the whole log and look for links in it
         else:
             found = root.fs.find(root.path, detail=True)
-        for path, about in found.items():
-            if about.get("size") is None and _ends(path, endings):  # a web server lists names alone
-                found[path] = root.fs.info(path)
     except io_errors(root) as error:
         raise ConfigError(f"cannot be listed ({reason(error)})", where=text) from error
+    unread = dict[str, str]()
+    for path, about in found.items():
+        if about.get("size") is None and _ends(path, endings):  # a web server lists names alone
+            try:
+                found[path] = root.fs.info(path)
+            except io_errors(root) as error:
+                unread[path] = reason(error)
     whole = fixed.rpartition("/")[0] if list(found) == [root.path] else fixed  # a log alone, by its own name
-    files = [_File(fixed + path[len(root.path.rstrip("/")) :], about) for path, about in sorted(found.items())]
-    return whole, (
-        file for file in files if _ends(file.where, endings) and file.about and file.about.get("type", "file") == "file"
-    )
+    files = [
+        _File(fixed + path[len(root.path.rstrip("/")) :], about, unread.get(path, ""))
+        for path, about in sorted(found.items())
+        if about and about.get("type", "file") == "file" and _ends(path, endings)
+    ]
+    return whole, iter(files)
 
 
 def within(out: Location, name: str) -> Location:

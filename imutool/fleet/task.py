@@ -122,7 +122,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True, tag_field="line", tag="d
     target_sha256: str = ""
     seconds: float = 0.0
     cpu_seconds: float = 0.0
-    messages: int = 0
+    messages: int | None = None  # a diagnosis does not count them
     duration_s: float | None = None
     imus: tuple[Imu, ...] = ()
     losses: tuple[str, ...] = ()

@@ -187,6 +187,13 @@ def check_conventions(recordings: Iterable[Recording]) -> None:
             logger.warning("%s: %s", where, warning)
 
 
+def check_units(whole: TopicSummary, where: str) -> None:
+    """Refuse samples that are clearly in another unit (DataError)."""
+    for finding in Units().findings(whole):
+        if "fix" in finding.values:
+            raise DataError(finding.what, where=where, expected="rad/s and m/s²", fix=CORRECTION)
+
+
 def conventions(whole: TopicSummary) -> list[Convention]:
     """What the motion shows of each convention."""
     return [Convention(*entry) for entry in _entries(whole, whole.conventions)]

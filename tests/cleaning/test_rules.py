@@ -391,6 +391,12 @@ def test_stamps_that_were_never_set_are_told_with_what_to_do(made: ImuBatch) -> 
     assert second == "the stamps were never set: imutool convert LOG OUT --restamp takes the log times"
 
 
+def test_samples_that_are_all_nan_are_not_told_as_stamps_that_were_never_set(made: ImuBatch) -> None:
+    reasons = look(with_values(made, slice(0, None), 1, np.nan)).reasons
+    assert any("not finite" in reason for reason in reasons)
+    assert not any("stamps" in reason for reason in reasons)
+
+
 def test_stamps_in_batches_are_no_missing_samples(made: ImuBatch) -> None:
     number = np.arange(len(made.stamp_ns))
     last = np.minimum(number // 10 * 10 + 9, len(number) - 1)

@@ -213,3 +213,15 @@ def test_in_a_store_it_lies_in_pieces(store: Any, monkeypatch: pytest.MonkeyPatc
     assert len(store.keys()) == pieces + 1
     with Journal(out, OTHER, overwrite=True) as journal:
         assert journal.done("f") is None
+
+
+def test_of_two_runs_that_go_on_at_once_in_a_store_neither_loses_a_line(store: Any) -> None:
+    out = to_location("s3://fleet/out")
+    fill(out, "a")
+    with Journal(out, SETTINGS, resume=True) as one, Journal(out, SETTINGS, resume=True) as other:
+        for journal, key in ((one, "b"), (other, "c"), (one, "d")):
+            journal.begin(key, f"{key}.mcap")
+            journal.finish(result(key))
+    with Journal(out, SETTINGS, resume=True) as journal:
+        assert all(journal.done(key) is not None for key in "abcd")
+        assert all(journal.ours(f"{key}.mcap") for key in "abcd")

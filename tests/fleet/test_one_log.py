@@ -17,8 +17,8 @@ from fuzz.numbers import put_log
 from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
-from imutool.errors import ConfigError
-from imutool.fleet.one_log import page_name, target_name, work
+from imutool.errors import ConfigError, LogError
+from imutool.fleet.one_log import COMMANDS, page_name, target_name, work
 from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
@@ -200,6 +200,36 @@ def test_a_log_that_is_still_being_written_waits(logs: Path, tmp_path: Path, set
     assert "has changed since it was listed" in work(listed).error
 
 
+def test_of_a_log_that_is_written_to_meanwhile_nothing_is_kept(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    growing = tmp_path / "growing.mcap"
+    growing.write_bytes((logs / "flight_1.mcap").read_bytes())
+    info = COMMANDS["info"]
+
+    def while_it_grows(job: Any) -> dict[str, Any]:
+        entries = info(job)
+        os.utime(growing, ns=(1, 1))
+        return entries
+
+    monkeypatch.setitem(COMMANDS, "info", while_it_grows)
+    done = work(task(growing, tmp_path / "out", Settings(command="info"), "growing.json"))
+    assert (done.status, done.exit_code) == ("failed", LogError.exit_code)
+    assert not (tmp_path / "out" / "growing.json").exists()
+
+
+def test_a_result_of_an_earlier_run_is_named_where_this_one_fails(logs: Path, tmp_path: Path, settings: Settings) -> None:
+    log, out = tmp_path / "log.mcap", tmp_path / "out"
+    log.write_bytes((logs / "flight_1.mcap").read_bytes())
+    assert work(task(log, out, settings, "log.mcap")).status == "ok"
+    before = (out / "log.mcap").read_bytes()
+    log.write_bytes(b"no log any more")
+    failed = work(task(log, out, settings, "log.mcap"))
+    assert failed.status == "failed"
+    assert f"{out / 'log.mcap'} is from an earlier run" in failed.error
+    assert (out / "log.mcap").read_bytes() == before
+
+
 def test_a_log_that_has_gone_is_a_result(tmp_path: Path) -> None:
     source = Source(str(tmp_path / "gone.mcap"), "gone.mcap", 1, "1")
     out = Task(key="k", source=source, out=str(tmp_path), target="gone.json", settings=Settings(command="info"))
@@ -222,6 +252,9 @@ def test_a_robot_is_its_folder_or_what_the_pattern_says(logs: Path, tmp_path: Pa
     assert robot_of("site/robot 3/log.mcap", None, log) == "site/robot 3"
     assert robot_of("robot_3.mcap", None, log) == "robot_3"
     assert robot_of("site/r3_monday.mcap", r"(r\d+)_", log) == "r3"
+    assert robot_of("site/b_monday.mcap", r"(a)_|(b)_", log) == "b"
+    with pytest.raises(ConfigError, match="matches nothing"):
+        robot_of("site/monday.mcap", r"(r\d+)?", log)
     assert robot_of("any.mcap", "metadata:unit.serial", log) == "7"
     with pytest.raises(ConfigError, match="matches nothing"):
         robot_of("site/monday.mcap", r"(r\d+)_", log)

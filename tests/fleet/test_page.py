@@ -11,7 +11,7 @@ import pytest
 
 from imutool.fleet import page
 from imutool.fleet.results import Statistics
-from imutool.fleet.task import Result
+from imutool.fleet.task import Result, Settings
 from imutool.viewing.html import drawing
 
 LETTER = 6.0  # pixels between two numbers: a browser has another font
@@ -23,6 +23,23 @@ def test_what_is_said_of_logs_counts_without_their_topics_and_stays_whole() -> N
         said = (f"{topic}: 4 samples missing", "the record at byte 956 is damaged: it says it has 190982 bytes")
         statistics.add(Result(key=topic, source=topic, target="", status="ok", warnings=said))
     assert statistics.warnings == {"4 samples missing": 2, "the record at byte 956 is damaged: it says it has 190982 bytes": 2}
+
+
+def test_of_logs_that_are_not_whole_the_common_folder_stands_once() -> None:
+    places = [f"/fleet/{robot}/log.mcap" for robot in ("robot_a", "robot_b")]
+    results = [
+        Result(key=place, source=place, target="", status="failed", error=f"{place}: the file is empty") for place in places
+    ]
+    said = page.html(results, Settings(command="info"), seconds=1.0, source="logs")
+    assert said.count("/fleet/") == 1
+    assert all(f">{robot}/log.mcap<" in said for robot in ("robot_a", "robot_b"))
+    assert said.count(">the file is empty<") == 2
+
+
+def test_the_page_of_a_diagnosis_says_what_it_takes_to_do_it_again() -> None:
+    settings = Settings(command="diagnose", robot_from=r"^(\w+)/", sim="/sims", imu="/imu1", truth="/mocap")
+    said = page.html([], settings, seconds=1.0, source="logs")
+    assert all(f"<dd>{words}</dd>" in said for words in (r"^(\w+)/", "/sims", "/imu1", "/mocap"))
 
 
 def test_the_numbers_below_the_histograms_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imutool.errors import DataError
 from imutool.fleet.one_log import work
 from imutool.fleet.robots import FALSE_DISCOVERY, FEWEST, compare
 from imutool.fleet.robots import _robust as robust
 from imutool.fleet.sources import find
 from imutool.fleet.task import Parameter, Result, Settings, Task
+from imutool.mcap_io.read import read
+from imutool.mcap_io.write import write
 
 ROBOTS, PARAMETERS, STD = 20, 12, 0.2
 FALSE_FLEETS = 0.03  # of 200 with nothing to find: three standard deviations above FALSE_DISCOVERY
@@ -115,3 +119,13 @@ def test_of_a_dozen_robots_the_rotated_mount_and_the_wrong_scale_are_named(
     turned = next(one for one in found.outliers if one.robot == "robot_11")
     assert turned.value - turned.middle == pytest.approx(np.deg2rad(2.1), abs=4.0 * np.deg2rad(0.2))
     assert "robot_11: mount rotation phi y 2" in turned.sentence
+
+
+def test_a_robot_in_another_unit_is_refused_and_not_compared(logs: Path, tmp_path: Path) -> None:
+    made = read(logs / "flight_1.mcap")
+    write(replace(made, imu=replace(made.imu, gyro=np.rad2deg(made.imu.gyro))), tmp_path / "log.mcap")
+    (source,) = find(str(tmp_path / "log.mcap"), tmp_path / "out").logs
+    quick = Settings(command="diagnose", quick=True)
+    done = work(Task(key="k", source=source, out=str(tmp_path / "out"), target="log.json", settings=quick))
+    assert (done.status, done.exit_code, done.parameters) == ("failed", DataError.exit_code, ())
+    assert "deg/s" in done.error

@@ -103,6 +103,34 @@ def test_a_folder_that_cannot_be_read_is_told_and_the_others_go_on(tmp_path: Pat
     assert "cannot be read (Permission denied)" in found.refused[1][1]
 
 
+def test_a_log_in_a_folder_that_may_be_listed_only_is_told_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree(tmp_path, "good.mcap", "listed/a.mcap")
+    asked = Path.stat
+
+    def stat(path: Path, **options: Any) -> os.stat_result:
+        if path.name == "a.mcap":  # chmod does not stop root
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return asked(path, **options)
+
+    monkeypatch.setattr(Path, "stat", stat)
+    found = find(str(tmp_path), NOWHERE)
+    assert [log.name for log in found.logs] == ["good.mcap"]
+    assert [Path(where).name for where, _ in found.refused] == ["a.mcap"]
+
+
+def test_a_link_to_another_log_counts_once_where_logs_are_compared(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    fleet = tree(tmp_path, "robot/monday.mcap", "robot/tuesday.mcap")
+    (fleet / "robot" / "latest.mcap").symlink_to("tuesday.mcap")
+    (fleet / "again").symlink_to("robot")
+    every = [log.name for log in find(str(fleet), NOWHERE).logs]
+    assert len(every) == 6
+    kept = [log.name for log in find(str(fleet), NOWHERE, once=True).logs]
+    assert kept == ["robot/monday.mcap", "robot/tuesday.mcap"]
+    assert "4 logs are links to others" in caplog.text
+
+
 def test_links_to_logs_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     tree(tmp_path / "disk", "x/log.mcap")
     fleet = tree(tmp_path / "fleet", "own.mcap")
@@ -189,6 +217,8 @@ def test_another_simulation_is_another_key(tmp_path: Path) -> None:
     assert keys(str(sims))[0] != before[0]
     assert keys(str(sims))[1] == before[1]
     assert keys(str(sims / "a.mcap"))[1] != before[1], "one for all"
+    with pytest.raises(ConfigError, match="is not there"):
+        keys(str(tmp_path / "none"))
 
 
 def test_another_content_is_another_identity(tmp_path: Path) -> None:
@@ -245,12 +275,13 @@ class _WebServer(SimpleHTTPRequestHandler):
 
 def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> None:
     tree(tmp_path, "robots/a/log.mcap", "robots/b/notes.txt", "robots/b/other.mcap")
+    (tmp_path / "robots" / "latest.mcap").symlink_to("removed.mcap")
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_WebServer, directory=str(tmp_path))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
             root = f"http://127.0.0.1:{server.server_port}/robots"
-            found = find(root, NOWHERE).logs
+            found, refused = find(root, NOWHERE)
             (alone,) = find(f"{root}/b/other.mcap", NOWHERE).logs
             assert identity(to_location(alone.place)) == (alone.size, alone.stamp)
         finally:
@@ -260,5 +291,6 @@ def test_a_web_server_is_listed_although_it_tells_no_sizes(tmp_path: Path) -> No
         (f"{root}/a/log.mcap", "a/log.mcap", len("robots/a/log.mcap")),
         (f"{root}/b/other.mcap", "b/other.mcap", len("robots/b/other.mcap")),
     ]
+    assert [where for where, _ in refused] == [f"{root}/latest.mcap"]
     assert alone.name == "other.mcap"
     assert alone.stamp  # of the last change: a log of the same size is another one

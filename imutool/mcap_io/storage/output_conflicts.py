@@ -16,7 +16,7 @@ from itertools import combinations
 from pathlib import Path
 
 from imutool.errors import ConfigError, ImutoolError, UsageError
-from imutool.file_location import Location, LogPath, location
+from imutool.file_location import Location, LogPath, exists, is_folder, location
 from imutool.mcap_io.storage.local import is_stream
 
 JSON, HTML, PNG, TOML = (".json",), (".html", ".htm"), (".png",), (".toml",)
@@ -32,7 +32,7 @@ class OutputFile:
         parameter: Name of the parameter.
         place: File, folder or URL; None where it is not wanted.
         suffixes: Suffixes that fit the content; with none of them, any fits.
-        files: Of a folder: patterns of the names written into it.
+        files: Of a folder: patterns of the names written into it; (): the command makes the folder first.
         keeps: The function itself decides about an existing one, before its work.
         of_each: Of a folder that keeps other files: pattern of the names about an input, with {} for the input's name.
         may_be_folder: An existing folder gets a file of its own in it.
@@ -76,7 +76,10 @@ def check_outputs(outputs: Iterable[OutputFile], inputs: Iterable[object] = (), 
         if _collide(first, second):
             what = f"`{first.parameter}` and `{second.parameter}` are the same file"
             raise ConfigError(what, where=second.place, fix="Give each output a name of its own")
+    made = [Path(output.where).absolute() for output in files if output.files == () and isinstance(output.where, Path)]
     for output in files:
+        if output.files is None and not (output.may_be_folder and is_folder(output.where)):
+            _refuse_missing_folder(output.where, made)
         if not output.keeps:
             _refuse_existing_output(output, overwrite)
         elif output.of_each and not overwrite:
@@ -91,17 +94,17 @@ def refuse_existing(path: Location, *, overwrite: bool, choose: str = "Choose an
     Raises:
         ConfigError: it is a folder, a disk or a socket, or it exists.
     """
-    if path.is_dir():
+    if is_folder(path):
         raise ConfigError("the target is a folder", where=path, expected="the name of a file")
     if not isinstance(path, Path):
-        exists = path.exists()
+        there = exists(path)
     elif is_stream(path):
         return
     elif path.is_block_device() or path.is_socket():
         raise ConfigError("the target is a disk or a socket", where=path, expected="the name of a file")
     else:
-        exists = os.path.lexists(path)  # a link to nothing is there too
-    if exists and not overwrite:
+        there = os.path.lexists(path)  # a link to nothing is there too
+    if there and not overwrite:
         raise ConfigError("the target exists", where=path, fix=f"{choose}, or add `overwrite=True`")
 
 
@@ -226,11 +229,10 @@ def _alias(path: Path) -> bool:
 def _refuse_existing_output(output: OutputFile, overwrite: bool) -> None:
     place = output.where
     if output.files is None:
-        if not (output.may_be_folder and place.is_dir()):
+        if not (output.may_be_folder and is_folder(place)):
             refuse_existing(place, overwrite=overwrite)
-            _refuse_missing_folder(place)
         return
-    if place.exists() and not place.is_dir():
+    if exists(place) and not is_folder(place):
         raise ConfigError("is a file", where=place, expected="a folder, which need not exist")
     if isinstance(place, Path) and place.is_dir() and not overwrite:
         there = sorted(e.name for e in place.iterdir() if any(fnmatchcase(e.name, pattern) for pattern in output.files))
@@ -247,11 +249,13 @@ def _refuse_existing_files(output: OutputFile, inputs: Sequence[str]) -> None:
         raise ConfigError("the target exists", where=folder / name, fix="Choose another folder, or add `overwrite=True`")
 
 
-def _refuse_missing_folder(place: Location) -> None:
-    """Refuse a file whose folder is not there or cannot be written."""
+def _refuse_missing_folder(place: Location, made: Sequence[Path]) -> None:
+    """Refuse a file whose folder is not there or cannot be written, unless the command makes that folder first."""
     if not isinstance(place, Path):
         return
     folder = place.absolute().parent
+    if not folder.is_dir() and folder in made:
+        return
     if not folder.is_dir():
         raise ConfigError(
             f"cannot be written (no folder {folder})", where=place, fix="Make the folder first, or choose another"

@@ -25,7 +25,7 @@ from imutool.recording import Imu, Recording
 from imutool.recording.columns import clock_jumps, jump_warnings, longest_run
 from imutool.viewing.model.run_data import LogTimes, Run
 
-MIN_SAMPLES = 2  # samples that make a log
+MIN_SAMPLES = 2  # samples that make a log, and poses that make a trajectory
 NO_SAMPLES = Imu(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
@@ -120,6 +120,9 @@ def _read(opened: Log, imu: str | None, truth: str | None, notes: list[str]) -> 
             log, imu=topic, truth=truth, samples=NO_SAMPLES, derived=False, refused=None if truth else refused
         )
         rest = longest_recording(with_temperatures(found, log))
+        few = {} if truth else {name: len(poses) for name, poses in rest.truths.items() if len(poses) < MIN_SAMPLES}
+        notes += [f"The true poses on {name} are left out: {count} of them are in the log." for name, count in few.items()]
+        rest = replace(rest, truths={name: poses for name, poses in rest.truths.items() if name not in few})
         metadata = log.metadata_records()
         if isinstance(log, RecoveredLog):
             notes += [f"The log is damaged; {line}." for line in describe(log.losses.plain())]

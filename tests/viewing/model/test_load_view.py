@@ -353,3 +353,11 @@ def test_of_several_imus_the_one_that_was_debiased_is_shown(made: Recording, tmp
         load(two)
     debias(two, tmp_path / "debiased.mcap", model="static", imus=["/imu_2/imu"])
     assert read_log(tmp_path / "debiased.mcap").recording.imu_topic == "/imu_2/imu"
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_true_poses_are_left_out(made: Recording, tmp_path: Path, count: int) -> None:
+    write(replace(made, truths={"/few": made.truth.rows(slice(0, count))}, scalars={}), tmp_path / "few.mcap")
+    data = load(tmp_path / "few.mcap")
+    assert data.truth is None
+    assert any("/few are left out" in note for note in data.notes)
