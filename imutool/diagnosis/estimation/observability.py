@@ -20,8 +20,10 @@ from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects import low_pass, vibration
+from imutool.sensor.effects.gyro_hysteresis import play
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
+SHARED, STANDS_STILL = "share", 0.4  # variant of a hysteresis; of the motion, what such a share moves at least
 LOW_PASSES = ("low_pass", "second_order_low_pass")
 NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", *LOW_PASSES, "mount_resonance")}
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
@@ -144,20 +146,22 @@ def _plainer(effect: Effect, theta: Theta, *, poses: bool) -> Mapping[str, tuple
     """Effects that may stand for one: their free parameters, by index, and a start.
 
     A clock that jumps, a gyro that lags beside poses (which have a clock of their own), a drift or step of a bias beside a
-    temperature of the log, two gains of axes that hardly change their sign, three scales as one gravity within what Earth has.
+    temperature of the log, two gains of axes that hardly change their sign, a share that lags by as much as the motion, three
+    scales as one gravity within what Earth has.
     """
     name = effect.name
     if name == "clock_jump":
         return {"clock_offset": ([0], [theta[1]]), "clock_skew": ([0], [theta[1] / max(2.0 * theta[0], 1.0)])}
     if name == LOW_PASSES[1]:
         lag_s = low_pass.Design.of(effect, theta).lag_s
-        if len(effect.sensors) == 1:
-            return {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
-        return {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
+        of_both = {"clock_offset": ([0], [-lag_s]), "low_pass": ([0], [1.0 / (2.0 * np.pi * lag_s)])}
+        return of_both if len(effect.sensors) > 1 else {"gyro_delay": ([0], [lag_s])} if effect.sensors[0] == "gyro" else {}
     if name == "gyro_delay" and poses:
         return {"clock_offset": ([0], [-theta[0]])}
-    if name in PLAINER:
+    if name in PLAINER and effect.variant != SHARED:
         return {PLAINER[name][0]: (PLAINER[name][1], np.zeros(len(PLAINER[name][1])).tolist())}
+    if effect.variant == SHARED:
+        return {f"{effect.sensors[0]}_scale": (range(3), np.full(3, -theta[1]).tolist())}
     g = GRAVITY_M_S2 * float(np.mean(theta))
     return {"gravity": (range(3), [g, 0.0, 0.0])} if name == "accel_scale" and len(theta) == 3 and abs(g) < SITES_M_S2 else {}
 
@@ -207,9 +211,9 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 # ── effects that are no answer ──
 
 
-def without_second_orders(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects but for second orders, beside which too little noise would be left."""
-    return [effect for effect in effects if effect.name != LOW_PASSES[1]]
+def for_noise(effects: Sequence[Effect]) -> list[Effect]:
+    """Effects beside which noise is measured: beside second orders and shares too little would be left."""
+    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant != SHARED]
 
 
 def exclude_each_other(a: Effect, b: Effect) -> bool:
@@ -238,9 +242,19 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
         takes_back = bool(theta[2:5].sum() < 0.0)  # as no spring does
         overdamped = bool(theta[1] > 1.0)  # a lag, which does not ring
         return outside or takes_back or overdamped or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
+    if effect.variant == SHARED and all(_is_scale(effect, theta, log.pair) for log in logs):
+        return True
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
     least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it
     return outside or any(n.name == "width" and value < least for n, value in zip(effect.parameters, theta, strict=True))
+
+
+def _is_scale(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:
+    """Whether the share of a hysteresis stands still, because its width exceeds the motion: it lowers the scale alone."""
+    (sensor,) = effect.sensors
+    motion = expected(pair, ())[:, pair.signals[sensor]]
+    held = play(motion, float(theta[0]))
+    return bool((held.std(axis=0) < STANDS_STILL * motion.std(axis=0)).all())
 
 
 def _is_motion(effect: Effect, theta: Theta, pair: AlignedLog) -> bool:

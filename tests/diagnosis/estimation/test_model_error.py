@@ -12,7 +12,7 @@ from imutool.diagnosis.diagnose import candidates_for
 from imutool.diagnosis.estimation.gauss_newton import fit
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
-from imutool.diagnosis.estimation.observability import without_second_orders
+from imutool.diagnosis.estimation.observability import for_noise
 from imutool.diagnosis.estimation.time_alignment import with_simulation
 from imutool.diagnosis.estimation.trial.model_error import (
     FOLLOWING,
@@ -114,7 +114,7 @@ def selected(real: Recording, sim: Recording) -> Selection:
     settings = DiagnoseSettings()
     pairs = list(with_simulation(real, sim, settings))
     candidates = candidates_for(pairs)
-    logs = [whitened(pair, without_second_orders(candidates), settings.band) for pair in pairs]
+    logs = [whitened(pair, for_noise(candidates), settings.band) for pair in pairs]
     named, always = without_unseen_offset(candidates, pairs)
     return select_effects(logs, named, always=always)
 

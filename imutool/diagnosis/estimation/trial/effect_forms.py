@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imutool.diagnosis.estimation.observability import SHARED
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.gyro_hysteresis import LEAST, SHARE, error_and_ideal, play
 from imutool.sensor.effects.low_pass import ORDER, RATE, SMOOTHING, of_one
@@ -16,7 +17,7 @@ from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import SENSORS
 
 HIGHER = 0, 4  # orders that a diagnosis tries, beside the first and the second
-WIDTHS = 0.3, 1.0, 3.0  # of the motion's standard deviation, from where the fit of a share starts
+WIDTHS = 0.3, 1.0  # of the motion's standard deviation, from where the fit of a share starts
 
 
 def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
@@ -112,7 +113,7 @@ def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
     whole = replace(
         effect, parameters=effect.parameters[:1], starts=lambda motion, at: [theta[:1] for theta in whole_starts(motion, at)]
     )
-    return [whole, *([replace(effect, variant="share", starts=of_share)] if exact else [])]
+    return [whole, *([replace(effect, variant=SHARED, starts=of_share)] if exact else [])]
 
 
 def _of_resonance(effect: Effect, *, exact: bool) -> list[Effect]:
