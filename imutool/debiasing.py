@@ -41,11 +41,8 @@ from imutool.mcap_io.rewrite import RewriteReport, Values, rewrite
 from imutool.mcap_io.verify import Verified, check_mode
 from imutool.recording import seconds
 
-SUFFIX = "/debiased"
-CLEAN_RECORD = "imutool_clean"
-DEBIASED_BY = (
-    "debiased_by"  # entry of the record `imutool`: the IMU of the log is a debiased one, of `imutool.debias` of arrays
-)
+SUFFIX, CLEAN_RECORD = "/debiased", "imutool_clean"
+DEBIASED_BY = "debiased_by"  # in the record `imutool`: the log's own IMU is a debiased one, from `imutool.debias` of arrays
 
 logger = logging.getLogger(__name__)
 
@@ -239,8 +236,7 @@ def _debias(
     progress: Callable[[int, int], None] | None,
 ) -> DebiasReport:
     """Debiases an open log: the source itself, or the repaired copy of a damaged one."""
-    model = options.model
-    given = dict(model) if isinstance(model, Mapping) else {} if model is None else {"": model}
+    given = dict(options.model) if isinstance(options.model, Mapping) else {} if options.model is None else {"": options.model}
     topics = model_choice.choose_imus(log, options.imus, given)
     check_new_topics(log, {topic: new_topics(topic) for topic in topics})
     if (by := log.metadata().get("imutool", {}).get(DEBIASED_BY)) and not options.force:

@@ -28,7 +28,7 @@ def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
 
 
 def at_rate(effect: Effect, names: Collection[str]) -> Effect:
-    """A low-pass in the form that has parameters of these names: digital, smoothing, or as it is."""
+    """A low-pass in the form with parameters of these names: digital, smoothing, or as it is."""
     if RATE.name in names:
         return digital(effect)
     return exponential(effect) if SMOOTHING.name in names else effect
