@@ -531,3 +531,21 @@ def test_examples_and_pages_import_the_package_alone() -> None:
                 assert (node.module or "").partition(".")[0] != "imutool" or node.module == "imutool", f"{where}: {node.module}"
             elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "imutool":
                 assert node.attr in imutool.__all__, f"{where} uses imutool.{node.attr}"
+
+
+def test_arrays_are_trained_on_scored_and_diagnosed_as_their_logs_are(logs: Path, tmp_path: Path) -> None:
+    first, second = sorted(logs.glob("*.mcap"))[:2]
+    arrays = [imutool.read(path) for path in (first, second)]
+    models = [
+        imutool.train(given, tmp_path / f"{name}.safetensors", method="linear", settings={"compare": False})
+        for name, given in (("logs", [first, second]), ("arrays", arrays))
+    ]
+    for name, values in models[0].tensors.items():
+        np.testing.assert_array_equal(values, models[1].tensors[name])
+    model = tmp_path / "logs.safetensors"
+    assert imutool.evaluate(arrays[0], models=model) == imutool.evaluate(first, models=model)
+    scaled = replace(arrays[0], imu=imutool.Imu(arrays[0].imu.t_ns, 1.02 * arrays[0].imu.gyro, arrays[0].imu.accel))
+    found = imutool.diagnose(scaled, arrays[0])
+    assert [finding.effect for finding in found.findings] == ["gyro_scale"]
+    with pytest.raises(imutool.errors.ConfigError, match="no log is given"):
+        imutool.train([], tmp_path / "none.safetensors")

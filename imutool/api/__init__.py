@@ -5,13 +5,21 @@ from __future__ import annotations
 import functools
 import inspect
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from numbers import Integral, Real
-from typing import Any, NamedTuple, TypeVar, cast
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 from imutool.errors import ConfigError
 from imutool.file_location import Location, LogPath, location, several
 
+if TYPE_CHECKING:
+    from imutool.recording import Recording
+
+LONGEST_NAME = 100  # of a file for a recording
 Progress = Callable[[int, int], None]  # bytes done, bytes in all
 NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 Init = str | Iterable[float]  # initial bias: the name of a method, or six numbers
@@ -70,15 +78,32 @@ def checked(function: Function) -> Function:
     return cast(Function, call)
 
 
-def given_logs(logs: LogPath | Iterable[LogPath], parameter: str) -> list[Location]:
-    """Files or objects of one log or several.
+@contextmanager
+def given_logs(
+    logs: LogPath | Recording | Iterable[LogPath | Recording], parameter: str, *, least: int = 1
+) -> Iterator[list[Location]]:
+    """Files or objects of one log or several; a recording in memory is a file while they are used.
 
     Raises:
-        ConfigError: none is given, or one is no path.
+        ConfigError: none is given, or one is neither a path nor a recording.
+        DataError: a recording without samples, or of a rate that is none.
     """
-    if places := [location(log) for log in several(logs)]:
-        return places
-    raise ConfigError("no log is given", where=parameter, expected="one or more")
+    from imutool.mcap_io.write import write
+    from imutool.recording import Recording
+
+    places = list[Location]()
+    with ExitStack() as folders:
+        for log in several(logs):
+            if isinstance(log, Recording):
+                log.imu.check_rate(log.name)
+                folder = folders.enter_context(TemporaryDirectory(prefix="imutool-"))
+                places.append(Path(folder) / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', log.name)[:LONGEST_NAME] or parameter}.mcap")
+                write(log, places[-1])
+            else:
+                places.append(location(log))
+        if len(places) < least:
+            raise ConfigError("no log is given", where=parameter, expected="one or more")
+        yield places
 
 
 def init_text(init: Init) -> str:

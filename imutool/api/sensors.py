@@ -13,7 +13,7 @@ from imutool.api import NamedProgress, checked, given_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import along_samples
 from imutool.errors import ConfigError
-from imutool.file_location import LogPath, local, location, several
+from imutool.file_location import LogPath, local, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 from imutool.processes.blas_threads import one_blas_thread
@@ -104,8 +104,8 @@ def simulate(
 
 @checked
 def diagnose(
-    reals: LogPath | Iterable[LogPath],
-    sim: LogPath | None = None,
+    reals: LogPath | Recording | Iterable[LogPath | Recording],
+    sim: LogPath | Recording | None = None,
     *,
     imu: str | None = None,
     truth: str | None = None,
@@ -119,8 +119,8 @@ def diagnose(
     """Find the physics that a simulation lacks: name, size, uncertainty and place.
 
     Args:
-        reals: MCAP logs of recordings. Several share the physics, with one constant bias each.
-        sim: MCAP log of a simulation; by default each recording is compared with its own true poses.
+        reals: MCAP logs, or recordings of arrays. Several share the physics, with one constant bias each.
+        sim: A simulation, likewise; by default each recording is compared with its own true poses.
         imu: IMU topic; needed where a log has several.
         truth: Topic of the true poses; by default the first.
         signals: Other fields to compare, `TOPIC.field`; one recording and its simulation.
@@ -145,14 +145,16 @@ def diagnose(
         >>> [finding.effect for finding in diagnosis.findings]  # doctest: +SKIP
         ['lever_arm']
     """
-    logs, folder = given_logs(reals, "reals"), None if output is None else local(output, "output")
+    folder = None if output is None else local(output, "output")
     if metric is not None and not callable(metric):
         raise ConfigError("`metric` is no function", expected="a function of the path of a simulated log")
-    check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sim], overwrite=overwrite)
-    with one_blas_thread():
+    sim_if_any = [] if sim is None else [sim]
+    with given_logs(reals, "reals") as logs, given_logs(sim_if_any, "sim", least=0) as sims, one_blas_thread():
+        simulated = sims[0] if sims else None
+        check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, simulated], overwrite=overwrite)
         diagnosis, _ = diagnosis_output.diagnose(
             logs,
-            None if sim is None else location(sim),
+            simulated,
             folder,
             imu=imu,
             truth=truth,

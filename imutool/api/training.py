@@ -15,12 +15,13 @@ from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
 
 if TYPE_CHECKING:
+    from imutool.recording import Recording
     from imutool.training.fit import Epoch
 
 
 @checked
 def train(
-    logs: LogPath | Iterable[LogPath],
+    logs: LogPath | Recording | Iterable[LogPath | Recording],
     out: str | Path,
     *,
     method: str = "hybrid",
@@ -35,7 +36,7 @@ def train(
     """Train a bias model on logs of one sensor with true poses, and write it.
 
     Args:
-        logs: MCAP logs; `imutool.write` makes one of arrays.
+        logs: MCAP logs, or recordings of arrays.
         out: Model file to write, `FILE.safetensors`.
         method: `hybrid`, `neural_ode`, `conv` or `linear`.
         settings: Training settings by name, for example `{"steps": 300, "seed": 1}`.
@@ -62,25 +63,26 @@ def train(
     from imutool.training.settings import placed, settings_of
 
     chosen = None if settings is None else build(settings_of(method), placed(method, settings), where="settings")
-    files = [local(log, "logs") for log in given_logs(logs, "logs")]
-    check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [files], overwrite=overwrite)
-    return run(
-        files,
-        local(out, "out"),
-        method=method,
-        settings=chosen,
-        device=device,
-        imu=imu,
-        truth=truth,
-        resume=resume,
-        overwrite=overwrite,
-        progress=progress,
-    )
+    with given_logs(logs, "logs") as places:
+        files = [local(log, "logs") for log in places]
+        check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [files], overwrite=overwrite)
+        return run(
+            files,
+            local(out, "out"),
+            method=method,
+            settings=chosen,
+            device=device,
+            imu=imu,
+            truth=truth,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+        )
 
 
 @checked
 def evaluate(
-    log: str | Path,
+    log: LogPath | Recording,
     *,
     models: Sequence[str | Path] | str | Path = (),
     init: Init = "auto",
@@ -94,7 +96,7 @@ def evaluate(
     """Score pure integration against the true poses, raw and with each model.
 
     Args:
-        log: MCAP log with true poses; `imutool.write` makes one of arrays.
+        log: MCAP log with true poses, or a recording of arrays.
         models: Model files, names of models that ship, or `static`; one, or several.
         init: Initial bias, as in `debias`.
         smooth: Smoothing, as in `debias`.
@@ -123,15 +125,16 @@ def evaluate(
     """
     tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True, of_each="{}_*.tum")
     chosen = several(models)
-    check_outputs([tum], [log, chosen], overwrite=overwrite)
-    return evaluation.evaluate(
-        local(log, "log"),
-        models=chosen,
-        init=init_text(init),
-        smooth=smooth,
-        aid=aid,
-        truth=truth,
-        imu=imu,
-        trajectories=None if trajectories is None else local(trajectories, "trajectories"),
-        overwrite=overwrite,
-    )
+    with given_logs([log], "log") as (place,):
+        check_outputs([tum], [place, chosen], overwrite=overwrite)
+        return evaluation.evaluate(
+            local(place, "log"),
+            models=chosen,
+            init=init_text(init),
+            smooth=smooth,
+            aid=aid,
+            truth=truth,
+            imu=imu,
+            trajectories=None if trajectories is None else local(trajectories, "trajectories"),
+            overwrite=overwrite,
+        )
