@@ -507,3 +507,26 @@ def test_a_place_of_one_of_several_logs_names_it() -> None:
 def test_no_unseen_time_is_not_called_unseen() -> None:
     one = replace(diagnoses.LAG, held_out=HeldOut(0.02, 0.01, "rad/s", 0.0))
     assert "unseen" not in conclusion(replace(diagnoses.LATE, findings=(one,)))
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers", "said"),
+    [
+        (
+            "gyro_hysteresis",
+            {"width": (0.2, "rad/s")},
+            "it follows only once the simulation has moved by 0.200 ± 0.010 rad/s, and",
+        ),
+        ("gyro_hysteresis", {"width": (0.2, "rad/s"), "share": (0.1, "-")}, "10.0 ± 0.5 % of it follows only once"),
+        (
+            "gyro_hysteresis",
+            {"width": (0.2, "rad/s"), "share": (-0.1, "-")},
+            "it shows what moves by less than 0.200 ± 0.010 rad/s",
+        ),
+        ("low_pass", {"f_c": (9.0, "Hz")}, "(first-order low-pass)"),
+        ("low_pass", {"f_c": (9.0, "Hz"), "smoothing_rate": (200.0, "Hz")}, "(exponential smoothing)"),
+    ],
+)
+def test_forms_of_an_effect_have_sentences_of_their_own(effect: str, numbers: dict[str, tuple[float, str]], said: str) -> None:
+    parameters = {name: Estimate(value, 0.05 * abs(value), unit) for name, (value, unit) in numbers.items()}
+    assert said in conclusion(replace(diagnoses.ARM, findings=(finding(effect, parameters, "gyro"),)))

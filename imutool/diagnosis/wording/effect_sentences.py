@@ -133,9 +133,8 @@ def _mount_resonance(w: Words) -> str:
 def _low_pass(w: Words) -> str:
     """Cut-off of a filter, and its order."""
     order = w.finding.parameters.get("order")
-    form = (
-        "first-order low-pass" if order is None else f"low-pass of order {order.value:g}" if order.value else "moving average"
-    )
+    first = "exponential smoothing" if "smoothing_rate" in w.finding.parameters else "first-order low-pass"
+    form = first if order is None else f"low-pass of order {order.value:g}" if order.value else "moving average"
     return f"{w.it} is too slow for what happens above {w.main} ({form})"
 
 
