@@ -38,7 +38,7 @@ def hysteresis(sensor: Sensor, symbol: str, unit: str, plausible: float, observa
         f"{sensor}_hysteresis",
         Stage.SENSOR,
         (sensor,),
-        f"{sensor}(t) = {symbol} where it moves by less than width, else width behind it, on every axis (or a share of it)",
+        f"{sensor}(t) = {symbol} where it moves by less than width, else width behind it, on every axis",
         (Parameter("width", unit, plausible, positive=True, step=LOG_STEP), SHARE),
         observable_if,
         forward,

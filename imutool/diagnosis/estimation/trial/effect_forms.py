@@ -113,7 +113,8 @@ def _of_hysteresis(effect: Effect, *, exact: bool) -> list[Effect]:
     whole = replace(
         effect, parameters=effect.parameters[:1], starts=lambda motion, at: [theta[:1] for theta in whole_starts(motion, at)]
     )
-    return [whole, *([replace(effect, variant=SHARED, starts=of_share)] if exact else [])]
+    of_part = f"share of h(t) and the rest of the ideal reading, h as {effect.equation}"
+    return [whole, *([replace(effect, variant=SHARED, equation=of_part, starts=of_share)] if exact else [])]
 
 
 def _of_resonance(effect: Effect, *, exact: bool) -> list[Effect]:
