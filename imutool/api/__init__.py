@@ -82,7 +82,7 @@ def checked(function: Function) -> Function:
 def given_logs(
     logs: LogPath | Recording | Iterable[LogPath | Recording], parameter: str, *, least: int = 1
 ) -> Iterator[list[Location]]:
-    """Files or objects of one log or several; a recording in memory is a file while they are used.
+    """Files or objects of one log or several; a recording is a file while they are used.
 
     Raises:
         ConfigError: none is given, or one is neither a path nor a recording.

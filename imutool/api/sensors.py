@@ -148,13 +148,12 @@ def diagnose(
     folder = None if output is None else local(output, "output")
     if metric is not None and not callable(metric):
         raise ConfigError("`metric` is no function", expected="a function of the path of a simulated log")
-    sim_if_any = [] if sim is None else [sim]
-    with given_logs(reals, "reals") as logs, given_logs(sim_if_any, "sim", least=0) as sims, one_blas_thread():
-        simulated = sims[0] if sims else None
-        check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, simulated], overwrite=overwrite)
+    given = given_logs(reals, "reals"), given_logs([] if sim is None else [sim], "sim", least=0)
+    with given[0] as logs, given[1] as sims, one_blas_thread():
+        check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sims], overwrite=overwrite)
         diagnosis, _ = diagnosis_output.diagnose(
             logs,
-            simulated,
+            sims[0] if sims else None,
             folder,
             imu=imu,
             truth=truth,
