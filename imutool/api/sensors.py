@@ -151,7 +151,7 @@ def diagnose(
     given = given_logs(reals, "reals"), given_logs([] if sim is None else [sim], "sim", least=0)
     with given[0] as logs, given[1] as sims, one_blas_thread():
         check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sims], overwrite=overwrite)
-        diagnosis, _ = diagnosis_output.diagnose(
+        return diagnosis_output.diagnose(
             logs,
             sims[0] if sims else None,
             folder,
@@ -162,5 +162,4 @@ def diagnose(
             metric=metric,
             overwrite=overwrite,
             tell=progress,
-        )
-    return diagnosis
+        )[0]
