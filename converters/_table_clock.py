@@ -35,10 +35,10 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     gyro = proposal.unsigned("gyro", columns)
     length = len(columns.values[gyro[0]]) if gyro else None
     if "rate_hz" in given:
-        proposal.rate_hz = given["rate_hz"]
-        counter = given.get("counter", "")
+        if counter := given.get("counter", ""):
+            column_named(columns, counter, "mapping")
         if length:
-            proposal.entries |= {"time": count_times(columns, proposal.rate_hz, length, counter), "time_unit": "s"}
+            proposal.entries |= {"time": count_times(columns, given["rate_hz"], length, counter), "time_unit": "s"}
         return
     if "time" in given:
         column_named(columns, given["time"], "mapping")

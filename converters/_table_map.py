@@ -31,6 +31,7 @@ LISTS = {  # entries that name several columns
     "roll_pitch_yaw": (3, "roll, pitch, yaw"),
     "rotation_matrix": (9, "row by row"),
 }
+OF_COUNTS = {"gyro_scale", "gyro_offset", "accel_scale", "accel_offset"}
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
 Entries = dict[str, Any]  # of a map: names, lists of names, numbers
@@ -74,7 +75,7 @@ def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
     """Entries that a TOML file or a program states; a text `a,b,c` is a list, too.
 
     Raises:
-        ConfigError: unreadable, no TOML, an unknown entry, an unknown unit, or no three columns.
+        ConfigError: unreadable, no TOML, an unknown entry or unit, no three columns, or a scale without units.
     """
     where = mapping if isinstance(mapping, Path) else "mapping"
     values = _toml(mapping) if isinstance(mapping, Path) else dict(mapping)
@@ -95,6 +96,9 @@ def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
             raise ConfigError(f"{name} is {given[name]!r}", where=where, expected=f"one of {', '.join(units)}")
     if "rate_hz" in given and ("time" in given or not 0.0 < given["rate_hz"] < np.inf):
         raise ConfigError("has to name a time or a positive rate_hz", where=where, expected="`time`, or `rate_hz`")
+    if not given.keys().isdisjoint(OF_COUNTS) and not {"gyro_unit", "accel_unit"} <= given.keys():
+        what = f"{min(OF_COUNTS & given.keys())} without both units: the values alone no longer show them"
+        raise ConfigError(what, where=where, expected="`gyro_unit` and `accel_unit`")
     for name, (count, of) in LISTS.items():
         if name in given and not isinstance(given[name], str) and len(given[name]) != count:
             raise ConfigError(f"{name} names {len(given[name])} columns", where=where, expected=f"{count}: {of}")
@@ -127,6 +131,7 @@ class Proposal(msgspec.Struct):
     def state(self, given: Entries) -> None:
         """Enter what the user states; it is open no more."""
         self.entries |= {name: value for name, value in given.items() if name != "rate_hz"}
+        self.rate_hz = given.get("rate_hz", self.rate_hz)
         self.open[:] = [name for name in self.open if name not in given]
         self.reasons[:] = [each for each in self.reasons if each not in (NO_UNIT.format(name[:-5]) for name in given)]
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from imutool.diagnosis.estimation.jacobians import Chosen
-from imutool.diagnosis.estimation.trial.effect_forms import at_rate
+from imutool.diagnosis.estimation.trial.effect_forms import low_pass_with
 from imutool.diagnosis.result import CONVENTIONS, Diagnosis, Estimate, Finding
 from imutool.noise.colour import measured
 from imutool.noise.datasheet import Noise
@@ -42,7 +42,7 @@ def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> C
 
 def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect, Theta]:
     """An effect with found values; a low-pass is digital, or smoothing, if its rate was found."""
-    effect = at_rate(effect, parameters) if effect.lagless is not None else effect
+    effect = low_pass_with(effect, parameters) if effect.lagless is not None else effect
     values = [parameters[of.name].value if of.name in parameters else of.null_value for of in effect.parameters]
     return effect, np.array(values)
 

@@ -451,6 +451,9 @@ def test_a_map_states_what_is_open_and_the_table_shows_the_rest(tmp_path, stated
         ({"gyro_unit": "rpm"}, "gyro_unit is 'rpm'"),
         ({"gyro_unit": ""}, "state no unit of the gyro"),
         ({"rate_hz": float("nan")}, "a positive rate_hz"),
+        ({"rate_hz": 100.0, "counter": "n"}, "no column 'n'"),
+        ({"gyro_scale": 0.01}, "gyro_scale without both units"),
+        ({"accel_offset": 512.0, "gyro_unit": "rad/s"}, "accel_offset without both units"),
         ({"gyro_unti": "deg/s"}, "did you mean"),
     ],
 )

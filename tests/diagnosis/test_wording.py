@@ -521,7 +521,7 @@ def test_no_unseen_time_is_not_called_unseen() -> None:
         (
             "gyro_hysteresis",
             {"width": (0.2, "rad/s"), "share": (-0.1, "-")},
-            "it shows what moves by less than 0.200 ± 0.010 rad/s",
+            "it reads motion of less than 0.200 ± 0.010 rad/s larger",
         ),
         ("low_pass", {"f_c": (9.0, "Hz")}, "(first-order low-pass)"),
         ("low_pass", {"f_c": (9.0, "Hz"), "smoothing_rate": (200.0, "Hz")}, "(exponential smoothing)"),

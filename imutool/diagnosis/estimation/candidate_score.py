@@ -17,7 +17,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, effect_jacobian, priors
 from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
-from imutool.diagnosis.estimation.trial.effect_forms import at_rate
+from imutool.diagnosis.estimation.trial.effect_forms import low_pass_with
 from imutool.diagnosis.estimation.trial.lag_start import lag_taken_back
 from imutool.diagnosis.estimation.unnamed_effects import finer_curve
 from imutool.diagnosis.estimation.whitening import WhitenedLog
@@ -268,7 +268,7 @@ def restored(described: Portable, like: Fit, effects: Sequence[Effect]) -> Fit:
     """Fit as another process described it; finer curves are made again."""
     by_key, chosen = {effect.key: effect for effect in effects}, list[tuple[Effect, Theta]]()
     for key, names, theta in described.chosen:
-        whole = at_rate(by_key[key], names)
+        whole = low_pass_with(by_key[key], names)
         free = [k for k, parameter in enumerate(whole.parameters) if parameter.name in names]
         effect = with_free(whole, free) if len(free) == len(names) else finer_curve(like.logs, whole)
         assert effect is not None, f"{key} was made from the same samples"

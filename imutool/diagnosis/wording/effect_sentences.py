@@ -119,7 +119,7 @@ def _hysteresis(w: Words) -> str:
     if share is None:
         return f"{w.it} follows only once {w.other} has moved by {w.main}, and stays that far behind"
     if share.value < 0.0:
-        return f"{w.it} shows what moves by less than {w.main} larger than what moves more"
+        return f"{w.it} reads motion of less than {w.main} larger than wider motion"
     return f"{w.rest[0] if w.rest else 'a part'} of it follows only once {w.other} has moved by {w.main}"
 
 

@@ -27,7 +27,7 @@ def in_forms(found: Iterable[Effect], *, exact: bool) -> list[Effect]:
     return [*found]
 
 
-def at_rate(effect: Effect, names: Collection[str]) -> Effect:
+def low_pass_with(effect: Effect, names: Collection[str]) -> Effect:
     """A low-pass in the form with parameters of these names: digital, smoothing, or as it is."""
     if RATE.name in names:
         return digital(effect)
