@@ -258,7 +258,7 @@ EFFECT = Effect(
     "low_pass",
     Stage.BANDWIDTH,
     ("gyro", "accel"),
-    "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel (at a rate: bilinear, or y += k (x - y))",
+    "d gyro/dt = 2 pi f_c (omega - gyro), and likewise accel (at a rate: bilinear)",
     (Parameter("f_c", "Hz", 20.0, positive=True, null_value=math.inf), RATE, ORDER, SMOOTHING),
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,

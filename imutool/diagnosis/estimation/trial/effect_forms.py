@@ -49,6 +49,7 @@ def exponential(of_analog: Effect) -> Effect:
 
     return replace(
         of_analog,
+        equation="y += (1 - exp(-2 pi f_c / smoothing_rate)) (x - y) at each sample x, y read in its place",
         parameters=(*of_analog.parameters, SMOOTHING),
         forward=lambda motion, theta: of_analog.forward(motion, full(theta)),
         lagless=lambda motion, theta: lagless(motion, full(theta)),
