@@ -85,7 +85,7 @@ class OnlineDebiaser:
 
     `start` is a bias of `imutool.bias_at_rest`, over the first seconds for instance. Without `start` it begins at the prior and
     tracks the rest bias, as `init="auto"` does. If the model's bias follows the temperature, give it (°C) with the samples that
-    have one. With `with_covariance` each sample has a `covariance`, for an estimator of yours, and takes several times as long.
+    have one. With `with_covariance` each sample has a `covariance`, for an estimator of yours, and takes longer.
 
     Raises:
         ConfigError: another type, or the covariance of a model that follows the temperature.
