@@ -13,6 +13,7 @@ from ._table_text import Columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
+EITHER_WAY = ", and as well the other way; the motion is about too few axes to tell"
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
 QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
@@ -168,13 +169,19 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
     """Entries of the rotations of a group: quaternions, or angles that turn as the gyro does."""
     arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
     q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
-    if not q and (four := _axes(QUATERNION_ARRAY, leaves, "0123")) and (q := order_by_motion(columns, entries, four, clock)):
-        reasons.append(f"{', '.join(four)} turn as the gyro does in the order {'wxyz' if q == four else 'xyzw'}")
+    if not q and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
+        q, is_shown = order_by_motion(columns, entries, four, clock)
+        if q:
+            order = "wxyz" if q == four else "xyzw"
+            reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}{'' if is_shown else EITHER_WAY}")
     if q:
         return {"quaternion_wxyz": q}
-    if (nine := _matrix(leaves)) and (rows := matrix_by_motion(columns, entries, nine, clock)):
-        reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{'' if rows == nine else ', transposed'}")
-        return {"rotation_matrix": rows}
+    if nine := _matrix(leaves):
+        rows, is_shown = matrix_by_motion(columns, entries, nine, clock)
+        if rows:
+            way = "" if rows == nine else ", transposed"
+            reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{way}{'' if is_shown else EITHER_WAY}")
+            return {"rotation_matrix": rows}
     found = next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in _angles(leaves))), {})
     if found:
         reasons.append(f"{', '.join(found['roll_pitch_yaw'])} turn as the gyro does, as roll, pitch and yaw")

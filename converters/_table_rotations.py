@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -76,21 +77,36 @@ def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Boo
     return ~missing & ~off, notes
 
 
-def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> list[str]:
-    """Columns w, x, y, z of an array that turns as the gyro does; empty where not certain."""
-    values, gyro, at_s = columns.side_by_side(array), _GyroTurns.of(columns, entries), _seconds(columns, clock)
-    found = [_turns_alike(gyro, values[:, order], at_s)[0] for order in ORDERS]
-    best = int(np.argmax(found))
-    return [array[axis] for axis in ORDERS[best]] if found[best] > SURE and _is_clear(found[best], min(found)) else []
+def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
+    """Columns w, x, y, z of an array that turns as the gyro, and whether it shows the order."""
+    values = columns.side_by_side(array)
+    best, is_shown = _way_by_motion(columns, entries, [values[:, order] for order in ORDERS], clock)
+    return ([] if best is None else [array[axis] for axis in ORDERS[best]]), is_shown
 
 
-def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> list[str]:
-    """Nine columns of a matrix or its transpose that turns as the gyro does; else none."""
+def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
+    """Nine columns of a matrix or its transpose that turns as the gyro; whether it shows which."""
     ways = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
+    rotations = [_rotations(columns, {"rotation_matrix": way}) for way in ways]
+    best, is_shown = _way_by_motion(columns, entries, rotations, clock)
+    return ([] if best is None else ways[best]), is_shown
+
+
+def _way_by_motion(
+    columns: Columns, entries: Entries, ways: Sequence[Float64[np.ndarray, "n 4"]], clock: tuple[str, str]
+) -> tuple[int | None, bool]:
+    """Which of two readings of a rotation turns as the gyro does, and whether motion shows it.
+
+    A quaternion in the other order is the inverse rotation in other frames, as is the transpose of a matrix. Motion about one
+    or two axes fits both. Then the reading counts that turns about the gyro's own axes, and without one the first.
+    """
     gyro, at_s = _GyroTurns.of(columns, entries), _seconds(columns, clock)
-    found = [_turns_alike(gyro, _rotations(columns, {"rotation_matrix": way}), at_s)[0] for way in ways]
-    best = int(np.argmax(found))
-    return ways[best] if found[best] > SURE and _is_clear(found[best], min(found)) else []
+    turns = [_turns_alike(gyro, way, at_s) for way in ways]
+    for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
+        best = int(np.argmax(found))
+        if found[best] > SURE and _is_clear(found[best], min(found)):
+            return best, True
+    return (0 if min(turn.correlation for turn in turns) > SURE else None), False
 
 
 def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock: tuple[str, str]) -> Entries:
@@ -108,7 +124,7 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
     for span_s, delay_s in product(SPANS_S, DELAYS_S if clock[0] != entries["time"] else (0.0,)):
         found = {}
         for way, q_wxyz in turns.items():
-            correlation, ratio = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
+            correlation, ratio, _ = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
             is_alike = not size or 1.0 / MOST_OFF < correlation * ratio / size < MOST_OFF
             found[way] = correlation if is_alike else 0.0
         unit, yaw = max(found, key=lambda way: found[way])
@@ -140,7 +156,7 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     q_wxyz, gyro = _rotations(columns, entries), _GyroTurns.of(columns, entries)
     at_s = _seconds(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
     for span_s in (SPAN_S, LONG_SPAN_S):
-        correlation, ratio = _turns_alike(gyro, q_wxyz, at_s, span_s)
+        correlation, ratio, _ = _turns_alike(gyro, q_wxyz, at_s, span_s)
         slope = correlation * ratio  # of the poses' turns by the gyro's: noise of the poses does not bias it
         near = [unit for unit, size in GYRO_SI.items() if 1.0 / MOST_OFF < slope / size < MOST_OFF]
         if correlation > LIKELY and near:
@@ -183,12 +199,20 @@ class _GyroTurns(NamedTuple):
         return cls(t, np.concatenate([np.zeros((min(len(t), 1), 3)), np.cumsum(steps, axis=0)]))
 
 
+class _Alike(NamedTuple):
+    """Turns of poses beside the gyro's."""
+
+    correlation: float  # under the best rotation between poses and gyro
+    ratio: float  # of the sizes, poses by gyro
+    same_axes: float  # correlation without a rotation
+
+
 def _turns_alike(
     gyro: _GyroTurns, q_wxyz: Float64[np.ndarray, "n 4"], at_s: Float64[np.ndarray, " n"], span_s: float = SPAN_S
-) -> tuple[float, float]:
-    """Correlation of the poses' turns with the gyro's under the best rotation between them, and the ratio of their sizes."""
+) -> _Alike:
+    """How far the poses turn as the gyro does; a correlation of zero where they share too little time."""
     if not len(gyro.t_s):
-        return 0.0, 0.0
+        return _Alike(0.0, 0.0, 0.0)
     inside = (at_s >= gyro.t_s[0]) & (at_s <= gyro.t_s[-1])
     at, q = at_s[inside], q_wxyz[inside]
     size = np.sqrt((q**2).sum(axis=1))
@@ -199,7 +223,7 @@ def _turns_alike(
     spans = np.diff(at)
     kept = (spans > 0.0) & (spans < MOST_SPANS * span_s)
     if spans[kept].sum() < LEAST_S:
-        return 0.0, 0.0
+        return _Alike(0.0, 0.0, 0.0)
     turned = quaternion.log(quaternion.multiply(quaternion.inverse(q[:-1]), q[1:]))[kept]
     measured = np.diff(np.stack([np.interp(at, gyro.t_s, angle) for angle in gyro.angles.T], axis=1), axis=0)[kept]
     turned, measured = turned - turned.mean(axis=0), measured - measured.mean(axis=0)
@@ -207,7 +231,9 @@ def _turns_alike(
     singular = np.linalg.svd(product, compute_uv=False)
     together = singular[0] + singular[1] + np.sign(np.linalg.det(product)) * singular[2]
     power = (turned**2).sum(), (measured**2).sum()
-    return float(together / max(np.sqrt(power[0] * power[1]), 1e-30)), float(np.sqrt(power[0] / max(power[1], 1e-30)))
+    size = max(np.sqrt(power[0] * power[1]), 1e-30)
+    ratio = np.sqrt(power[0] / max(power[1], 1e-30))
+    return _Alike(float(together / size), float(ratio), float(np.trace(product) / size))
 
 
 def _seconds(columns: Columns, clock: tuple[str, str]) -> Float64[np.ndarray, " n"]:

@@ -21,10 +21,10 @@ from imutool.bias_start.initial_bias import (
     TRACKED_BY,
     InitialBias,
     accuracy,
-    bias_over,
     bias_prior,
     prior,
     relative_samples,
+    smooth_bias,
     tracked_from_prior,
     training_source,
 )
@@ -34,50 +34,56 @@ from imutool.inertial.inertial_filter import LEAST_FORCE_M_S2
 from imutool.inertial.stationary import Blocks, rest_stretches, resting_blocks, white_noise
 from imutool.recording import GRAVITY_M_S2, Imu, nanoseconds
 
+LOOK_AHEAD_S = 60.0  # in which a log that begins in motion may stop: what the start of a command reads
 REST_BEGINS_WITHIN_S = 5.0  # a later stop would give a bias from the future
 MOST_UNKNOWN = 1e-3  # rad/s, deviation of a bias that may be left unknown: 3 degrees in a minute
 PIECE = 512  # samples, of which the search for a stop takes no more than it needs
 
 
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
-    """Bias from the stop at the log's start and the training runs, tracked from there on.
+    """Bias from the first stop of the first minute and the training runs, then tracked.
 
-    Only the samples up to the end of that stop are used.
+    Samples up to the end of that stop get what all of them show, later ones what earlier samples show.
 
     Raises:
         DataError: an untrained model, and the log does not start at rest.
     """
-    before = bias_prior(model, int(imu.t_ns[0]) if len(imu) else None)
-    rest_blocks = _first_stop(model, imu, before)
-    if not rest_blocks:
-        if not model.card:
-            raise _no_rest()
-        return tracked_from_prior(model, int(imu.t_ns[0]))
-    end_s = rest_blocks[-1].end_s
-    stop = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, imu.t_ns[0] + nanoseconds(end_s)))))
-    t_s, gyro, accel = relative_samples(stop)
-    u = np.concatenate([gyro, accel], axis=1)
-    difference = (u - model.stream(before.mean)(t_s, gyro, accel)).mean(axis=0)
-    wide = widened(before.std, difference, _at_rest_variance(model, u))
+    first_ns = int(imu.t_ns[0]) if len(imu) else 0
+    imu = imu.rows(slice(0, int(np.searchsorted(imu.t_ns, first_ns + nanoseconds(LOOK_AHEAD_S)))))
+    before = bias_prior(model, first_ns if len(imu) else None)
+    blocks = _up_to_first_stop(model, imu, before)
+    if not model.card and not (blocks and blocks[0].resting):
+        raise _no_rest()
+    if not blocks:
+        return tracked_from_prior(model, first_ns)
+    begin_s, end_s = next(block.start_s for block in blocks if block.resting), blocks[-1].end_s
+    t_s, gyro, accel = relative_samples(imu.rows(slice(0, int(np.searchsorted(imu.t_ns, first_ns + nanoseconds(end_s))))))
+    u, at_stop = np.concatenate([gyro, accel], axis=1), t_s >= begin_s
+    difference = (u - model.stream(before.mean)(t_s, gyro, accel))[at_stop].mean(axis=0)
+    wide = widened(before.std, difference, _at_rest_variance(model, u[at_stop]))
     if (wide > before.std).any():
         before = replace(before, std=wide)
         # a stop of a single block ends before the filter closes it: take as many blocks of the log itself
-        again = itertools.islice(filter_blocks(model, _pieces(imu), before), len(rest_blocks))
-        rest_blocks = _first_stop(model, stop, before) or list(again)
-    last = [rest_blocks[-1].step.after] * 2
+        blocks = list(itertools.islice(filter_blocks(model, _pieces(imu), before), len(blocks)))
+    track = None if blocks[0].resting else smooth_bias(model, [(t_s, gyro, accel)], before).track
+    last = [blocks[-1].step.after] * 2
     (rest, _), (_, P) = before.supported(last, np.full(2, end_s), np.array([True, False]))
     std = np.sqrt(np.diag(P))  # in motion, where the bias is used
-    noise = white_noise(u)
-    source = f"{end_s - rest_blocks[0].start_s:.1f} s at rest from 0.0 s on"
+    source = f"{end_s - begin_s:.1f} s at rest from {begin_s:.1f} s on"
     if model.card:
         source = f"{source}, {training_source(model)}"
     how = f"{source}, {accuracy(std)}, then {TRACKED_BY}"
-    return InitialBias(rest, std, how, noise, follows=before, hold_s=end_s)
+    return InitialBias(rest, std, how, white_noise(u[at_stop]), track, before, end_s)
 
 
-def _first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:
-    """Filtered blocks of the stop at the beginning of some samples; none if they begin in motion."""
-    return list(itertools.takewhile(lambda b: b.resting, filter_blocks(model, _pieces(imu), before)))
+def _up_to_first_stop(model: BiasModel, imu: Imu, before: BiasPrior) -> list[FilteredBlock]:
+    """Filtered blocks of some samples up to the end of their first stop; none if they never rest."""
+    found: list[FilteredBlock] = []
+    for block in filter_blocks(model, _pieces(imu), before):
+        if found and found[-1].resting and not block.resting:
+            return found
+        found.append(block)
+    return found if found and found[-1].resting else []
 
 
 def _pieces(imu: Imu) -> Iterator[Samples]:
@@ -106,7 +112,11 @@ def at_rest(model: BiasModel, imu: Imu) -> InitialBias:
     if bounds is None:
         raise _no_rest()
     start, samples = prior(model, int(imu.t_ns[0])), imu.rows(slice(*bounds))
-    residual = np.concatenate([samples.gyro, samples.accel], axis=1) - bias_over(model, samples, start.rest) + start.rest
+    residual = (
+        np.concatenate([samples.gyro, samples.accel], axis=1)
+        - model.stream(start.rest)(*relative_samples(samples))
+        + start.rest
+    )
     mean = residual.mean(axis=0)
     squares = ((residual - mean) ** 2).sum(axis=0)
     stretch = _RestStretch(mean, squares, len(samples), int(samples.t_ns[0]), int(samples.t_ns[-1]))

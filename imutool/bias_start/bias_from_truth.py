@@ -16,9 +16,9 @@ from imutool.bias_start.initial_bias import (
     TRACKED_BY,
     InitialBias,
     accuracy,
-    bias_over,
     bias_prior,
     prior,
+    relative_samples,
 )
 from imutool.bias_start.prior_width import supported_std
 from imutool.errors import DataError
@@ -66,7 +66,7 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     piece, poses = imu.rows(rows), poses.rows(rows)
     assert poses.v_w is not None
     start = prior(model, int(imu.t_ns[0]))
-    residual = np.concatenate([piece.gyro, piece.accel], axis=1) - bias_over(model, piece, start.rest)
+    residual = np.concatenate([piece.gyro, piece.accel], axis=1) - model.stream(start.rest)(*relative_samples(piece))
     mount_std = 0.0 if model.card else MOUNT_STD  # a trained model knows it
     offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows], mount_std)
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.bias.model import GAP_S, BiasEstimate, BiasModel, Vector6
+from imutool.bias.model import GAP_S, BiasEstimate, BiasModel
 from imutool.bias_start.prior_width import MOST_CHANGE, MOST_DEVIATIONS, BiasPrior
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State, Step
@@ -180,13 +180,13 @@ class TrackedBiasStream:
 
     Row k depends on samples up to k, and on the start.
 
-    Until `hold_s` the rest bias is `rest`, measured on the whole stop at the log's start.
+    Until `hold_s` the rest bias is that of `held`, which was measured up to then.
     """
 
-    def __init__(self, model: BiasModel, prior: BiasPrior, rest: Vector6, hold_s: float) -> None:
+    def __init__(self, model: BiasModel, prior: BiasPrior, held: BiasTrajectory, hold_s: float) -> None:
         self._motion, self._mean = model.stream(prior.mean), prior.mean
         self.filter = BiasFilter(prior)
-        self._rest, self._now, self._hold_s, self._prior = rest, rest, hold_s, prior
+        self._held, self._now, self._hold_s, self._prior = held, held.rest[0], hold_s, prior
         self._covariance = np.diag(prior.std**2)
 
     def __call__(
@@ -211,7 +211,8 @@ class TrackedBiasStream:
             rest, covariance = rest[row], covariance[row]
         else:
             rest, covariance = np.repeat(rest, len(bias), axis=0), np.repeat(covariance, len(bias), axis=0)
-        rest[t_s < self._hold_s] = self._rest
+        if (early := t_s < self._hold_s).any():
+            rest[early], covariance[early] = self._held.at(t_s[early]), _diagonal(self._held.std_at(t_s[early]) ** 2)
         return BiasEstimate(bias + rest, covariance)
 
 
@@ -233,9 +234,13 @@ class TrajectoryBiasStream:
         self, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
     ) -> BiasEstimate:
         """Bias at each sample, and the smoother's variances of the rest bias."""
-        covariance = np.zeros((len(t_s), 6, 6))
-        covariance[:, range(6), range(6)] = self.track.std_at(t_s) ** 2
-        return BiasEstimate(self(t_s, gyro, accel), covariance)
+        return BiasEstimate(self(t_s, gyro, accel), _diagonal(self.track.std_at(t_s) ** 2))
+
+
+def _diagonal(variance: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6 6"]:
+    covariance = np.zeros((len(variance), 6, 6))
+    covariance[:, range(6), range(6)] = variance
+    return covariance
 
 
 def filter_blocks(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> Iterator[FilteredBlock]:

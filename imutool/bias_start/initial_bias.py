@@ -7,7 +7,7 @@ add a motion-dependent part C(u): the measurement then uses the samples without 
 
 With `auto` and `truth` the rest bias is tracked after the start, by every stop and by gravity in motion
 (`imutool.bias_start.bias_tracking`): the bias of a sample depends on that sample and earlier ones. One exception: samples of
-the measured stretch (the stop at the start of the log, or the first seconds of truth) get the estimate from the whole stretch.
+the measured stretch (up to the first stop's end, or the first seconds of truth) get the estimate from the whole stretch.
 `smooth` uses the whole log for each sample.
 """
 
@@ -65,8 +65,8 @@ class InitialBias:
     """Rest bias (gyro rad/s, accel m/s²) with standard deviation, and its source in words.
 
     It is valid for the whole log, unless `track` or `follows` is set. `track` is the rest bias over time. `follows` is the
-    prior before the first sample: the rest bias is then tracked from `hold_s` seconds after the first sample. With
-    `least`, the standard deviation of a prior lies between that and `std`.
+    prior before the first sample: the rest bias is then tracked from `hold_s` seconds after the first sample, and before
+    them it is `track` or `rest`. With `least`, the standard deviation of a prior lies between that and `std`.
     """
 
     rest: Vector6
@@ -89,19 +89,19 @@ class InitialBias:
 
     def stream(self, model: BiasModel) -> Stream:
         """Bias stream of a model from this start."""
-        if self.track is not None:
-            return TrajectoryBiasStream(model, self.track)
-        if self.follows is not None:
-            return TrackedBiasStream(model, self.follows, self.rest, self.hold_s)
-        return model.stream(self.rest)
+        return self._tracked(model) or model.stream(self.rest)
 
     def estimator(self, model: BiasModel) -> RestBiasEstimator:
         """Bias stream of a model from this start, with the covariance of the rest bias."""
+        return self._tracked(model) or ConstantBiasStream(model, self.rest, self.std)
+
+    def _tracked(self, model: BiasModel) -> TrackedBiasStream | TrajectoryBiasStream | None:
+        if self.follows is not None:
+            held = self.track or BiasTrajectory(np.zeros(1), self.rest[None], self.std[None])
+            return TrackedBiasStream(model, self.follows, held, self.hold_s)
         if self.track is not None:
             return TrajectoryBiasStream(model, self.track)
-        if self.follows is not None:
-            return TrackedBiasStream(model, self.follows, self.rest, self.hold_s)
-        return ConstantBiasStream(model, self.rest, self.std)
+        return None
 
     @property
     def tracked(self) -> bool:
@@ -209,15 +209,11 @@ def smoothed_start(model: BiasModel, batches: Iterable[Samples], where: str = ""
         DataError: less than half a second of samples.
         NoRestError: an untrained model, and a log that never rests.
     """
-    before = bias_prior(model, first_ns)
-    track, rested_s, difference, variance = smooth_bias(model, batches, before)
+    track, rested_s, *_ = smooth_bias(model, batches, bias_prior(model, first_ns))
     if not len(track.t_s):
         raise DataError("too short to be smoothed", where=where, expected="at least half a second of samples")
     if not model.card and not rested_s:
         raise NoRestError("the log never rests", where=where, expected="1.5 s or more without motion")
-    std = supported_std(before.std, before.least, difference, variance)
-    if not np.array_equal(std, before.std):
-        track, *_ = smooth_bias(model, batches, replace(before, std=std))
     std = np.median(track.std, axis=0)
     parts = [f"{rested_s:.1f} s at rest in all"] * (rested_s > 0) + ["gravity in motion"]
     parts += [training_source(model)] * bool(model.card)
@@ -265,11 +261,6 @@ def model_samples(model: BiasModel, imu: Imu) -> Samples:
     return relative_samples(without_drift(model, imu if good.all() else imu.rows(good)))
 
 
-def bias_over(model: BiasModel, imu: Imu, rest: Vector6) -> Float64[np.ndarray, "n 6"]:
-    """Bias of a model over some samples, from a rest bias."""
-    return model.stream(rest)(*relative_samples(imu))
-
-
 class SmoothedBias(NamedTuple):
     """Smoothed rest bias, time at rest, and what the log alone shows of the bias at its start.
 
@@ -283,10 +274,18 @@ class SmoothedBias(NamedTuple):
 
 
 def smooth_bias(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:
-    """Smoothed rest bias over a whole log; memory: thirteen numbers per block.
+    """Smoothed rest bias over some samples; memory: thirteen numbers per block.
 
-    The trajectory is empty for a log shorter than a block.
+    The samples decide on the prior's width: they are iterated again if they contradict it. The trajectory is empty for less
+    than a block.
     """
+    found = _smoothed(model, batches, prior)
+    std = supported_std(prior.std, prior.least, found.difference, found.variance)
+    kept = np.array_equal(std, prior.std)
+    return found if kept else found._replace(track=_smoothed(model, batches, replace(prior, std=std)).track)
+
+
+def _smoothed(model: BiasModel, batches: Iterable[Samples], prior: BiasPrior) -> SmoothedBias:
     rows, rested_s, first = [], 0.0, None
     for block, state in smooth_blocks(filter_blocks(model, batches, prior)):
         first = state if first is None else first

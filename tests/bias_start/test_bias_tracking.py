@@ -14,6 +14,7 @@ from support.nees import consistency
 
 from imutool.bias import static
 from imutool.bias.model import BiasModel
+from imutool.bias_start.bias_at_rest import auto
 from imutool.bias_start.bias_tracking import (
     CHUNK_S,
     BiasFilter,
@@ -42,6 +43,7 @@ SENSOR = {
 }
 SETTINGS = FlightSettings(**SENSOR, room_m=0.6, position_knot_s=0.9, tilt_rad=0.25)  # speeds of about 1 m/s
 KNOWN = BiasPrior(np.zeros(6), PRIOR, GROUND)
+NOTHING_HELD = BiasTrajectory(np.zeros(1), np.zeros((1, 6)), np.tile(PRIOR, (1, 1)))
 SEEDS = range(12)
 BOUND = 0.999  # of chi-square: one run of this suite in a thousand would fail by chance, were the seeds not fixed
 
@@ -165,6 +167,28 @@ def test_rest_at_the_end_is_seen_by_smoothing_and_not_before() -> None:
     assert np.linalg.norm(track.rest[late, :3] - bias[:3]) < np.linalg.norm(causal[late].step.after.bias[:3] - bias[:3])
 
 
+def test_a_log_that_begins_in_motion_gets_up_to_its_first_stop_what_that_shows() -> None:
+    """A later stop than the first minute's is not waited for, and after the stop nothing is known before it is measured."""
+    made = model()
+    made.card = {"name": "m", "logs": [{}] * 6}
+    made.tensors["prior_std"][:], made.tensors["rest_std"][:] = PRIOR, GROUND
+    errors, priors, covariances = [], [], []
+    for seed in SEEDS:
+        imu = biased(seed, duration_s=40.0, still_s=6.0, backwards=True)
+        start = auto(made, imu)
+        assert " s at rest from 3" in start.how
+        found = start.estimator(made).estimate(*samples(imu))
+        middle = len(imu) // 2
+        errors.append((found.bias[middle] - planted(seed)[0])[:3])
+        priors.append(planted(seed)[0][:3])
+        covariances.append(found.covariance[middle, :3, :3])
+    assert np.std(errors) < 0.5 * np.std(priors)
+    assert consistency(np.array(errors), np.array(covariances), BOUND)["nees_mean"] < 4.0
+    late = auto(made, biased(1, duration_s=80.0, still_s=6.0, backwards=True))
+    assert late.track is None
+    assert "at rest" not in late.how
+
+
 def test_smoothing_is_never_less_sure() -> None:
     imu = biased(5, still_s=4.0)
     blocks = forward(imu)
@@ -196,7 +220,7 @@ def test_nothing_later_changes_what_came_before() -> None:
         np.concatenate([imu.gyro[:cut], other.gyro[cut:]]),
         np.concatenate([imu.accel[:cut], 2.0 * other.accel[cut:]]),
     )
-    one, two = (TrackedBiasStream(model(), KNOWN, np.zeros(6), 0.0)(*samples(some)) for some in (imu, changed))
+    one, two = (TrackedBiasStream(model(), KNOWN, NOTHING_HELD, 0.0)(*samples(some)) for some in (imu, changed))
     np.testing.assert_array_equal(one[:cut], two[:cut])
     assert np.abs(one[cut + 200 :] - two[cut + 200 :]).max() > 1e-5
 
@@ -204,8 +228,8 @@ def test_nothing_later_changes_what_came_before() -> None:
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_batches_of_any_size_give_the_same_numbers(size: int) -> None:
     t, gyro, accel = samples(biased(9, duration_s=12.0, still_s=3.0))
-    whole = TrackedBiasStream(model(), KNOWN, np.zeros(6), 0.0)(t, gyro, accel)
-    stream = TrackedBiasStream(model(), KNOWN, np.zeros(6), 0.0)
+    whole = TrackedBiasStream(model(), KNOWN, NOTHING_HELD, 0.0)(t, gyro, accel)
+    stream = TrackedBiasStream(model(), KNOWN, NOTHING_HELD, 0.0)
     parts = [stream(t[a : a + size], gyro[a : a + size], accel[a : a + size]) for a in range(0, len(t), size)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     assert len(np.unique(whole[:, 0])) > 15

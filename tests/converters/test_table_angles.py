@@ -278,3 +278,24 @@ def test_further_forms_of_tables(tmp_path, form):
     np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-5)
     np.testing.assert_allclose(imu.accel, accel, atol=1e-4)
     np.testing.assert_allclose(imu.t_ns, t_ns, atol=500)
+
+
+@pytest.mark.parametrize("mounted", [False, True])
+@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+def test_numbered_quaternions_of_a_motion_about_one_axis_are_poses_in_the_gyros_axes(tmp_path, order, mounted):
+    """Another order is the inverse rotation, which turns about the same axis the other way: only the gyro's own axis tells."""
+    yaw = Rotation.from_rotvec(np.sin(0.7 * T_S)[:, None] * [0.0, 0.0, 1.0])
+    gyro = np.zeros((COUNT, 3))
+    gyro[:, 1 if mounted else 2] = 0.7 * np.cos(0.7 * T_S)
+    names = ",".join(f"mocap_orientation_{k}" for k in range(4))
+    q = yaw.as_quat(scalar_first=order == "wxyz")
+    (tmp_path / "log.csv").write_text(
+        f"time [s],{names},acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z\n" + rows(T_S, q, ACCEL, np.rad2deg(gyro))
+    )
+    log = read(tmp_path / "log.csv")
+    (imu,), (poses,) = log.imus.values(), log.poses.values()
+    assert np.abs(imu.gyro - gyro).max() < 1e-5, "the poses show that it counts degrees"
+    either_way = any("and as well the other way; the motion is about too few axes to tell" in n for n in log.remarks.notes)
+    assert either_way == mounted
+    right = np.abs((Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * yaw.inv()).as_rotvec()).max() < 1e-5
+    assert right == (order == "wxyz" or not mounted)
