@@ -114,14 +114,27 @@ def _tell(report: ConvertReport, common: Common) -> None:
         for path in report.written:
             say(str(path))
     if not common.quiet:
-        for note in report.notes:
+        for note in _grouped(report.notes):
             tell_warning(note, "note")
-    for loss in report.losses:
+    for loss in _grouped(report.losses):
         tell_warning(loss)
+    told: set[str] = set()
     for failure in report.failures:
-        tell_error(with_flags(failure.message))
+        first, _, others = failure.message.partition("\n")
+        tell_error(with_flags(f"{first} the same as above" if others in told else failure.message))
+        told.update(filter(None, [others]))
     if report.failures or report.losses:
         raise typer.Exit(DataError.exit_code if report.failures else LOST)
+
+
+def _grouped(sentences: list[str]) -> list[str]:
+    """Sentences `LOG: TEXT`, each text once, in front of it the first of its logs and the number of the others."""
+    logs: dict[str, list[str]] = {}
+    for sentence in sentences:
+        log, _, text = sentence.partition(": ")
+        logs.setdefault(text, []).append(log)
+    others = {text: f" and {len(names) - 1} other{'s' if len(names) > 2 else ''}" for text, names in logs.items()}
+    return [f"{names[0]}{others[text] if len(names) > 1 else ''}: {text}" for text, names in logs.items()]
 
 
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")

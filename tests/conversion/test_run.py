@@ -336,3 +336,23 @@ def test_an_archive_of_several_tables_says_to_unpack_it(tmp_path, ending):
             [file.add(tmp_path / name, name) for name in ("IMU.txt", "GPS.txt")]
     with pytest.raises(DataError, match=r"it is an archive without a mav0 folder.*Unpack it, and convert the folder"):
         convert(archive, tmp_path / "log.mcap")
+
+
+def test_what_holds_for_several_logs_is_said_once(tmp_path, imutool):
+    """A question about ten tables is a page, not ten."""
+    rng = np.random.default_rng(0)
+    for name, size in (("walk_1", 1.0), ("walk_2", 2.0), ("walk_3", 1.0)):
+        (tmp_path / "tables" / name).mkdir(parents=True)
+        rows = [
+            f"{k / 100:.2f},{','.join(f'{size * x:.4f}' for x in rng.normal(size=3))},0,0,9.8" for k in range(400)
+        ]  # the rates show no unit
+        (tmp_path / "tables" / name / "imu.csv").write_text("\n".join(["time [s],gyr_x,gyr_y,gyr_z,acc_x,acc_y,acc_z", *rows]))
+    refused = imutool("convert", "tables", "logs", cwd=tmp_path)
+    assert refused.returncode == DataError.exit_code
+    assert refused.stderr.count("the meaning of its columns is not certain") == 3
+    assert refused.stderr.count('gyro_unit = "?"') == 1
+    assert refused.stderr.count("completed: the same as above") == 2
+    told = imutool("convert", "tables", "logs", "--map", "gyro_unit=rad/s", cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert told.stderr.count("gravity in m/s^2") == 1
+    assert "walk_1.mcap and 2 others: the median acceleration is 9.8: gravity in m/s^2" in " ".join(told.stderr.split())
