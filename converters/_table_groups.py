@@ -34,7 +34,7 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"p_?(?P<axis>[ned])", "ned"),
 )
 NED = POSITIONS[2:]
-MATRIX = r"(mat|matrix|rot|rotation|rotmat|dcm|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
+MATRIX = r"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias

@@ -28,7 +28,7 @@ NOT_UNIT, MOST_NOT_UNIT = 0.01, 0.1  # error of a quaternion's length, and the s
 ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
 TURNS = {"quaternion_wxyz", "rotation_matrix", "roll_pitch_yaw"}  # entries of a map that name rotations
 MOST_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
-SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, which are often rounded to 0.1 degrees
+SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, often rounded to 0.1 degrees, or of poses that jump
 DELAYS_S = (*(sign * tenth / 10.0 for tenth in range(11) for sign in (1, -1)),)  # of a clock of the angles' own, none first
 
 
@@ -100,13 +100,15 @@ def _way_by_motion(
     A quaternion in the other order is the inverse rotation in other frames, as is the transpose of a matrix. Motion about one
     or two axes fits both. Then the reading counts that turns about the gyro's own axes, and without one the first.
     """
-    gyro, at_s = _GyroTurns.of(columns, entries), _seconds(columns, clock)
-    turns = [_turns_alike(gyro, way, at_s) for way in ways]
-    for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
-        best = int(np.argmax(found))
-        if found[best] > SURE and _is_clear(found[best], min(found)):
-            return best, True
-    return (0 if min(turn.correlation for turn in turns) > SURE else None), False
+    gyro, at_s, fits_both = _GyroTurns.of(columns, entries), _seconds(columns, clock), False
+    for span_s in SPANS_S:
+        turns = [_turns_alike(gyro, way, at_s, span_s) for way in ways]
+        for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
+            best = int(np.argmax(found))
+            if found[best] > SURE and _is_clear(found[best], min(found)):
+                return best, True
+        fits_both = fits_both or min(turn.correlation for turn in turns) > SURE
+    return (0 if fits_both else None), False
 
 
 def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock: tuple[str, str]) -> Entries:
@@ -172,7 +174,8 @@ def _rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]
     if "rotation_matrix" in entries:
         matrices = columns.side_by_side(entries["rotation_matrix"]).reshape(-1, 3, 3)
         is_rotation = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) < ORTHOGONAL
-        return of_matrices(np.where(is_rotation[:, None, None] & (np.linalg.det(matrices) > 0.0)[:, None, None], matrices, 0.0))
+        is_rotation &= np.linalg.det(np.where(is_rotation[:, None, None], matrices, 0.0)) > 0.0
+        return of_matrices(np.where(is_rotation[:, None, None], matrices, 0.0))
     return columns.side_by_side(entries["quaternion_wxyz"])
 
 

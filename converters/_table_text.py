@@ -44,13 +44,17 @@ STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
 )
 
 
+def matrix_columns(name: str) -> list[str]:
+    """Columns of an array of matrices, row by row."""
+    return [f"{name}[{row}][{column}]" for row in range(3) for column in range(3)]
+
+
 @dataclass
 class Columns:
-    """Columns by name, with units, matrices, single numbers, texts, remarks, and files by group."""
+    """Columns by name, with units, single numbers, texts, remarks, and files by group."""
 
     values: dict[str, np.ndarray] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
-    matrices: dict[str, np.ndarray] = field(default_factory=dict)
     numbers: dict[str, float] = field(default_factory=dict)
     texts: dict[str, list[str]] = field(default_factory=dict)
     remarks: Remarks = field(default_factory=Remarks)
@@ -62,10 +66,10 @@ class Columns:
         if array.dtype.kind not in "iufb" or array.ndim > 3 or not array.size:
             return
         if array.ndim == 3:
-            if array.shape[:2] == (3, 3):
-                self.matrices[name] = np.moveaxis(array, 2, 0).astype(float)
-            elif array.shape[1:] == (3, 3):
-                self.matrices[name] = array.astype(float)
+            array = np.moveaxis(array, 2, 0) if array.shape[:2] == (3, 3) else array
+            if array.shape[1:] == (3, 3):
+                for column, values in zip(matrix_columns(name), array.reshape(-1, 9).T, strict=True):
+                    self.values[column], self.units[column] = values, unit
             return
         if array.ndim == 2 and array.shape[0] < array.shape[1]:
             array = array.T

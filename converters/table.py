@@ -41,7 +41,7 @@ from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
 from ._table_propose import propose
 from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
-from ._table_text import Columns
+from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
 
@@ -242,12 +242,12 @@ def _rotations(columns: Columns, table: TableMap, where: Path) -> Float64[np.nda
         return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
     if table.roll_pitch_yaw:
         return of_angles(vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where))
-    if isinstance(table.rotation_matrix, list):
-        return of_matrices(vectors_named(columns, table.rotation_matrix, 1.0, 0.0, where).reshape(-1, 3, 3), where)
-    if table.rotation_matrix in columns.matrices:
-        return of_matrices(columns.matrices[table.rotation_matrix], where)
-    expected = ", ".join(columns.matrices) or "an array of 3 by 3 matrices, or nine columns"
-    raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
+    nine = matrix_columns(table.rotation_matrix) if isinstance(table.rotation_matrix, str) else table.rotation_matrix
+    if isinstance(table.rotation_matrix, str) and nine[0] not in columns.values:
+        arrays = [name.removesuffix(matrix_columns("")[0]) for name in columns.values if name.endswith(matrix_columns("")[0])]
+        expected = ", ".join(arrays) or "an array of 3 by 3 matrices, or nine columns"
+        raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
+    return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 
 
 def _further(

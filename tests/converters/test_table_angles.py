@@ -299,3 +299,30 @@ def test_numbered_quaternions_of_a_motion_about_one_axis_are_poses_in_the_gyros_
     assert either_way == mounted
     right = np.abs((Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * yaw.inv()).as_rotvec()).max() < 1e-5
     assert right == (order == "wxyz" or not mounted)
+
+
+@pytest.mark.parametrize("glitches", [False, True])
+@pytest.mark.parametrize("form", ["mat", "npz"])
+def test_an_array_of_matrices_is_poses_also_where_they_jump(tmp_path, form, glitches):
+    """As MATLAB keeps them, 3 by 3 by n, or n by 3 by 3; a map may name the array, or its nine columns."""
+    matrices = TURN.as_matrix()
+    if glitches:  # of markers that change places, twice in three seconds: over 0.1 s most turns are theirs
+        for k in range(100, COUNT, 150):
+            matrices[k : k + 2] = matrices[k : k + 2] @ Rotation.from_euler("x", 12.0, degrees=True).as_matrix()
+        matrices[:3] = np.nan
+    arrays = {"ts": T_S, "gyr": GYRO, "acc": ACCEL}
+    (tmp_path / "walk").mkdir()
+    if form == "mat":
+        scipy.io.savemat(tmp_path / "walk" / "imu.mat", arrays)
+        scipy.io.savemat(tmp_path / "walk" / "vicon.mat", {"ts": T_S, "rots": np.moveaxis(matrices, 0, 2)})
+    else:
+        np.savez(tmp_path / "walk" / "imu.npz", **arrays)
+        np.savez(tmp_path / "walk" / "vicon.npz", ts=T_S, rots=matrices)
+    (sequence,) = table.sequences(tmp_path / "walk")
+    for stated in ({}, {"rotation_matrix": "ground_truth/rots", "truth_time": "ground_truth/ts"}):
+        log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s", "accel_unit": "m/s^2", **stated})
+        (poses,) = log.poses.values()
+        off = Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * motion((poses.t_ns - poses.t_ns[0]) * 1e-9).inv()
+        assert np.median(off.magnitude()) < 0.05
+    with pytest.raises(ConfigError, match=r"no rotations 'rotations'; expected ground_truth/rots"):
+        table.read_sequence(sequence, mapping={"gyro_unit": "rad/s", "accel_unit": "m/s^2", "rotation_matrix": "rotations"})
