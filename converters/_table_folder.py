@@ -23,11 +23,12 @@ from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape
 from ._table_groups import TRUE_GROUPS, has_poses, known_layout
 from ._table_headerless import name_headerless
+from ._table_map import IMU_GROUP
 from ._table_mocap import is_mocap
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name, text_head
 from ._table_propose import propose
-from ._table_sensors import SENSORS, WORD, name_columns, pairs_among, sensors_among
+from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, sensors_among
 from ._table_text import Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
@@ -39,7 +40,7 @@ DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
-ROLE = "|".join(["imu|inertial|ground|truth|poses?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
+ROLE = "|".join(["imu|inertial|ground|truth|poses?|raw|rots?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
 ENDINGS = (
     ".csv",
     ".txt",
@@ -56,7 +57,7 @@ ENDINGS = (
     ".h5",
     ".hdf5",
 )
-IMU_GROUP, TRUTH_GROUP, POSES_GROUP = "imu", "ground_truth", "poses"
+TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"
 
 
 def sequences_below(source: Path) -> list[Sequence]:
@@ -126,7 +127,9 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     for path in tables:
         alike.setdefault(_without_role(_stem(path)), []).append(path)
     found: dict[str, list[Path]] = {}
-    for name, paths in alike.items():
+    for shared, paths in alike.items():
+        first = _stem(paths[0])
+        name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
         found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if _look(path).is_imu}
     return found
 
@@ -201,9 +204,10 @@ def _groups(tables: list[Path]) -> dict[Path, str]:
         return {path: several[_stem(path)] for path in tables if _stem(path) in several}
     seen = {path: _look(path) for path in tables}
     captured = [path for path in tables if seen[path].is_mocap]
-    true = captured or [path for path in tables if re.fullmatch(POSES, _stem(path).lower())]
+    words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1
+    true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
     shown = [path for path in tables if seen[path].is_imu and path not in true]
-    imus = [path for path in tables if re.fullmatch(IMU, _stem(path).lower()) and path not in true] or shown
+    imus = [path for path in tables if re.fullmatch(IMU, words[path]) and path not in true] or shown
     poses = true or [path for path in tables if seen[path].has_poses and path not in shown]
     if len(poses) != 1 or poses[0] in imus:
         return {}

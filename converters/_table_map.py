@@ -31,6 +31,9 @@ LISTS = {  # entries that name several columns
     "roll_pitch_yaw": (3, "roll, pitch, yaw"),
     "rotation_matrix": (9, "row by row"),
 }
+TRUE_ENTRIES = {"truth_time", "position", "quaternion_wxyz", "roll_pitch_yaw", "rotation_matrix"}  # columns of the poses
+CLOCKS = "time", "accel_time", "truth_time", "counter"
+IMU_GROUP = "imu"  # in front of the columns of an IMU beside another table
 OF_COUNTS = {"gyro_scale", "gyro_offset", "accel_scale", "accel_offset"}
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
@@ -112,6 +115,26 @@ def _toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"cannot be read ({error.strerror})", where=path) from error
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"is no map of a table ({error})", where=path) from error
+
+
+def within_groups(given: Entries, columns: Columns) -> Entries:
+    """Entries with the group in front of the names of columns, if one table alone has them."""
+    out = dict(given)
+    for entry in {*LISTS, *CLOCKS} & given.keys():
+        of_imu = entry not in TRUE_ENTRIES
+        if of_imu or "truth_file" not in given:
+            names = [given[entry]] if isinstance(given[entry], str) else given[entry]
+            found = [_within_group(name, columns, of_imu) for name in names]
+            out[entry] = found[0] if isinstance(given[entry], str) else found
+    return out
+
+
+def _within_group(name: str, columns: Columns, of_imu: bool) -> str:
+    plain = columns.unsigned(name)
+    names = {*columns.values, *(column.removesuffix("[0][0]") for column in columns.values)}
+    among = [] if plain in names else [each for each in names if each.endswith(f"/{plain}")]
+    own = [each for each in among if each.startswith(f"{IMU_GROUP}/") == of_imu] or among
+    return name.replace(plain, own[0]) if len(own) == 1 else name
 
 
 def is_whole(given: Entries) -> bool:

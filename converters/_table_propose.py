@@ -27,6 +27,7 @@ from ._table_units import (
     COUNTS_A_DPS,
     GYRO_SI,
     TIME_NS,
+    are_unsigned_counts,
     gravity_units,
     raw_counts,
     unit_by_steps,
@@ -155,11 +156,19 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
     """Unit from the magnitude: gravity shows that of an accelerometer; no magnitude shows that of a gyro."""
     if sensor == "accel":
         level, near = gravity_units(columns, proposal.unsigned(sensor, columns))
-        if near:
-            proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
         if len(near) == 1:
+            proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {near[0]}")
             proposal.entries["accel_unit"] = near[0]
             return
+        if are_unsigned_counts(columns.side_by_side(proposal.entries[sensor])):
+            near = []
+            proposal.reasons.append("the accel holds whole numbers, none below zero: raw counts, with a zero of their own?")
+            proposal.hints += [
+                'accel_offset = [x, y, z]  # counts without force, and accel_scale the g of a count with accel_unit = "g"',
+                'gyro_offset = [x, y, z]  # counts at rest, and gyro_scale the deg/s of a count with gyro_unit = "deg/s"',
+            ]
+        if near:
+            proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
         if raw := raw_counts(columns.side_by_side(proposal.entries[sensor])):
             said = f"±{raw[0]} g ({raw[1]} counts a g)"
             proposal.reasons.append(

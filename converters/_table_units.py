@@ -150,3 +150,9 @@ def raw_counts(accel: Float64[np.ndarray, "n 3"]) -> tuple[int, int] | None:
         return None
     level = float(np.median(np.linalg.norm(finite, axis=1)))
     return next(((full, counts) for full, counts in COUNTS_A_G.items() if abs(level / counts - 1.0) < RAW_BAND), None)
+
+
+def are_unsigned_counts(accel: Float64[np.ndarray, "n 3"]) -> bool:
+    """Whether values are whole numbers above zero, as of a converter whose zero is no force."""
+    finite = accel[np.isfinite(accel).all(axis=1)]
+    return len(finite) > 0 and bool((finite == np.round(finite)).all() and (finite >= 0.0).all())

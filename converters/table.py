@@ -36,6 +36,7 @@ from ._table_map import (
     share_units,
     times_named,
     vectors_named,
+    within_groups,
 )
 from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
@@ -76,8 +77,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     path = sequence.path
     columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path))
     remarks, place = columns.remarks, mapping if isinstance(mapping, Path) else path
-    given = {} if mapping is None else read_map(mapping)
-    tables = _mapped(columns, given, place) or _proposed(columns, path, remarks, given)
+    asked = path / sequence.inside
+    given = {} if mapping is None else within_groups(read_map(mapping), columns)
+    tables = _mapped(columns, given, place) or _proposed(columns, asked, remarks, given)
     tables = [_counted(columns, table, place) for table in tables]
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
@@ -212,7 +214,7 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
     if not (table.quaternion_wxyz or table.rotation_matrix or table.roll_pitch_yaw):
         return {}
     if table.truth_file:
-        other = path.parent / table.truth_file
+        other = (path if path.is_dir() else path.parent) / table.truth_file
         if not other.is_file():
             raise ConfigError(f"truth_file {table.truth_file!r} does not exist", where=where)
         columns = load(other, kind_of(head(other), other))

@@ -7,8 +7,8 @@ Navigation, 2001, sec. 5.4), and the bias that the log shows lies within the pri
 raw samples ask for the whole of the model's correction in motion (`imutool.inertial.innovations`), whatever bias a new
 switching-on gave; a log that asks for less than half is another unit's.
 Where one of the three fails, the likelihood of the innovations is compared with that of the raw samples and an unknown constant
-bias: the model is unfit if even from its start in this log it explains the samples worse than no model, or if its bias and its
-correction are both another unit's.
+bias: the model is unfit if even from its start in this log it explains the samples worse than no model, if the log asks for the
+opposite of its correction, or if its bias and its correction are both another unit's.
 
 The thresholds come from `tests/bench/fit.py`, on pieces of the training logs of the models that ship and on logs of other
 sensors, and from made-up sensors as those of `tests/bench/units.py`.
@@ -106,7 +106,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         used = _started(start, prior)
         same = np.array_equal(used.mean, prior.mean)
         worse = _worse_than_none(corrected if same else _without_motion(model, samples, used), used, found, prior, none)
-        if harmful or other_axes or worse or (other_bias and refuted):
+        opposite = bool(refuted) and share.value < -SURE * share.std
+        if harmful or other_axes or worse or opposite or (other_bias and refuted):
             return Fitness("unfit", (*other_start, *contradictions, *worse))
     doubts = [
         *other_start,

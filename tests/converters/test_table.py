@@ -334,6 +334,26 @@ def test_the_public_raw_counts_with_motion_capture(convert, tmp_path, data):
     assert list(recording.truths) == ["/ground_truth/pose"]
 
 
+def test_tables_that_a_number_pairs_are_a_recording_each_and_one_map_holds_for_all(convert, tmp_path, data):
+    """imuRaw1 and viconRot1; the map's names need no group, and its poses are found by the motion."""
+    folder = data / "outside" / "upenn_vicon"
+    asked = convert(folder, tmp_path / "out/")
+    assert asked.returncode == 4
+    assert "upenn_vicon/imuRaw2: the meaning of its columns is not certain" in asked.stderr
+    assert "the accel holds whole numbers, none below zero: raw counts, with a zero of their own?" in asked.stderr
+    assert "gravity in mg" not in asked.stderr
+    (tmp_path / "map.toml").write_text(
+        'gyro = ["vals[4]", "vals[5]", "vals[3]"]\ngyro_unit = "deg/s"\ngyro_offset = [373.6, 375.2, 369.7]\n'
+        'gyro_scale = 1.0\naccel = ["-vals[0]", "-vals[1]", "vals[2]"]\naccel_unit = "g"\n'
+        "accel_offset = [511.0, 501.0, 503.0]\naccel_scale = 0.0097\n"
+    )
+    done = convert(folder, tmp_path / "out/", "--map", tmp_path / "map.toml")
+    assert done.returncode == 0, done.stderr
+    recordings = [read(tmp_path / "out" / f"imuRaw{number}.mcap") for number in (1, 2, 3)]
+    assert [len(each.imu) for each in recordings] == [5645, 4698, 3404]
+    assert [len(each.truth.t_ns) for each in recordings] == [5561, 4601, 3433]
+
+
 def test_nine_columns_of_a_motion_capture_are_its_rotations_row_by_row(convert, tmp_path):
     """As Qualisys writes them: column by column, and zeros where the body was not seen."""
     poses = flight(3, duration_s=4.0).truth
