@@ -21,17 +21,22 @@ from imutool.bias_start.initial_bias import (
     relative_samples,
 )
 from imutool.bias_start.prior_width import supported_std
+from imutool.cleaning.rules.saturation import at_limit
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.log_info.convention_report import check_start_poses
-from imutool.recording import Recording, nanoseconds, seconds
+from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
+from imutool.recording.columns import median
 
 TRUTH_S = 15.0  # length of truth for a start: of 3, 5, 8, 10 and 15 s the best on training logs left out in turn
 LEAST_TRUTH_S = 1.0
 CHECKED_S = 60.0  # of truth and gyro that are compared first: 15 s do not always show a clock
 NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses without positions
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room (docs/diagnosis.md)
+STEP_S = 0.1  # over which turns of poses and gyro are compared
+JUMP_RAD, JUMP_MEDIANS, JUMP_SHARE = np.deg2rad(5.0), 10.0, 0.2  # as `imutool info` counts jumps of poses
+LOST = 2.5  # median periods, beyond which samples are lost
 MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
 SAME = 100.0  # samples whose poses have the same error
 ITERATIONS = 4
@@ -67,8 +72,9 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     assert poses.v_w is not None
     start = prior(model, int(imu.t_ns[0]))
     residual = np.concatenate([piece.gyro, piece.accel], axis=1) - model.stream(start.rest)(*relative_samples(piece))
+    alone = poses_turn_alone(replace(piece, gyro=residual[:, :3]), truth)
     mount_std = 0.0 if model.card else MOUNT_STD  # a trained model knows it
-    offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows], mount_std)
+    offset = bias_from_truth(t[rows], residual, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted[rows], mount_std, alone)
     variance = model.truth_std**2 * (TRUTH_S / length_s) ** 2
     if not truth.has_positions:
         offset[3:], variance[3:] = 0.0, NOT_SEEN**2
@@ -82,6 +88,28 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
     before = replace(bias_prior(model), mean=mean, std=np.maximum(spread, LEAST_STD), least=None)
     ends_s = seconds(piece.t_ns[-1:], int(recording.imu.t_ns[0]))[0]
     return InitialBias(rest, std, f"{how}, then {TRACKED_BY}", follows=before, hold_s=float(ends_s))
+
+
+def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
+    """Samples over which the poses turn and the gyro does not.
+
+    The gyro was clipped, samples are lost, or the poses jump: no bias mends that, and a path keeps the error to its end.
+    """
+    t, (poses, valid) = seconds(imu.t_ns, int(imu.t_ns[0])), truth.at(imu.t_ns)
+    dt, out = np.diff(t), np.zeros(len(t), bool)
+    first = np.arange(0, len(t), max(1, round(STEP_S / median(dt)))) if len(dt) else np.zeros(1, int)
+    begin, end = first[:-1], first[1:]
+    known = valid[begin] & valid[end]
+    if known.any():
+        turned = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro[:-1] * dt[:, None], axis=0)])
+        seen, span, q = turned[end] - turned[begin], (t[end] - t[begin])[:, None], poses.q_wb_wxyz
+        more = seen - quaternion.log(quaternion.multiply(quaternion.inverse(q[begin]), q[end]))
+        misfit = np.linalg.norm(more - np.median((more / span)[known], axis=0) * span, axis=1)
+        most = np.maximum(JUMP_SHARE * np.linalg.norm(seen, axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known])))
+        clipped = np.logical_or.reduce([at_limit(column) for column in imu.gyro.T])[:-1]
+        lost = np.logical_or.reduceat(clipped | (dt > LOST * median(dt)), begin)
+        out[: end[-1]] = np.repeat(known & (lost | (misfit > most)), np.diff(first))
+    return out
 
 
 def _updated(start: InitialBias, offset: Vector6, variance: Vector6) -> tuple[Vector6, Vector6]:
@@ -98,10 +126,12 @@ def bias_from_truth(
     v_w: Rows,
     trusted: Bool[np.ndarray, " n"],
     mount_std: float = 0.0,
+    alone: Bool[np.ndarray, " n"] | None = None,
 ) -> Vector6:
     """Constant bias of samples with true poses: the slope in time of the integration error.
 
     With `mount_std` (rad) the body of the poses may be turned against the gyro, which a constant else takes up in motion.
+    Over the samples `alone` the poses turn and the gyro does not: these turns are left out.
 
     Rotation and velocity are integrated from the first true pose; their errors e(t) = e_0 + (sum of A) b are fitted at all
     trusted poses with Huber's weights, e_0 being the error of the first pose itself. The accelerometer is rotated with the true
@@ -110,8 +140,12 @@ def bias_from_truth(
     dt = np.diff(t_s)[:, None]
     rate, force, offset = samples[:, :3], samples[:, 3:], np.zeros(6)
     turned = quaternion.multiply(quaternion.inverse(q_wb_wxyz[:1]), q_wb_wxyz[1:])
+    steps = quaternion.multiply(quaternion.inverse(q_wb_wxyz[:-1]), q_wb_wxyz[1:])
     for _ in range(ITERATIONS):
         running = _integrated(rate - offset[:3], dt)
+        if alone is not None and alone.any():
+            own = quaternion.exp(_step_means(rate - offset[:3]) * dt)
+            turned = quaternion.unit(quaternion.running_product(np.where(alone[:-1, None], own, steps)))
         R = quaternion.matrix(running)
         error = quaternion.rotate(running, quaternion.log(quaternion.multiply(quaternion.inverse(running), turned)))
         offset[:3] -= _slope(error, np.cumsum(R * dt[..., None], axis=0), trusted[1:], R - np.eye(3), mount_std)

@@ -3,7 +3,8 @@
 Candidates, from the simplest: `constant` (the prior of the rest bias alone), `linear` (scale and misalignment), and `effects`
 (those that the other logs support). Each log is integrated from its first true pose with every start that users have; raw
 samples and `static`, the log's own rest bias without any training, are scored alike. The poses are first turned and shifted by
-the rotation and the clock that are fitted between them and the sensor for this log alone. The simplest candidate that is not
+the rotation and the clock that are fitted between them and the sensor for this log alone. Where they turn and the gyro does
+not, as over clipped samples, the path turns with them. The simplest candidate that is not
 beaten is kept, for the gyro by the orientation error (AOE), for the accelerometer by the velocity after 5 s from the truth.
 Effects are linear in their parameters, so a left-out model is one Gauss-Newton step from the fit of all logs; the weights of
 outliers and the attitude under the accelerometer stay those of all logs (`tests/bench/left_out.py` fits anew).
@@ -19,19 +20,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from imutool.array_types import Float64
+from imutool.array_types import Bool, Float64
 from imutool.bias import static
 from imutool.bias.model import COLUMNS, BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.temperature import Scale
+from imutool.bias_start.bias_from_truth import poses_turn_alone
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
 from imutool.bias_start.prior_width import turned_axes
 from imutool.errors import DataError, ModelError
+from imutool.geometry import quaternion
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
-from imutool.recording import Imu, Recording, nanoseconds
+from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.candidates import CANDIDATES, known, left_out_effects, left_out_model, with_statistics
 from imutool.training.effect_selection import LINEAR, Calibration, parameter_columns
@@ -124,11 +127,12 @@ def compare(
         left_out = {c: left_out_model(fits, pool, statistics[c], effects[c], index, scale) for c in candidates}
         models = {c: bound_to(model, recording) for c, model in left_out.items()}
         log = _without_nuisances(recording, fits["gyro"], (), index)
-        scores = [_score(log, "raw", "", log.imu)]
-        scores += [_score(log, "static", start, imu) for start in STARTS for imu in _corrected(log, None, start)]
+        alone = poses_turn_alone(log.imu, log.truth)
+        scores = [_score(log, "raw", "", log.imu, alone)]
+        scores += [_score(log, "static", start, imu, alone) for start in STARTS for imu in _corrected(log, None, start)]
         for name, model in models.items():
             log = _without_nuisances(recording, fits["gyro"], effects[name]["gyro"], index)
-            scores += [_score(log, name, start, imu) for start in STARTS for imu in _corrected(log, model, start)]
+            scores += [_score(log, name, start, imu, alone) for start in STARTS for imu in _corrected(log, model, start)]
         return scores
 
     logs = list(enumerate(_logs(recordings, pool, fits["gyro"])))
@@ -270,8 +274,17 @@ def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]
         return []
 
 
-def _score(log: Recording, model: str, start: str, imu: Imu) -> Score:
+def _score(log: Recording, model: str, start: str, imu: Imu, alone: Bool[np.ndarray, " n"]) -> Score:
+    imu = _turned_as_poses(imu, log.truth, alone[np.searchsorted(log.imu.t_ns, imu.t_ns)])
     path, truth, valid = along_truth(imu, log.truth, log.name)
     speeds = drift(path, truth, valid, DRIFT_S).velocity_m_s
     drift_m_s = float(np.sqrt(np.mean(speeds**2))) if len(speeds) and truth.has_positions else None
     return Score(log.name, model, start, float(metrics.absolute(path, truth, valid)["aoe_deg"] or 0.0), drift_m_s)
+
+
+def _turned_as_poses(imu: Imu, truth: Poses, rows: Bool[np.ndarray, " n"]) -> Imu:
+    """Samples whose gyro turns as the poses do in some rows, by the rule of `dead_reckon`."""
+    (poses, valid), dt = truth.at(imu.t_ns), np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))
+    turns = quaternion.log(quaternion.multiply(quaternion.inverse(poses.q_wb_wxyz[:-1]), poses.q_wb_wxyz[1:]))
+    replaced = (rows[:-1] & valid[:-1] & valid[1:])[:, None]
+    return replace(imu, gyro=np.concatenate([np.where(replaced, turns / dt[:, None], imu.gyro[:-1]), imu.gyro[-1:]]))

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from support.switchings_on import Switchings, log
 
 from imutool.bias import model_file
+from imutool.bias_start.bias_from_truth import poses_turn_alone
 from imutool.config import load
 from imutool.mcap_io.write import write
+from imutool.recording import seconds
+from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 from imutool.training.candidates import with_statistics
 from imutool.training.effect_selection import LINEAR, PhysicsFirst
 from imutool.training.fit import Training
+from imutool.training.left_out import _score
 from imutool.training.run import train
 from imutool.training.settings import settings_of
 from imutool.training.training_windows import Pool
@@ -43,3 +48,19 @@ def test_a_candidate_is_judged_with_the_statistics_that_it_would_ship_with(tmp_p
         judged, others = (getattr(model, name).numpy()[:3] for model in (candidates["constant"], training.model))
         np.testing.assert_allclose(judged, getattr(shipped, name)[:3], rtol=TOLERANCE)
         assert judged.max() > 3.0 * others.max()
+
+
+def test_turns_that_the_gyro_does_not_show_count_for_no_candidate() -> None:
+    """A second of a flight that is lost costs ten degrees and more, whatever the model; the rest of the path is exact."""
+    perfect = TriadSettings(
+        noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
+    )
+    made = flight(3, FlightSettings(gyro=perfect, accel=perfect), duration_s=30.0)
+    t = seconds(made.imu.t_ns, int(made.imu.t_ns[0]))
+    with_gap = replace(made, imu=made.imu.rows((t < 12.0) | (t > 13.0)))
+    nothing = np.zeros(len(with_gap.imu), bool)
+    shown, hidden = (
+        _score(with_gap, "raw", "", with_gap.imu, rows) for rows in (nothing, poses_turn_alone(with_gap.imu, made.truth))
+    )
+    assert shown.aoe_deg > 10.0
+    assert hidden.aoe_deg < 0.1
