@@ -33,7 +33,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     check: str = "imu"  # what of a new log is read back: all, imu or none
     damaged: str = "drop"
     sim: str | None = None
-    imu: str | None = None
+    imus: tuple[str, ...] = ()  # of each log those that it has; a diagnosis takes the first of them
     truth: str | None = None
     robot_from: str | None = None  # a regular expression on the log's name, or metadata:RECORD.KEY; else its folder
     quick: bool = False  # diagnose: the effects that robots are compared by, and no search for others

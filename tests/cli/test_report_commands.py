@@ -20,7 +20,8 @@ from imutool.cli.train import lines_of_choice
 from imutool.errors import DataError, ModelError
 from imutool.file_location import identity
 from imutool.fleet import page as fleet_page
-from imutool.fleet.one_log import is_current, work
+from imutool.fleet.one_log import work
+from imutool.fleet.targets import is_current
 from imutool.fleet.task import Result as Done
 from imutool.fleet.task import Settings, Source, Task, with_model_hash
 from imutool.mcap_io.read import read
