@@ -24,7 +24,23 @@ from imutool.fleet.task import Source
 logger = logging.getLogger(__name__)
 
 LOG, BAG = ".mcap", ".bag"
-RAW = BAG, ".db3", ".ulg", ".csv", ".tsv", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".zip", ".tar", ".tgz", ".tar.gz"
+RAW = (
+    BAG,
+    ".db3",
+    ".ulg",
+    ".csv",
+    ".tsv",
+    ".xlsx",
+    ".parquet",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".zip",
+    ".tar",
+    ".tgz",
+    ".tar.gz",
+)
 CONVERT = "imutool convert makes logs of other recordings"
 PATTERN = re.compile(r"[*?\[]")
 

@@ -300,7 +300,7 @@ def test_an_object_of_matlab_hides_no_array_that_is_too_large(tmp_path, monkeypa
     scipy.io.savemat(tmp_path / "log.mat", {"zeros": np.zeros(10_000)}, do_compression=True)
     with (tmp_path / "log.mat").open("ab") as file:
         file.write(np.array([14, 16, 6, 8, 17, 0], np.uint32).tobytes())
-    monkeypatch.setattr("imutool.converters._table_files.LIMIT", 50_000)
+    monkeypatch.setattr("imutool.converters._table_mat.LIMIT", 50_000)
     with pytest.raises(DataError, match="unpacks to"):
         load(tmp_path / "log.mat", "mat")
 
