@@ -121,7 +121,7 @@ def debias(
 
         require_matplotlib()
     start = {"init": init, "smooth": smooth, "force": force}
-    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imus=tuple(imu or ()))  # type: ignore[arg-type]
+    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imu=_one_or_more(imu))  # type: ignore[arg-type]
     return with_model_hash(settings)
 
 
@@ -174,9 +174,13 @@ def diagnose(
         sim=None if where is None else str(where),
         robot_from=robot_from,
         quick=not search,
-        imus=tuple(imu or ()),
+        imu=_one_or_more(imu),
         truth=truth,
     )
+
+
+def _one_or_more(imus: list[str] | None) -> str | tuple[str, ...] | None:
+    return None if not imus else imus[0] if len(imus) == 1 else tuple(imus)
 
 
 def _show(done: FleetReport, target: str, report: str | None) -> None:

@@ -76,7 +76,7 @@ def test_a_model_of_another_sensor_is_refused_or_warned_of(logs: Path, tmp_path:
 
 
 def test_the_imu_is_the_one_that_is_named(logs: Path, tmp_path: Path, settings: Settings) -> None:
-    named = msgspec.structs.replace(settings, imus=("gyro=/imu0,accel=/imu1",))
+    named = msgspec.structs.replace(settings, imu=("gyro=/imu0,accel=/imu1",))
     refused = work(task(logs / "flight_1.mcap", tmp_path / "out", named))
     assert refused.status == "failed"
     assert "the log has no topic gyro=/imu0,accel=/imu1; expected /imu0 (sensor_msgs/msg/Imu)" in refused.error
@@ -89,11 +89,11 @@ def test_a_fleet_names_the_imus_of_all_its_logs(logs: Path, tmp_path: Path, sett
     alone = work(task(two, tmp_path / "out", settings, name="two.mcap"))
     assert (alone.status, alone.exit_code) == ("failed", 5)
     assert "2 IMU topics: /imu0, /imu1. Choose one with `imu`" in alone.error
-    named = msgspec.structs.replace(settings, imus=("/imu1", "/imu0"))
+    named = msgspec.structs.replace(settings, imu=("/imu1", "/imu0"))
     for log, topics in ((two, ["/imu1", "/imu0"]), (logs / "flight_1.mcap", ["/imu0"])):
         done = work(task(log, tmp_path / "out", named, name=log.name))
         assert (done.status, [imu.topic for imu in done.imus]) == ("ok", topics), done.error
-    quick = Settings(command="diagnose", quick=True, imus=("/imu1", "/imu0"))
+    quick = Settings(command="diagnose", quick=True, imu=("/imu1", "/imu0"))
     assert work(task(logs / "flight_1.mcap", tmp_path / "found", quick, name="flight_1.json")).status == "ok"
 
 
