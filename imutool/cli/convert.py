@@ -114,7 +114,9 @@ def _tell(report: ConvertReport, common: Common) -> None:
         for path in report.written:
             say(str(path))
     if not common.quiet:
-        for note in report.notes:
+        bare = [path for path in report.written if path.suffix.lower() != ".mcap"]
+        asked = [f"{path} is a log, although its name does not end in .mcap; for a folder add a slash" for path in bare]
+        for note in [*report.notes, *asked]:
             tell_warning(note, "note")
     for loss in report.losses:
         tell_warning(loss)

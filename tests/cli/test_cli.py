@@ -242,6 +242,22 @@ def test_a_table_too_wide_goes_on_below_with_its_keys(
     assert lines == [["log", "aaaaaaaa", "bbbbbbbb"], ["x" * 8, "1", "2"], ["log", "cccccccc", "dddddddd"], ["x" * 8, "3", "4"]]
 
 
+def test_a_row_whose_value_is_folded_begins_in_its_first_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The topic and the property stood beside the last line of the value."""
+    monkeypatch.setattr(terminal, "out", type(terminal.out)(width=30, force_terminal=True, no_color=True, highlight=False))
+    terminal.table([("topic", "value"), ("/imu0", "cannot be judged: the log has no poses")], keys=1)
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+    assert shown[2].split() == ["/imu0", "cannot", "be", "judged:", "the"]
+    assert shown[3].split() == ["log", "has", "no", "poses"]
+
+
+def test_without_a_terminal_stderr_has_no_empty_line_of_the_progress(logs: Path, imutool: Run, tmp_path: Path) -> None:
+    done = imutool("debias", logs / "flight_2.mcap", "out.mcap", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
