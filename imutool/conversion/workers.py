@@ -64,6 +64,10 @@ def _convert_one(job: Job) -> Outcome:
             raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
         content = module.read_sequence(job.sequence, images=job.images, **given)
         return write_content(content, job)
+    except DataError as error:
+        known = error.where is not None and str(job.sequence.path) in error.where
+        where = str(job.sequence) if error.where is None else f"{job.sequence}: {error.where}"
+        return Outcome(error if known else type(error)(error.what, where=where, expected=error.expected, fix=error.fix))
     except ImutoolError as error:
         return Outcome(error)
 
