@@ -95,6 +95,8 @@ def write(
             complete.mkdir(parents=True)
             remarks = _make(d, complete, logs, drawn)
             _publish(complete, folder, overwrite=overwrite)
+        except ImutoolError as error:
+            raise error.renamed({str(complete): str(folder)}) from error.__cause__
         finally:
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(partial)

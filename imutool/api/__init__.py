@@ -6,7 +6,7 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import chain, count
 from numbers import Integral, Real
@@ -118,7 +118,7 @@ def given_logs(
         try:
             yield GivenLogs(places, names)
         except ImutoolError as error:
-            raise _renamed(error, names) from error.__cause__
+            raise error.renamed(names) from error.__cause__
 
 
 def _file_name(name: str) -> str:
@@ -128,15 +128,6 @@ def _file_name(name: str) -> str:
 
 def _distinct(name: str, taken: set[str]) -> str:
     return next(each for each in chain([name], (f"{name} ({number})" for number in count(2))) if each not in taken)
-
-
-def _renamed(error: ImutoolError, names: Mapping[str, str]) -> ImutoolError:
-    """Error that names recordings in place of their files."""
-    texts = [error.what, error.where or "", error.expected, error.fix]
-    for place, name in names.items():
-        texts = [text.replace(place, name) for text in texts]
-    what, where, expected, fix = texts
-    return type(error)(what, where=where or None, expected=expected, fix=fix)
 
 
 def init_text(init: Init) -> str:
