@@ -254,10 +254,7 @@ def of_noise(noise: noises.Noise, rate_hz: float) -> Iterator[str]:
     """Remarks on what of a noise is not simulated."""
     if noise.colour is not None and not noise.colour.holds_at(rate_hz):
         yield f"the colour of the noise is that of {noise.colour.rate_hz:g} Hz, and not simulated at {rate_hz:g} Hz"
-    kinds = {
-        n: [a for a, v in zip("xyz", noise.values(n), strict=True) if np.isnan(v)] for n in noises.UNITS if "inst" not in n
-    }
-    if lacking := ", ".join(name + f" ({', '.join(axes)})" * (len(axes) < 3) for name, axes in kinds.items() if axes):
+    if lacking := ", ".join(name for name in noises.unknown(noise) if "instability" not in name):
         yield f"{lacking} not known in the noise file, and not simulated"
 
 
