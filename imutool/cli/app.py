@@ -155,6 +155,8 @@ class App(typer.Typer):
 
         def register(function: CommandFunctionType) -> CommandFunctionType:
             command = expanded(function)
+            paragraphs = (" ".join(each.split()) for each in (inspect.getdoc(function) or "").split("\n\n"))
+            settings.setdefault("help", "\n\n".join(paragraphs))  # typer would keep the lines of the source
             kind = type("Command", (cls or Command,), {"function": staticmethod(command)})
             typer.Typer.command(self, name, cls=kind, **settings)(command)
             return function
@@ -187,7 +189,7 @@ app = App(
     add_completion=True,
 )
 
-Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG", help="MCAP logs.")]
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Initial bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]

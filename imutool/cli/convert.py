@@ -54,7 +54,9 @@ class Export(Report, frozen=True, tag="imutool.export/1"):
     cls=listing("imutool.converters", "--format"), epilog="Example: [bold]imutool convert MH_04_difficult.zip MH_04.mcap[/]"
 )
 def convert(
-    source: Annotated[Path, typer.Argument(help="Bag, log, table, sequence folder or archive, or a folder of these.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SRC", help="Bag, log, table, sequence folder or archive, or a folder of these.")
+    ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="File for one sequence, folder (or NAME/) for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,

@@ -27,7 +27,7 @@ def train(
     model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model."), MODEL],
     method: Annotated[str, typer.Option(help="Bias model from the list below.")] = "hybrid",
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.fit.TrainSettings lists them.")
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.settings.TrainSettings lists them.")
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")

@@ -207,6 +207,17 @@ def test_names_of_files_are_shown_as_they_are(tmp_path: Path, logs: Path, imutoo
     assert done.stdout.startswith(r"a [bold]b[] \x1b[31m.mcap: ")
 
 
+@pytest.mark.parametrize(
+    ("word", "usage"), [("view", "{LOG}..."), ("live", "[LOG]"), ("schema", "[NAME]"), ("convert", "{SRC} {OUT}")]
+)
+def test_help_names_each_argument_once_and_has_no_lines_of_the_source(
+    word: str, usage: str, imutool: Run, tmp_path: Path
+) -> None:
+    said = imutool(word, "--help", cwd=tmp_path, env={"COLUMNS": "200", "TERM": "dumb"}).stdout
+    assert f" {word} [OPTIONS] {usage}\n" in re.sub(r" +\n", "\n", said)
+    assert "an .rrd is saved." in said or word != "view"  # on one line
+
+
 # ── tables and progress ──
 
 
