@@ -136,7 +136,8 @@ def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwri
         return False
     text = json_text(report)
     if where == "-":
-        sys.stdout.write(text)
+        sys.stdout.flush()
+        sys.stdout.buffer.write(text.encode())  # JSON is UTF-8, whatever the terminal is
         return True
     with Target(to_location(where), overwrite=overwrite) as target:
         target.write(text.encode())

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -216,6 +217,21 @@ def test_help_names_each_argument_once_and_has_no_lines_of_the_source(
     said = imutool(word, "--help", cwd=tmp_path, env={"COLUMNS": "200", "TERM": "dumb"}).stdout
     assert f" {word} [OPTIONS] {usage}\n" in re.sub(r" +\n", "\n", said)
     assert "an .rrd is saved." in said or word != "view"  # on one line
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_an_output_that_knows_few_letters_gets_a_report_and_json_stays_utf_8(
+    encoding: str, logs: Path, imutool: Run, tmp_path: Path
+) -> None:
+    """As Windows has it where stdout goes to a file: the root of rad/s/√Hz was a traceback."""
+    log = shutil.copy(logs / "flight_1.mcap", tmp_path / "Prüflauf.mcap")
+    env = {"PYTHONIOENCODING": encoding}
+    done = imutool("info", log, cwd=tmp_path, apart=True, env=env, encoding=encoding)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    assert "rad/s/?Hz" in done.stdout
+    words = [sys.executable, "-m", "imutool", "info", str(log), "--json", "-"]
+    said = subprocess.run(words, env=os.environ | env, capture_output=True, check=True).stdout
+    assert json.loads(said.decode("utf-8"))["log"] == log.stem
 
 
 # ── tables and progress ──

@@ -235,6 +235,8 @@ def test_a_source_is_never_the_target(tmp_path):
 def test_a_read_only_target_is_refused(source):
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):
         convert(source / "a", Path("/proc/a.mcap"))
+    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder beside it
+        convert(source / "a", Path("/proc/a.mcap"), correct=["conventions"])
     with pytest.raises(ConfigError, match="/proc/imutool: cannot be made"):
         convert(source, Path("/proc/imutool"))
 
