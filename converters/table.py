@@ -211,7 +211,10 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
 
 
 def _described(table: TableMap) -> dict[str, str]:
-    return {key: str(getattr(table, key)) for key in table.__struct_fields__}
+    """Entries of a map that say something; columns as `a, b, c`."""
+    stated, blank = msgspec.structs.asdict(table), msgspec.structs.asdict(TableMap())
+    said = {key: value for key, value in stated.items() if value != blank[key] or key == "topic"}
+    return {key: ", ".join(map(str, value)) if isinstance(value, list) else str(value) for key, value in said.items()}
 
 
 def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:

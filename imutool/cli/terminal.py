@@ -171,11 +171,13 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, i
 
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
     shown = err.is_terminal or err.is_jupyter  # elsewhere the library would print an empty line
+    room = max(err.width - len(what) - 26, 8)  # a longer word would take it from the bar
     with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, transient=True, disable=not shown) as bar:
         task = bar.add_task(what, total=None, word="")
 
         def tell(done: int, total: int, word: str) -> None:
-            bar.update(task, completed=done, total=total, word=plain(word))
+            short = plain(word) if len(word) <= room else f"{plain(word)[: room - 1]}…"
+            bar.update(task, completed=done, total=total, word=short)
             if word:
                 logger.info("%s %s", what, word)
 

@@ -356,7 +356,11 @@ def test_several_imus_of_one_table_are_several_imus_of_one_log(tmp_path, written
     late_ns = log.imus["/right/imu"].t_ns - log.imus["/left/imu"].t_ns[:length]
     assert np.array_equal(late_ns, np.full(length, 1_000_000 if written_by == "groups with clocks" else 0))
     assert log.scalars == {}
-    assert log.metadata["imutool/map/right/imu"]["topic"] == "/right/imu"
+    stated = log.metadata["imutool/map/right/imu"]  # and nothing of what the map leaves open
+    assert (stated["topic"], stated["gyro_unit"]) == ("/right/imu", "rad/s")
+    assert all(stated.values())
+    assert "[" not in stated["gyro"][0]
+    assert not {"truth_file", "rotation_matrix", "gyro_scale"} & stated.keys()
 
 
 @pytest.mark.parametrize("form", ["{s}{a}{n}", "{s}_{a}_{n}", "{s}{n}_{a}"])
