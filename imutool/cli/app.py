@@ -31,6 +31,7 @@ from imutool.report import Report
 REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
+MANY = "debias", "repair"  # commands of one log that a fleet has for many
 
 
 class _Commands(TyperGroup):
@@ -104,10 +105,15 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the words of the command line; an option that only other commands have is answered with this command's."""
         try:
-            return super().parse_args(ctx, args)
+            return super().parse_args(ctx, [*args])  # it takes them out one by one
         except Exception as error:  # click's own kinds of error are not exported by typer
+            message = str(getattr(error, "message", ""))
             if hasattr(error, "possibilities"):
                 error.possibilities = instead_of(getattr(error, "option_name", ""), self)
+                if file := next((word for word in args if word.startswith("-") and Path(word).exists()), ""):
+                    error.message = f"{message}; the file of that name is ./{file}"  # type: ignore[attr-defined]
+            elif "extra argument" in message and self.name in MANY:
+                error.message = f"{message}. imutool fleet {self.name} takes many logs"  # type: ignore[attr-defined]
             raise
 
     def invoke(self, ctx: Any) -> Any:

@@ -234,6 +234,15 @@ def test_an_output_that_knows_few_letters_gets_a_report_and_json_stays_utf_8(
     assert json.loads(said.decode("utf-8"))["log"] == log.stem
 
 
+def test_a_usage_error_says_how_to_give_many_logs_and_a_name_that_begins_with_a_dash(imutool: Run, tmp_path: Path) -> None:
+    done = imutool("debias", "a.mcap", "b.mcap", "c.mcap", cwd=tmp_path)
+    assert done.returncode == errors.UsageError.exit_code
+    assert "imutool fleet debias takes many logs" in " ".join(done.stderr.replace("│", " ").split())
+    (tmp_path / "-x.mcap").write_bytes(b"")
+    done = imutool("info", "-x.mcap", cwd=tmp_path)
+    assert "No such option: -x; the file of that name is ./-x.mcap" in " ".join(done.stderr.replace("│", " ").split())
+
+
 # ── tables and progress ──
 
 
