@@ -24,6 +24,7 @@ from ._table_sheets import load_sheets
 from ._table_text import WIDEST, Columns, is_text_table, read_csv, text_of
 from ._table_times import join_gps_weeks
 
+NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
     "mat": b"MATLAB 5.0 MAT-file",
     "hdf5": b"\x89HDF\r\n\x1a\n",
@@ -72,7 +73,7 @@ def load(path: Path, kind: str, sheet: str = "") -> Columns:
     join_gps_weeks(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
-        raise DataError(f"holds no columns of numbers{why}", where=path, expected="a time, three rates and three accelerations")
+        raise DataError(f"{NO_NUMBERS}{why}", where=path, expected="a time, three rates and three accelerations")
     return columns
 
 

@@ -8,6 +8,7 @@ among them, is a table too if it has the name of a sensor (`gyro/t` and `gyro/va
 
 from __future__ import annotations
 
+import logging
 import re
 from contextlib import suppress
 from functools import lru_cache
@@ -22,7 +23,7 @@ from imutool.errors import ConfigError, DataError
 from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
-from ._table_files import kind_of, load, npy_shape, read_npy
+from ._table_files import NO_NUMBERS, kind_of, load, npy_shape, read_npy
 from ._table_groups import TRUE_GROUPS, has_poses, known_layout
 from ._table_headerless import name_headerless
 from ._table_mocap import is_mocap
@@ -60,6 +61,7 @@ ENDINGS = (
     ".xlsx",
     ".xls",
 )
+logger = logging.getLogger(__name__)
 IMU_GROUP, TRUTH_GROUP, POSES_GROUP = "imu", "ground_truth", "poses"
 
 
@@ -280,8 +282,11 @@ def _looked(path: Path, mtime_ns: int, size: int) -> _Seen:  # the key notices a
         read_csv(start, columns, path)
         name_headerless(columns)
     elif kind not in ("csv", "") and size <= MOST_LOOKED:
-        with suppress(DataError, ConfigError):  # said when the file itself is named
+        try:
             columns = load(path, kind)
+        except (DataError, ConfigError) as error:
+            if not error.what.startswith(NO_NUMBERS):  # of a file of settings, say
+                logger.warning("left out: %s", error)
     if not columns.values:
         return _Seen(False, False, is_mocap(start))
     name_columns(columns, "")

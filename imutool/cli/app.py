@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -31,7 +32,6 @@ from imutool.report import Report
 REPORT_HEAD = 200  # bytes of a JSON report that hold its schema
 PIPE_CLOSED = 141  # what a shell reports of a program that SIGPIPE ended
 NOTHING_LEFT = "Nothing half-written is left"
-MANY = "debias", "repair"  # commands of one log that a fleet has for many
 
 
 class _Commands(TyperGroup):
@@ -107,13 +107,12 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, [*args])  # it takes them out one by one
         except Exception as error:  # click's own kinds of error are not exported by typer
-            message = str(getattr(error, "message", ""))
             if hasattr(error, "possibilities"):
                 error.possibilities = instead_of(getattr(error, "option_name", ""), self)
-                if file := next((word for word in args if word.startswith("-") and Path(word).exists()), ""):
-                    error.message = f"{message}; the file of that name is ./{file}"  # type: ignore[attr-defined]
-            elif "extra argument" in message and self.name in MANY:
-                error.message = f"{message}. imutool fleet {self.name} takes many logs"  # type: ignore[attr-defined]
+                files = (f"; the file of that name is ./{word}" for word in args if word[:1] == "-" and Path(word).exists())
+                error.message += next(files, "")  # type: ignore[attr-defined]
+            elif "extra argument" in getattr(error, "message", "") and self.name in ("debias", "repair"):
+                error.message += f". imutool fleet {self.name} takes many logs"  # type: ignore[attr-defined]
             raise
 
     def invoke(self, ctx: Any) -> Any:
@@ -161,8 +160,9 @@ class App(typer.Typer):
 
         def register(function: CommandFunctionType) -> CommandFunctionType:
             command = expanded(function)
-            paragraphs = (" ".join(each.split()) for each in (inspect.getdoc(function) or "").split("\n\n"))
-            settings.setdefault("help", "\n\n".join(paragraphs))  # typer would keep the lines of the source
+            settings.setdefault(
+                "help", re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(function) or "")
+            )  # no lines of the source
             kind = type("Command", (cls or Command,), {"function": staticmethod(command)})
             typer.Typer.command(self, name, cls=kind, **settings)(command)
             return function

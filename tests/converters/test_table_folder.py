@@ -308,3 +308,16 @@ def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, suffix
     (tmp_path / "drive" / "IMU" / "gyro" / f"value{suffix}").write_bytes(b"\x93NUMPY\x01\x00")
     with pytest.raises(DataError, match=rf"gyro/value{suffix}: cannot be read"):
         table.read_sequence(sequence)
+
+
+def test_a_damaged_table_in_a_folder_is_told_and_a_file_of_settings_is_not(tmp_path, caplog):
+    names = ["t_s", *(f"gyro_{axis} [rad/s]" for axis in "xyz"), *(f"acc_{axis} [m/s^2]" for axis in "xyz")]
+    (tmp_path / "walk.csv").write_text(",".join(names) + "\n" + rows(T_S, GYRO, ACCEL))
+    np.savez(tmp_path / "run.npz", gyro=GYRO, accel=ACCEL)
+    raw = (tmp_path / "run.npz").read_bytes()
+    (tmp_path / "run.npz").write_bytes(raw[:300] + bytes(50) + raw[350:])
+    (tmp_path / "settings.json").write_text('{"rate": 100, "name": "walk"}')
+    (sequence,) = table.sequences(tmp_path)
+    assert sequence.path.name == "walk.csv"
+    (told,) = caplog.messages
+    assert re.match(r"left out: .*run\.npz: cannot be read", told)
