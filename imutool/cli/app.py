@@ -160,11 +160,9 @@ class App(typer.Typer):
 
         def register(function: CommandFunctionType) -> CommandFunctionType:
             command = expanded(function)
-            settings.setdefault(
-                "help", re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(function) or "")
-            )  # no lines of the source
+            text = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(function) or "")  # without the lines of the source
             kind = type("Command", (cls or Command,), {"function": staticmethod(command)})
-            typer.Typer.command(self, name, cls=kind, **settings)(command)
+            typer.Typer.command(self, name, cls=kind, **{"help": text, **settings})(command)
             return function
 
         return register
