@@ -1,13 +1,10 @@
-"""Table files: text, JSON, Parquet, .npy, .npz, .mat and HDF5, by their first bytes."""
+"""Table files: text, JSON, Parquet, .npy, .npz, .mat, HDF5, .xlsx, by their first bytes."""
 
 from __future__ import annotations
 
 import re
-import struct
-import warnings
 import zipfile
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,25 +15,26 @@ from imutool.errors import DataError, required
 from ._archive import refusing
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
+from ._table_mat import check_size, load_mat
 from ._table_mocap import is_mocap, read_mocap
 from ._table_packed import opener, read_bytes, text_head
 from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
 from ._table_sensors import read_rows
+from ._table_sheets import load_sheets
 from ._table_text import WIDEST, Columns, is_text_table, read_csv, text_of
 from ._table_times import join_gps_weeks
 
-LIMIT = 4 << 30  # bytes of numbers in one file
+NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
     "mat": b"MATLAB 5.0 MAT-file",
     "hdf5": b"\x89HDF\r\n\x1a\n",
     "parquet": b"PAR1",
     "feather": b"ARROW1\0\0",  # also Arrow's own
     "npy": b"\x93NUMPY",
-    "sheet": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
+    "sheets": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
 }
-MAT_HEADER, MAT_COMPRESSED, MAT_STEP = 128, 15, 1 << 20  # bytes before the first element, type of a packed one, bytes at once
 ZIP = b"PK\x03\x04"
-SHEETS = "xl/workbook.xml", "xl/workbook.bin", "content.xml"  # members of Excel's and LibreOffice's files
+SHEETS = {"xl/workbook.xml": "sheets", "xl/workbook.bin": "other sheets", "content.xml": "other sheets"}  # members of a zip
 
 
 def kind_of(head: bytes, path: Path) -> str:
@@ -45,9 +43,11 @@ def kind_of(head: bytes, path: Path) -> str:
         if head.startswith(magic) or (kind == "hdf5" and head[512:].startswith(magic)):
             return kind
     if head.startswith(ZIP):
-        names = _members(path)
-        if any(name.endswith(".npy") for name in names) or names & {*SHEETS}:
-            return "sheet" if names & {*SHEETS} else "npz"
+        names = _members(path) or ({*SHEETS} if path.suffix.lower() == ".xlsx" else set())  # cut off
+        if sheets := next((kind for name, kind in SHEETS.items() if name in names), ""):
+            return sheets
+        if any(name.endswith(".npy") for name in names):
+            return "npz"
     text = text_head(path) if opener(head) else head
     words = "" if b"\0" in text else text_of(text)
     if is_json(words) and not as_table(words)[0]:
@@ -56,8 +56,8 @@ def kind_of(head: bytes, path: Path) -> str:
     return "csv" if is_table else ""
 
 
-def load(path: Path, kind: str) -> Columns:
-    """Columns of a table file.
+def load(path: Path, kind: str, sheet: str = "") -> Columns:
+    """Columns of a table file, of a spreadsheet those of one sheet or of all.
 
     Raises:
         ConfigError: a library is missing; the extra is named.
@@ -65,12 +65,15 @@ def load(path: Path, kind: str) -> Columns:
     """
     columns = Columns()
     with refusing(path):
-        LOADERS[kind](path, columns)
+        if kind == "sheets":
+            load_sheets(path, columns, read_text, sheet)
+        else:
+            LOADERS[kind](path, columns)
     columns.join_stamps()
     join_gps_weeks(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
-        raise DataError(f"holds no columns of numbers{why}", where=path, expected="a time, three rates and three accelerations")
+        raise DataError(f"{NO_NUMBERS}{why}", where=path, expected="a time, three rates and three accelerations")
     return columns
 
 
@@ -83,7 +86,11 @@ def _members(path: Path) -> set[str]:
 
 
 def _load_csv(path: Path, columns: Columns) -> None:
-    text = text_of(read_bytes(path))
+    read_text(text_of(read_bytes(path)), columns, path)
+
+
+def read_text(text: str, columns: Columns, path: Path) -> None:
+    """Add the columns of a table of text, whatever program wrote it."""
     if read_mocap(text, columns, path):
         return
     if sentences := of_vectornav(text, columns):
@@ -105,7 +112,7 @@ def _load_csv(path: Path, columns: Columns) -> None:
 def _load_parquet(path: Path, columns: Columns) -> None:
     file = _module("pyarrow.parquet", path).ParquetFile(path)
     names = _numbers_of(file.schema_arrow, columns)
-    _check_size(path, file.metadata.num_rows * len(names) * 8)
+    check_size(path, file.metadata.num_rows * len(names) * 8)
     _add_arrow(file.read(columns=names), columns)  # a text of a few bytes may unpack to gigabytes
 
 
@@ -116,7 +123,7 @@ def _load_feather(path: Path, columns: Columns) -> None:
         for number in range(file.num_record_batches):
             batches.append(file.get_batch(number).select(names))
             size += batches[-1].nbytes
-            _check_size(path, size)
+            check_size(path, size)
     if batches:
         _add_arrow(_module("pyarrow", path).Table.from_batches(batches), columns)
 
@@ -143,8 +150,8 @@ def _load_npz(path: Path, columns: Columns) -> None:
         for info in archive.infolist():
             with archive.open(info) as member:  # the size that the array states, whatever the archive says
                 shape = npy_shape(member) if info.filename.endswith(".npy") else ()
-            _check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
-        _check_size(path, sum(info.file_size for info in archive.infolist()))
+            check_size(path, max(info.file_size, 8 * int(np.prod(shape, dtype=float))))
+        check_size(path, sum(info.file_size for info in archive.infolist()))
     with np.load(path, allow_pickle=False) as arrays:
         for name in arrays.files:
             columns.add(name, arrays[name])
@@ -152,9 +159,7 @@ def _load_npz(path: Path, columns: Columns) -> None:
 
 def _load_npy(path: Path, columns: Columns) -> None:
     """One array, whose columns have no names unless its type states them."""
-    with path.open("rb") as file:
-        _check_size(path, 8 * int(np.prod(npy_shape(file), dtype=float)))
-    array = np.load(path, allow_pickle=False)
+    array = read_npy(path)
     if array.dtype.names:
         for name in array.dtype.names:
             columns.add(name, array[name])
@@ -167,69 +172,25 @@ def _load_npy(path: Path, columns: Columns) -> None:
     name_headerless(columns)
 
 
+def read_npy(path: Path) -> np.ndarray:
+    """Array of a .npy.
+
+    Raises:
+        DataError: larger than a table may be.
+        ValueError: damaged, or of Python's objects.
+    """
+    with path.open("rb") as file:
+        check_size(path, 8 * int(np.prod(npy_shape(file), dtype=float)))
+    array: np.ndarray = np.load(path, allow_pickle=False)
+    return array
+
+
 def npy_shape(member: Any) -> tuple[int, ...]:
     """Shape of the array that an open .npy states."""
     version = np.lib.format.read_magic(member)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape: tuple[int, ...] = read(member)[0]
     return shape
-
-
-def _load_mat(path: Path, columns: Columns) -> None:
-    scipy_io = _module("scipy.io", path)
-    try:
-        size = sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in scipy_io.whosmat(path))
-        has_objects = False
-    except TypeError:  # scipy reads no header of an object
-        size, has_objects = _unpacked_bytes(path), True
-    _check_size(path, size)
-    try:
-        with warnings.catch_warnings(action="ignore"):  # objects share a name
-            content = scipy_io.loadmat(path, simplify_cells=True)
-    except Exception as error:  # scipy raises whatever damaged bytes lead to
-        if not has_objects:
-            raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
-        content = {}
-    for name, value in _flat(content):
-        labels = [str(label) for label in np.ravel(content.get(f"{name}_label", []))]  # as Mission Planner writes a log
-        if np.ndim(value) == 2 and len(labels) == value.shape[1]:
-            for label, column in zip(labels, value.T, strict=True):
-                columns.add(f"{name}/{label}", column)
-        else:
-            columns.add(name, value)
-    if has_objects:
-        fix = "Save arrays from MATLAB (of an object struct(...), of a table table2array), or a table with writetable as CSV"
-        if not columns.values:
-            raise DataError("holds MATLAB objects, as tables and timetables are", where=path, expected="arrays", fix=fix)
-        columns.remarks.losses.append(f"its MATLAB objects are left out. {fix}")
-
-
-def _unpacked_bytes(path: Path) -> int:
-    """Bytes of the elements of a .mat file, unpacked; no further than the limit."""
-    with path.open("rb") as file:
-        order = "<" if file.read(MAT_HEADER).endswith(b"IM") else ">"
-        total = 0
-        while len(tag := file.read(8)) == 8 and total <= LIMIT:
-            kind, size = struct.unpack(f"{order}II", tag)
-            if kind != MAT_COMPRESSED:
-                total += size
-                file.seek(size, 1)
-                continue
-            unpacker, packed = zlib.decompressobj(), file.read(size)
-            while packed and total <= LIMIT:
-                total += len(unpacker.decompress(packed, MAT_STEP))
-                packed = unpacker.unconsumed_tail
-    return total
-
-
-def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Arrays of nested structures, with dotted names."""
-    for name, value in content.items():
-        if not name.startswith("__"):
-            if isinstance(value, dict):
-                yield from _flat(value, f"{prefix}{name}.")
-            elif isinstance(value, np.ndarray | int | float):
-                yield f"{prefix}{name}", value
 
 
 def _load_hdf5(path: Path, columns: Columns) -> None:
@@ -252,7 +213,7 @@ def _load_hdf5(path: Path, columns: Columns) -> None:
             return
         if node.external or node.is_virtual:
             raise DataError(f"{name} lies in another file", where=path, fix="Copy it into this file")
-        _check_size(path, node.size * 8)
+        check_size(path, node.size * 8)
         unit = node.attrs.get("units", node.attrs.get("unit", ""))
         columns.add(name, node[()], _plain(unit))
 
@@ -272,14 +233,9 @@ def _plain(attribute: Any) -> str:
     return attribute.decode(errors="replace") if isinstance(attribute, bytes) else str(attribute)
 
 
-def _refuse_sheet(path: Path, columns: Columns) -> None:
-    fix = "Save the sheet as CSV (UTF-8), and convert that"
-    raise DataError("is a spreadsheet", where=path, expected="a table of text, Parquet, .npz, .mat or HDF5", fix=fix)
-
-
-def _check_size(path: Path, size: int) -> None:
-    if size > LIMIT:
-        raise DataError(f"unpacks to {size} bytes", where=path, expected=f"at most {LIMIT}")
+def _refuse_sheets(path: Path, columns: Columns) -> None:
+    fix = "Save it as .xlsx or CSV (UTF-8), and convert that"
+    raise DataError("is a spreadsheet of another format", where=path, expected=".xlsx or .xls", fix=fix)
 
 
 def _module(name: str, path: Path) -> Any:
@@ -293,7 +249,7 @@ LOADERS: dict[str, Callable[[Path, Columns], None]] = {
     "feather": _load_feather,
     "npz": _load_npz,
     "npy": _load_npy,
-    "mat": _load_mat,
+    "mat": load_mat,
     "hdf5": _load_hdf5,
-    "sheet": _refuse_sheet,
+    "other sheets": _refuse_sheets,
 }

@@ -2,11 +2,13 @@
 
 The tables become groups: `gyro` and `accel`, or `imu` and `ground_truth`, and those of other files by their names. Poses are
 true by the name of their file, or where a motion capture wrote it; else they are the group `poses`. A table that holds a time
-alone (`time.csv` of gnss-ins-sim) is the clock of those that have none and as many rows.
+alone (`time.csv` of gnss-ins-sim) is the clock of those that have none and as many rows. A folder of .npy arrays, with a time
+among them, is a table too if it has the name of a sensor (`gyro/t` and `gyro/value` of comma2k19).
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from contextlib import suppress
 from functools import lru_cache
@@ -19,8 +21,9 @@ import numpy as np
 from imutool.errors import ConfigError, DataError
 
 from . import Sequence
+from ._archive import refusing
 from ._source import find_folders, head
-from ._table_files import kind_of, load, npy_shape
+from ._table_files import NO_NUMBERS, kind_of, load, npy_shape, read_npy
 from ._table_groups import TRUE_GROUPS, has_poses, known_layout
 from ._table_headerless import name_headerless
 from ._table_map import IMU_GROUP
@@ -56,7 +59,10 @@ ENDINGS = (
     ".arrow",
     ".h5",
     ".hdf5",
+    ".xlsx",
+    ".xls",
 )
+logger = logging.getLogger(__name__)
 TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"
 
 
@@ -111,11 +117,30 @@ def _tables(folder: Path) -> list[Path]:
     """Tables of a folder; narrow ones only beside a clock, which is none of them."""
     files = _files(folder)
     clocks = [path for path in files if _is_clock(path)]
-    return [path for path in files if path not in clocks and (kind_of(head(path), path) or (clocks and _is_narrow(path)))]
+    tables = [path for path in files if path not in clocks and (kind_of(head(path), path) or (clocks and _is_narrow(path)))]
+    return [*tables, *_sensor_folders(folder)]
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if Path(table_name(path)).suffix.lower() in ENDINGS)
+
+
+def _sensor_folders(folder: Path) -> list[Path]:
+    """Folders of arrays, those of a gyroscope and of an accelerometer among them; else none."""
+    folders = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    if {*sensors_among(path.name for path in folders).values()} != {*SENSORS}:
+        return []
+    return [path for path in folders if any(_is_time(array) for array in _arrays(path))]
+
+
+def _arrays(folder: Path) -> list[Path]:
+    """Arrays of a folder, by their first bytes; their times first."""
+    found = [path for path in folder.iterdir() if kind_of(head(path), path) == "npy"]
+    return sorted(found, key=lambda path: (not _is_time(path), path.name))
+
+
+def _is_time(path: Path) -> bool:
+    return re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0]) is not None
 
 
 def _recordings(folder: Path) -> dict[str, list[Path]]:
@@ -148,7 +173,7 @@ def _is_narrow(path: Path) -> bool:
 
 def _is_clock(path: Path) -> bool:
     """Whether a table is named as a time and holds nothing else."""
-    if not re.fullmatch(rf"(.*_)?{TIME_WORDS}", split_name(_stem(path))[0]):
+    if not _is_time(path):
         return False
     if kind_of(head(path), path) != "npy":
         return _is_narrow(path) and not is_text_table(head(path), 2)
@@ -186,9 +211,14 @@ def _load(path: Path) -> Columns:
     Raises:
         DataError: damaged, or without numbers.
     """
+    part = Columns()
+    if path.is_dir():
+        for array in _arrays(path):
+            with refusing(array):
+                part.add(_stem(array), read_npy(array))
+        return part
     if not _is_narrow(path):
         return load(path, kind_of(head(path), path))
-    part = Columns()
     read_csv(text_of(read_bytes(path)), part, path, least=3 if is_text_table(head(path), 3) else 1)
     if not part.values:
         raise DataError("holds no columns of numbers", where=path)
@@ -256,8 +286,11 @@ def _looked(path: Path, mtime_ns: int, size: int) -> _Seen:  # the key notices a
         read_csv(start, columns, path)
         name_headerless(columns)
     elif kind not in ("csv", "") and size <= MOST_LOOKED:
-        with suppress(DataError, ConfigError):  # said when the file itself is named
+        try:
             columns = load(path, kind)
+        except (DataError, ConfigError) as error:
+            if not error.what.startswith(NO_NUMBERS):  # of a file of settings, say
+                logger.warning("left out: %s", error)
     if not columns.values:
         return _Seen(False, False, is_mocap(start))
     name_columns(columns, "")

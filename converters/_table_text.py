@@ -136,8 +136,9 @@ def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
     """Whether text has a row of at least so many numbers."""
     if b"\0" in head and not head.startswith(UTF16):
         return False
-    lines = text_of(head).splitlines()
-    rows = [line for line in lines[:-1] or lines if line.strip()]
+    text = text_of(head)
+    lines = text.splitlines()
+    rows = [line for line in (lines if text.endswith("\n") else lines[:-1] or lines) if line.strip()]  # the last may be cut
     delimiter = _delimiter(rows, least)
     return any(_is_row(row, delimiter, least) for row in rows[:LOOKED_AT])
 

@@ -1,4 +1,4 @@
-"""Table with a map of its columns: CSV, TSV, JSON, Parquet, .npz, MATLAB .mat or HDF5.
+"""Table with a map of its columns: CSV, .xlsx, JSON, Parquet, .npz, MATLAB .mat or HDF5.
 
 Columns and units are recognised from their names. What stays open is asked for: the refusal holds a map file to complete.
 """
@@ -22,7 +22,7 @@ from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
 from ._source import head, name
-from ._table_files import kind_of, load
+from ._table_files import kind_of, load, read_text
 from ._table_folder import POSES_GROUP, TRUTH_GROUP, load_split, sequences_below
 from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
 from ._table_map import (
@@ -42,6 +42,7 @@ from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
 from ._table_propose import propose
 from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
+from ._table_sheets import recordings
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
@@ -56,10 +57,16 @@ MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metada
 def sequences(source: Path) -> list[Sequence]:
     """The source itself, if it is a table; tables in folders, or `data.hdf5`."""
     if source.is_dir():
-        return sequences_below(source)
+        return [each for found in sequences_below(source) for each in _recordings(found)]
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a file or a folder")
-    return [Sequence(name(Path(table_name(source))), source)] if kind_of(head(source), source) else []
+    return _recordings(Sequence(name(Path(table_name(source))), source)) if kind_of(head(source), source) else []
+
+
+def _recordings(found: Sequence) -> list[Sequence]:
+    """The table, or the sheets of a spreadsheet that are recordings of their own."""
+    is_sheets = found.path.is_file() and kind_of(head(found.path), found.path) == "sheets"
+    return recordings(found, read_text) if is_sheets else [found]
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -75,7 +82,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
         DataError: the file cannot be read.
     """
     path = sequence.path
-    columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path))
+    columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path), sequence.inside)
     remarks, place = columns.remarks, mapping if isinstance(mapping, Path) else path
     asked = path / sequence.inside
     given = {} if mapping is None else within_groups(read_map(mapping), columns)
@@ -206,7 +213,10 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
 
 
 def _described(table: TableMap) -> dict[str, str]:
-    return {key: str(getattr(table, key)) for key in table.__struct_fields__}
+    """Entries of a map that say something; columns as `a, b, c`."""
+    stated, blank = msgspec.structs.asdict(table), msgspec.structs.asdict(TableMap())
+    said = {key: value for key, value in stated.items() if value != blank[key] or key == "topic"}
+    return {key: ", ".join(map(str, value)) if isinstance(value, list) else str(value) for key, value in said.items()}
 
 
 def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:

@@ -11,11 +11,14 @@ import imutool
 
 
 def main(source: str, folder: str, model: str = "static") -> None:
-    for log in imutool.convert(source, folder, overwrite=True).written:
+    for log in imutool.convert(source, f"{folder}/").written:  # with a slash it is a folder, also for one log
         debiased = log.with_name(f"{log.stem}_debiased.mcap")
-        report = imutool.debias(log, debiased, model=model, overwrite=True)
+        report = imutool.debias(log, debiased, model=model)
         for topic, start in report.starts.items():
             print(f"{debiased}: {topic} with {report.models[topic]}, initial bias from {start.how}")
+        if not any(poses.kind == "truth" for poses in imutool.info(log).truth):
+            print("  without true poses there are no errors to show")
+            continue
         for result in imutool.evaluate(log, models=[model]):
             print(f"  {result['model']:>12}: orientation {result['aoe_deg']:8.2f} deg, position {result['ape_m']:8.2f} m")
 

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
-from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, closed_loop, figure, is_worth_a_round
+from imutool.diagnosis.closed_loop import CLOSED_LOG, ROUNDS, check_metric, closed_loop, figure, is_worth_a_round
 from imutool.diagnosis.diagnose import diagnose as diagnose_logs
 from imutool.diagnosis.estimation.aligned_log import DEFAULT
 from imutool.diagnosis.result import Diagnosis
@@ -94,6 +95,8 @@ def write(
             complete.mkdir(parents=True)
             remarks = _make(d, complete, logs, drawn)
             _publish(complete, folder, overwrite=overwrite)
+        except ImutoolError as error:
+            raise error.renamed({str(complete): str(folder)}) from error.__cause__
         finally:
             with contextlib.suppress(FileNotFoundError):
                 shutil.rmtree(partial)
@@ -113,12 +116,13 @@ def diagnose(
     metric: Callable[[Path], float] | None = None,
     overwrite: bool = False,
     tell: Callable[[int, int, str], None] | None = None,
+    names: Mapping[str, str] | None = None,
 ) -> tuple[Diagnosis, list[str]]:
     """Diagnosis of recordings, written to a folder if given; a remark for each file left out.
 
     With `close` its physics is simulated along `sim` or the recording's poses. What is missing against that log begins another
     search, for some rounds. `metric` is called with `sim` before the search; if it fails with the log that closes the loop, a
-    remark of the diagnosis says so.
+    remark of the diagnosis says so. `names` stand for the paths of logs in what is written.
 
     Raises:
         ConfigError: as `refuse`; with `close` several recordings, no folder, or an input that is no file or would be replaced;
@@ -132,11 +136,11 @@ def diagnose(
 
         return [load(real, imu=imu, truth=truth, findings=findings) for real in reals]
 
-    if metric is not None and not (close and sim is not None):
-        raise ConfigError("`metric` compares two simulations", fix="Give `close` and `sim`, or leave `metric` out")
+    if metric is not None:
+        check_metric(metric, closes=close and sim is not None)
     if close:
         _check_close(reals, sim, folder, overwrite=overwrite)
-    against = partial(diagnose_logs, reals, imu=imu, truth=truth, settings=settings, tell=tell)
+    against = partial(_diagnosed, names or {}, reals, imu=imu, truth=truth, settings=settings, tell=tell)
     search = partial(against, sim, signals=signals)
     if folder is None:
         return search(), []
@@ -156,6 +160,14 @@ def diagnose(
         own = None if metric is None or was is None else (metric, was)
         diagnosis = _closed(diagnosis, against, search, rewrite, simulated, folder, metric=own, overwrite=overwrite)
     return diagnosis, remarks
+
+
+def _diagnosed(names: Mapping[str, str], *args: Any, **options: Any) -> Diagnosis:
+    d = diagnose_logs(*args, **options)
+    real, sim = tuple(names.get(place, place) for place in d.real), names.get(d.sim or "", d.sim)
+    located = tuple(msgspec.structs.replace(at, log=names.get(at.log, at.log)) for at in d.located)
+    traces = tuple(replace(trace, path=names.get(trace.path, trace.path)) for trace in d.traces)
+    return replace(d, real=real, sim=sim, located=located, traces=traces)
 
 
 def _check_close(reals: Sequence[Location], sim: Location | None, folder: Path | None, *, overwrite: bool) -> None:
@@ -227,9 +239,13 @@ def _make(
             report.end()
             report = Forked(partial(_report, d, None))
     if seen:
-        _logs(seen, folder / LOG, drawn.ready() if drawn is not None else None)
+        from imutool.viewing.html.report import write_page
+
+        write_page(seen, folder / LOG, drawn=(drawn.ready() if drawn is not None else None) or {})
     if VIEW not in missing:
-        _recording(d, folder / VIEW)
+        from imutool.viewing.rerun.diagnosis import save
+
+        save(d, folder / VIEW)
     if REPORT not in missing:
         (folder / REPORT).write_text(report.result(), encoding="utf-8")
     for name in (LOG, REPORT, VIEW):
@@ -249,18 +265,6 @@ def _drawings(logs: Callable[[], list[RunData]]) -> dict[str, str]:
     from imutool.viewing.html.report import drawings
 
     return drawings(logs())
-
-
-def _logs(logs: list[RunData], path: Path, drawn: dict[str, str] | None) -> None:
-    from imutool.viewing.html.report import write_page
-
-    write_page(logs, path, drawn=drawn or {})
-
-
-def _recording(d: Diagnosis, path: Path) -> None:
-    from imutool.viewing.rerun.diagnosis import save
-
-    save(d, path)
 
 
 def _publish(complete: Path, folder: Path, *, overwrite: bool) -> None:

@@ -21,7 +21,7 @@ a sentence (``fix="Give `model`"``, ``expected="`init=prior`"``). The command li
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -65,6 +65,14 @@ class ImutoolError(Exception):
     def at(self, where: object) -> ImutoolError:
         """Error with its place filled in, by a caller that has the name of the file."""
         return self if self.where is not None else type(self)(self.what, where=where, expected=self.expected, fix=self.fix)
+
+    def renamed(self, names: Mapping[str, str]) -> ImutoolError:
+        """Error with other names of places in its text, such as that of a file whose temporary one it is about."""
+        texts = [self.what, self.where or "", self.expected, self.fix]
+        for place, name in names.items():
+            texts = [text.replace(place, name) for text in texts]
+        what, where, expected, fix = texts
+        return type(self)(what, where=where or None, expected=expected, fix=fix)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle with keyword arguments: errors of worker processes return to the parent."""

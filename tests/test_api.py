@@ -549,3 +549,18 @@ def test_arrays_are_trained_on_scored_and_diagnosed_as_their_logs_are(logs: Path
     assert [finding.effect for finding in found.findings] == ["gyro_scale"]
     with pytest.raises(imutool.errors.ConfigError, match="no log is given"):
         imutool.train([], tmp_path / "none.safetensors")
+
+
+def test_a_diagnosis_of_arrays_names_them_and_no_file_that_is_gone(tmp_path: Path) -> None:
+    """Arrays are a temporary log while they are diagnosed; its path stood in findings.json and on the page."""
+    real = replace(imutool.example_recording(7, duration_s=10.0), name="Halle 3/links")
+    found = imutool.diagnose([real, real], imutool.example_recording(7, duration_s=10.0), output=tmp_path / "found")
+    assert (found.report.real, found.report.sim) == (("Halle 3_links", "Halle 3_links (2)"), "flight_7")
+    written = [path.read_bytes().decode(errors="ignore") for path in sorted((tmp_path / "found").iterdir())]
+    assert len(written) >= 5
+    assert not [text for text in written if "/imutool-" in text]
+    page = (tmp_path / "found" / "log.html").read_text(encoding="utf-8")
+    assert "are not marked in Halle 3_links.mcap" not in page
+    with pytest.raises(imutool.errors.DataError, match="no simulation and no true poses") as refused:
+        imutool.diagnose(replace(real, truths={}))
+    assert "/imutool-" not in str(refused.value)

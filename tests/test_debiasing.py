@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 import torch
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
+from support.two_imus import write_two_imus
 
 from imutool.bias.model import BiasModel
 from imutool.bias.model_file import load, save
@@ -546,23 +547,6 @@ def test_models_on_the_command_line_are_for_all_or_for_a_topic(tmp_path: Path, m
     ):
         with pytest.raises(ConfigError, match=said):
             assigned(words)
-
-
-def write_two_imus(recording: Recording, log: Path, about: dict[str, str] | None = None, other: float = 0.1) -> tuple[str, str]:
-    imu = recording.imu
-    with log.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start("ros2", "test")
-        kind = writer.register_schema(schemas.IMU, "ros2msg", schemas.definition(schemas.IMU).encode())
-        for topic, change in (("/imu0", 0.0), ("/imu1", other)):
-            channel = writer.register_channel(topic, "cdr", kind)
-            payloads = encode_imu(imu.t_ns, imu.gyro + change, imu.accel, "body")
-            for k, (stamp, payload) in enumerate(zip(imu.t_ns.tolist(), payloads, strict=True)):
-                writer.add_message(channel, stamp, payload.tobytes(), stamp, k)
-        if about is not None:
-            writer.add_metadata("imutool", about)
-        writer.finish()
-    return "/imu0", "/imu1"
 
 
 def test_poses_that_make_no_sense_are_no_business_of_an_imu(recording: Recording, tmp_path: Path, model_file: Path) -> None:

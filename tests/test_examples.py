@@ -12,6 +12,7 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.in_process import run_script
 from support.saved_rrd import entities
@@ -59,6 +60,13 @@ def test_a_data_set_becomes_debiased_logs_with_smaller_errors(tmp_path: Path, ex
     errors = {kind: [float(v) for v in re.findall(rf"{kind}: orientation +([\d.]+)", printed)] for kind in ("raw", "static")}
     assert [len(values) for values in errors.values()] == [2, 2]
     assert max(errors["static"]) < min(errors["raw"])
+    imu = flight(3, duration_s=10.0).imu
+    header = "time [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+    rows = np.column_stack([imu.t_ns - imu.t_ns[0], imu.gyro, imu.accel])
+    np.savetxt(tmp_path / "blind.csv", rows, header=header, delimiter=",", comments="")
+    printed = example("convert_and_debias.py", "blind.csv", "blind")
+    assert "without true poses there are no errors to show" in printed
+    assert sorted(p.name for p in (tmp_path / "blind").iterdir()) == ["blind.mcap", "blind_debiased.mcap"]
 
 
 def test_a_model_is_trained_on_given_logs(tmp_path: Path, example: Example) -> None:

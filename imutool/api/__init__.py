@@ -8,22 +8,30 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import chain, count
 from numbers import Integral, Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, ImutoolError
 from imutool.file_location import Location, LogPath, location, several
 
 if TYPE_CHECKING:
     from imutool.recording import Recording
 
-LONGEST_NAME = 100  # of a file for a recording
+LONGEST_NAME = 200  # bytes of the name of a file for a recording
 Progress = Callable[[int, int], None]  # bytes done, bytes in all
 NamedProgress = Callable[[int, int, str], None]  # steps done, steps in all, the current step
 Init = str | Iterable[float]  # initial bias: the name of a method, or six numbers
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class GivenLogs(NamedTuple):
+    """Files or objects of logs; names of those that are recordings, by the place of their file."""
+
+    places: list[Location]
+    names: dict[str, str]
 
 
 class _Kind(NamedTuple):
@@ -81,8 +89,10 @@ def checked(function: Function) -> Function:
 @contextmanager
 def given_logs(
     logs: LogPath | Recording | Iterable[LogPath | Recording], parameter: str, *, least: int = 1
-) -> Iterator[list[Location]]:
+) -> Iterator[GivenLogs]:
     """Files or objects of one log or several; a recording is a file while they are used.
+
+    No error names such a file.
 
     Raises:
         ConfigError: none is given, or one is neither a path nor a recording.
@@ -91,19 +101,33 @@ def given_logs(
     from imutool.mcap_io.write import write
     from imutool.recording import Recording
 
-    places = list[Location]()
+    places, names = list[Location](), dict[str, str]()
     with ExitStack() as folders:
         for log in several(logs):
             if isinstance(log, Recording):
                 log.imu.check_rate(log.name)
                 folder = folders.enter_context(TemporaryDirectory(prefix="imutool-"))
-                places.append(Path(folder) / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', log.name)[:LONGEST_NAME] or parameter}.mcap")
+                name = _distinct(_file_name(log.name) or parameter, {*names.values()})
+                places.append(Path(folder) / f"{name}.mcap")
+                names[str(places[-1])] = name
                 write(log, places[-1])
             else:
                 places.append(location(log))
         if len(places) < least:
             raise ConfigError("no log is given", where=parameter, expected="one or more")
-        yield places
+        try:
+            yield GivenLogs(places, names)
+        except ImutoolError as error:
+            raise error.renamed(names) from error.__cause__
+
+
+def _file_name(name: str) -> str:
+    """Name of a recording as a file can have it on every system."""
+    return re.sub(r"[^\w ()+.-]", "_", name).encode()[:LONGEST_NAME].decode(errors="ignore").strip(" .")
+
+
+def _distinct(name: str, taken: set[str]) -> str:
+    return next(each for each in chain([name], (f"{name} ({number})" for number in count(2))) if each not in taken)
 
 
 def init_text(init: Init) -> str:

@@ -12,7 +12,6 @@ from imutool import diagnosis_output
 from imutool.api import NamedProgress, checked, given_logs
 from imutool.diagnosis.result import Diagnosis
 from imutool.diagnosis.second_simulation import along_samples
-from imutool.errors import ConfigError
 from imutool.file_location import LogPath, local, several
 from imutool.mcap_io.storage import output_conflicts
 from imutool.mcap_io.storage.output_conflicts import OutputFile, check_outputs
@@ -146,15 +145,15 @@ def diagnose(
         ['lever_arm']
     """
     folder = None if output is None else local(output, "output")
-    if metric is not None and not callable(metric):
-        raise ConfigError("`metric` is no function", expected="a function of the path of a simulated log")
     given = given_logs(reals, "reals"), given_logs([] if sim is None else [sim], "sim", least=0)
     with given[0] as logs, given[1] as sims, one_blas_thread():
-        check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], [logs, sims], overwrite=overwrite)
+        inputs = logs.places + sims.places
+        check_outputs([OutputFile("output", folder, files=diagnosis_output.FILES)], inputs, overwrite=overwrite)
         return diagnosis_output.diagnose(
-            logs,
-            sims[0] if sims else None,
+            logs.places,
+            next(iter(sims.places), None),
             folder,
+            names=logs.names | sims.names,
             imu=imu,
             truth=truth,
             signals=several(signals),

@@ -63,8 +63,8 @@ def train(
     from imutool.training.settings import placed, settings_of
 
     chosen = None if settings is None else build(settings_of(method), placed(method, settings), where="settings")
-    with given_logs(logs, "logs") as places:
-        files = [local(log, "logs") for log in places]
+    with given_logs(logs, "logs") as given:
+        files = [local(log, "logs") for log in given.places]
         check_outputs([OutputFile("out", out, output_conflicts.MODEL)], [files], overwrite=overwrite)
         return run(
             files,
@@ -125,7 +125,8 @@ def evaluate(
     """
     tum = OutputFile("trajectories", trajectories, files=("*.tum",), keeps=True, of_each="{}_*.tum")
     chosen = several(models)
-    with given_logs([log], "log") as (place,):
+    with given_logs([log], "log") as given:
+        (place,) = given.places
         check_outputs([tum], [place, chosen], overwrite=overwrite)
         return evaluation.evaluate(
             local(place, "log"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import msgspec
 import numpy as np
@@ -61,23 +61,11 @@ class Model(BiasModel):
         effects: Mapping[Sensor, tuple[LinearForm, ...]] | None = None,
     ) -> None:
         super().__init__(config, rate_hz, tensors)
-        self._given = effects
-        self.effects = self._forms()
+        self.effects = effects or {sensor: forms(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
         self.ode: neural_ode.Model | None = None
         if self.config.remainder:
             held = {name.removeprefix("ode."): value for name, value in self.tensors.items() if name.startswith("ode.")}
             self.ode = neural_ode.Model(self.config.ode, rate_hz, held)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """State for a copy or a pickle: effects are functions, which do not pickle, and the settings name them."""
-        return {name: value for name, value in self.__dict__.items() if name != "effects"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self.effects = self._forms()
-
-    def _forms(self) -> Mapping[Sensor, tuple[LinearForm, ...]]:
-        return self._given or {sensor: forms(sensor, self.config.effects(sensor) or ()) for sensor in SENSORS}
 
     @classmethod
     def shapes(cls, config: Settings) -> Shapes:

@@ -60,14 +60,7 @@ class Model(BiasModel):
         for sensor in SENSORS:
             values, vectors = np.linalg.eigh(self.tensors[f"covariance.{sensor}"])
             roots[sensor] = (vectors * np.sqrt(np.maximum(values, 0.0))).reshape(3, 3, 9)
-
-        def root_at(
-            t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
-        ) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
-            samples: dict[Sensor, Float64[np.ndarray, "n 3"]] = {"gyro": gyro, "accel": accel}
-            return {sensor: np.einsum("nj,ijp->nip", u, roots[sensor]) for sensor, u in samples.items()}
-
-        return root_at
+        return partial(_roots_at, roots)
 
 
 def _affine(
@@ -81,3 +74,14 @@ def _affine(
     """Bias rest + W u; a function of the module, so that a stream can be pickled."""
     bias: Float64[np.ndarray, "n 6"] = rest + np.concatenate([gyro @ by_gyro, accel @ by_accel], axis=1)
     return bias
+
+
+def _roots_at(
+    roots: Mapping[Sensor, Float64[np.ndarray, "3 3 p"]],
+    t_s: Float64[np.ndarray, " n"],
+    gyro: Float64[np.ndarray, "n 3"],
+    accel: Float64[np.ndarray, "n 3"],
+) -> Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]:
+    """Roots at each sample; a function of the module, as `_affine`."""
+    samples: dict[Sensor, Float64[np.ndarray, "n 3"]] = {"gyro": gyro, "accel": accel}
+    return {sensor: np.einsum("nj,ijp->nip", u, roots[sensor]) for sensor, u in samples.items()}

@@ -130,20 +130,7 @@ def load(path: Path, rate_hz: float) -> Model:
         ModelError: the file has no effect that a model can correct.
     """
     file = physics_file.read(path)
-    acting = file.acting(where=path)
-    parts: dict[Sensor, list[Part]] = {"gyro": [], "accel": []}
-    kept = [entry.name for entry in file.effect if not _is_corrected(entry, parts)]
-    without_name = acting[len(file.effect) : len(acting) - (file.bias is not None)]
-    for (effect, theta), variables in zip(without_name, _variables(file), strict=True):
-        if _needs_channel(variables):
-            kept.append(effect.equation)
-        else:
-            for acted_on in (sensor for sensor in SENSORS if sensor in effect.sensors):
-                parts[acted_on].append(_of_size_one(effect, theta, acted_on))
-    for sensor in SENSORS:
-        part = _matrix(file, sensor)
-        if part is not None:
-            parts[sensor].append(part)
+    parts, kept = _parts(file, path)
     if not any(parts.values()) and file.bias is None:
         listed = ", ".join(kept) or "nothing at all"
         raise ModelError(f"no effect can be corrected ({listed})", where=path, expected="a bias, or an effect in closed form")
@@ -158,6 +145,30 @@ def load(path: Path, rate_hz: float) -> Model:
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     model.card = {"name": path.stem, "sha256": sha256, "prior": f"bias of {path.name}", "not_taken": kept}
     return model
+
+
+def _parts(file: PhysicsFile, where: Path) -> tuple[dict[Sensor, list[Part]], list[str]]:
+    """Effects of each sensor that a model corrects, and what it does not."""
+    acting = file.acting(where=where)
+    parts: dict[Sensor, list[Part]] = {"gyro": [], "accel": []}
+    kept = [entry.name for entry in file.effect if not _is_corrected(entry, parts)]
+    without_name = acting[len(file.effect) : len(acting) - (file.bias is not None)]
+    for (effect, theta), variables in zip(without_name, _variables(file), strict=True):
+        if _needs_channel(variables):
+            kept.append(effect.equation)
+        else:
+            for acted_on in (sensor for sensor in SENSORS if sensor in effect.sensors):
+                parts[acted_on].append(_of_size_one(effect, theta, acted_on))
+    for sensor in SENSORS:
+        if (part := _matrix(file, sensor)) is not None:
+            parts[sensor].append(part)
+        for k, (form, theta, std) in enumerate(parts[sensor]):
+            parts[sensor][k] = replace(form, recipe=(_form, (file, where, sensor, k))), theta, std
+    return parts, kept
+
+
+def _form(file: PhysicsFile, where: Path, sensor: Sensor, place: int) -> LinearForm:
+    return _parts(file, where)[0][sensor][place][0]
 
 
 def _is_corrected(entry: Entry, parts: Mapping[Sensor, list[Part]]) -> bool:

@@ -66,7 +66,7 @@ def _form(sensor: Sensor) -> LinearForm:
     for axis, term in np.ndindex(3, TEMPERATURE_TERMS):
         pattern[axis, term, axis * TEMPERATURE_TERMS + term] = 1.0
     size = len(parameters)
-    return LinearForm(effect, sensor, parameters, np.zeros(size), np.arange(size), None, (), pattern)
+    return LinearForm(effect, sensor, parameters, np.zeros(size), np.arange(size), None, (), pattern, (_form, (sensor,)))
 
 
 FORMS: Mapping[Sensor, LinearForm] = {sensor: _form(sensor) for sensor in SENSORS}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -104,10 +105,14 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the words of the command line; an option that only other commands have is answered with this command's."""
         try:
-            return super().parse_args(ctx, args)
+            return super().parse_args(ctx, [*args])  # it takes them out one by one
         except Exception as error:  # click's own kinds of error are not exported by typer
             if hasattr(error, "possibilities"):
                 error.possibilities = instead_of(getattr(error, "option_name", ""), self)
+                files = (f"; the file of that name is ./{word}" for word in args if word[:1] == "-" and Path(word).exists())
+                error.message += next(files, "")  # type: ignore[attr-defined]
+            elif "extra argument" in getattr(error, "message", "") and self.name in ("debias", "repair"):
+                error.message += f". imutool fleet {self.name} takes many logs"  # type: ignore[attr-defined]
             raise
 
     def invoke(self, ctx: Any) -> Any:
@@ -155,8 +160,9 @@ class App(typer.Typer):
 
         def register(function: CommandFunctionType) -> CommandFunctionType:
             command = expanded(function)
+            text = re.sub(r"(?<!\n)\n(?!\n)", " ", inspect.getdoc(function) or "")  # without the lines of the source
             kind = type("Command", (cls or Command,), {"function": staticmethod(command)})
-            typer.Typer.command(self, name, cls=kind, **settings)(command)
+            typer.Typer.command(self, name, cls=kind, **{"help": text, **settings})(command)
             return function
 
         return register
@@ -187,7 +193,7 @@ app = App(
     add_completion=True,
 )
 
-Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="MCAP logs.")]
+Logs = Annotated[list[Path], typer.Argument(metavar="LOG", help="MCAP logs.")]
 Models = Annotated[list[str] | None, typer.Option("--model", help="Model file, a name that ships, or 'static'. Repeatable.")]
 Init = Annotated[str, typer.Option(help="Initial bias: auto, stationary, prior, truth, or gx,gy,gz,ax,ay,az (rad/s, m/s²).")]
 Smooth = Annotated[bool, typer.Option("--smooth", help="Use the whole log for each sample's bias: more accurate, not causal.")]

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from imutool.mcap_io.recovery.losses import Losses
 
 COLORS = {"good": "green", "usable": "yellow", "quarantine": "red"}
-SHOWN = 3  # intervals of a finding in the table; all of them are in the JSON
 
 
 @app.command(cls=listing("imutool.clean", "--rule"), epilog="Example: [bold]imutool clean robot.mcap robot_clean.mcap[/]")
@@ -125,18 +124,9 @@ def show(survey: Survey) -> None:
 
 def finding_rows(survey: Survey) -> list[tuple[str, ...]]:
     """Rows of the table of findings, the header first."""
-    rows: list[tuple[str, ...]] = [("rule", "count", "what was found", "done", "when s")]
-    for finding in survey.findings:
-        times = [_span(first - survey.start_ns, last - survey.start_ns) for first, last in finding.intervals_ns]
-        more = len(times) - SHOWN + finding.intervals_left_out
-        when = ", ".join(times[:SHOWN]) + (f" and {more} more" if more > 0 else "")
-        rows.append((finding.rule, str(finding.count), finding.what, finding.action, when or "whole log"))
-    return rows
-
-
-def _span(first_ns: int, last_ns: int) -> str:
-    first, last = f"{first_ns * 1e-9:.3f}", f"{last_ns * 1e-9:.3f}"
-    return first if first == last else f"{first}–{last}"
+    head = "rule", "count", "what was found", "done", "when s"
+    rows = ((one.rule, str(one.count), one.what, one.action, one.when(survey.start_ns)) for one in survey.findings)
+    return [head, *rows]
 
 
 REPAIRED = Written((".mcap", ".bag"))

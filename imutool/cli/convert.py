@@ -54,7 +54,9 @@ class Export(Report, frozen=True, tag="imutool.export/1"):
     cls=listing("imutool.converters", "--format"), epilog="Example: [bold]imutool convert MH_04_difficult.zip MH_04.mcap[/]"
 )
 def convert(
-    source: Annotated[Path, typer.Argument(help="Bag, log, table, sequence folder or archive, or a folder of these.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SRC", help="Bag, log, table, sequence folder or archive, or a folder of these.")
+    ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="File for one sequence, folder (or NAME/) for several."), LOGS],
     format: Annotated[str, typer.Option(help="auto, or a name from the list below.")] = "auto",
     sequence: Annotated[list[str] | None, typer.Option(help="Convert only this sequence. Repeatable.")] = None,
@@ -114,7 +116,9 @@ def _tell(report: ConvertReport, common: Common) -> None:
         for path in report.written:
             say(str(path))
     if not common.quiet:
-        for note in _grouped(report.notes):
+        bare = [path for path in report.written if path.suffix.lower() != ".mcap"]
+        asked = [f"{path} is a log, although its name does not end in .mcap; for a folder add a slash" for path in bare]
+        for note in [*_grouped(report.notes), *asked]:
             tell_warning(note, "note")
     for loss in _grouped(report.losses):
         tell_warning(loss)
@@ -131,10 +135,10 @@ def _grouped(sentences: list[str]) -> list[str]:
     """Sentences `LOG: TEXT`, each text once, in front of it the first of its logs and the number of the others."""
     logs: dict[str, list[str]] = {}
     for sentence in sentences:
-        log, _, text = sentence.partition(": ")
-        logs.setdefault(text, []).append(log)
+        log, colon, text = sentence.partition(": ")
+        logs.setdefault(colon + text, []).append(log)
     others = {text: f" and {len(names) - 1} other{'s' if len(names) > 2 else ''}" for text, names in logs.items()}
-    return [f"{names[0]}{others[text] if len(names) > 1 else ''}: {text}" for text, names in logs.items()]
+    return [f"{names[0]}{others[text] if len(names) > 1 else ''}{text}" for text, names in logs.items()]
 
 
 @app.command(epilog="Example: [bold]imutool export MH_04_debiased.mcap MH_04_debiased --format euroc[/]")

@@ -41,7 +41,7 @@ Metric = Annotated[
 @app.command(epilog="Example: [bold]imutool diagnose real.mcap --sim sim.mcap -o diagnosis[/]")
 def diagnose(
     reals: Annotated[
-        list[Path], typer.Argument(metavar="REAL...", help="Recordings; several share the physics, each has its own bias.")
+        list[Path], typer.Argument(metavar="REAL", help="Recordings; several share the physics, each has its own bias.")
     ],
     sim: Sim = None,
     signal: Annotated[

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imutool.cli.app import COMMON, App, Common, Imu, Init, Smooth, Truth, Written, app, expanded, with_options
+from imutool.cli.app import COMMON, App, Common, Init, Smooth, Truth, Written, app, expanded, with_options
 from imutool.cli.debias import FORCE_HELP, VERIFY_HELP
 from imutool.cli.parameters import with_flags
 from imutool.cli.terminal import say
@@ -33,6 +33,10 @@ UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 SHOWN = 10  # logs that are not whole; all are in fleet.parquet
 PAGES_HELP = "Also write a page for each log, with a link from --report; it takes 5 to 10 s for a log of minutes."
 RESUME = "Continue an earlier run: skip finished logs."
+Imus = Annotated[
+    list[str] | None,
+    typer.Option("--imu", help="IMU topic, where logs have several. Repeatable: each log uses those of them that it has."),
+]
 CODES = "\n\nExit code: 0 all logs are intact; 3 data were lost or quarantined; else the largest code of the failed logs."
 
 
@@ -103,7 +107,7 @@ def debias(
     clean: Annotated[bool, typer.Option(help="Also clean the IMU; skip logs that cannot be trusted.")] = True,
     verify: Annotated[str, typer.Option(metavar="all|imu|none", help=VERIFY_HELP)] = "imu",
     pages: Annotated[bool, typer.Option("--pages", help=PAGES_HELP)] = False,
-    imu: Imu = None,
+    imu: Imus = None,
 ) -> Settings:
     """Debias every log, as `imutool debias --clean` does."""
     from imutool.bias_start.model_choice import check_smooth
@@ -117,7 +121,7 @@ def debias(
 
         require_matplotlib()
     start = {"init": init, "smooth": smooth, "force": force}
-    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imu=imu)  # type: ignore[arg-type]
+    settings = Settings(command="debias", model=model, **start, clean=clean, check=verify, pages=pages, imu=_one_or_more(imu))  # type: ignore[arg-type]
     return with_model_hash(settings)
 
 
@@ -153,7 +157,7 @@ def diagnose(
         ),
     ] = None,
     search: Annotated[bool, typer.Option(help="Also search each log for other physics.")] = True,
-    imu: Imu = None,
+    imu: Imus = None,
     truth: Truth = None,
 ) -> Settings:
     """Compare one kind of sensor on many robots: shared parameters and outliers."""
@@ -170,9 +174,13 @@ def diagnose(
         sim=None if where is None else str(where),
         robot_from=robot_from,
         quick=not search,
-        imu=imu,
+        imu=_one_or_more(imu),
         truth=truth,
     )
+
+
+def _one_or_more(imus: list[str] | None) -> str | tuple[str, ...] | None:
+    return None if not imus else imus[0] if len(imus) == 1 else tuple(imus)
 
 
 def _show(done: FleetReport, target: str, report: str | None) -> None:

@@ -57,7 +57,7 @@ class CatalogReport(Report, frozen=True, tag="imutool.catalog/1"):
 
 @fleet.command("view", epilog="Example: [bold]imutool fleet view debiased/ --web[/]")
 def view(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="OUT folders of `imutool fleet`, of the same logs.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR", help="OUT folders of `imutool fleet`, of the same logs.")],
     worst: Annotated[int, typer.Option(min=1, help="Number of logs to list and to open.")] = 10,
     by: Annotated[str | None, typer.Option(metavar="MEASURE", help=BY_HELP)] = None,
     web: Annotated[bool, typer.Option("--web", help="Open in a browser on this machine instead of a viewer.")] = False,

@@ -39,7 +39,7 @@ class LiveReport(Report, frozen=True, tag="imutool.live/1"):
 
 @app.command(epilog="Example: [bold]imutool live log.mcap[/] or [bold]imutool live --from udp://127.0.0.1:5005[/]")
 def live(
-    log: Annotated[str | None, typer.Argument(metavar="[LOG]", help="An MCAP log to replay at its own speed.")] = None,
+    log: Annotated[str | None, typer.Argument(metavar="LOG", help="An MCAP log to replay at its own speed.")] = None,
     source: Annotated[str | None, typer.Option("--from", metavar="SOURCE", help=FROM_HELP, show_default=False)] = None,
     model: Annotated[str, typer.Option(help=MODEL_HELP)] = "static",
     imu: Imu = None,

@@ -49,7 +49,7 @@ def models(common: Common = COMMON) -> None:
 
 @app.command(epilog="Example: [bold]imutool schema info[/]")
 def schema(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="A report, such as info; by default list all.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="A report, such as info; by default list all.")] = None,
     verbose: Verbose = False,
     quiet: Quiet = False,
 ) -> None:

@@ -48,7 +48,7 @@ class SimulationReport(Report, frozen=True, kw_only=True, tag="imutool.simulatio
 @app.command(epilog="Example: [bold]imutool simulate V1_02.mcap sim.mcap --physics physics.toml --noise adis16448 --seed 1[/]")
 def simulate(
     trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="An MCAP log with poses.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="New log with the simulated IMU and the poses."), LOG],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="New log with the simulated IMU and the poses."), LOG],
     physics: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Physics of the sensor; by default ideal.")] = None,
     noise: Annotated[str, typer.Option(metavar="NAME|FILE.toml", help="none, adis16448, bmi160, or a TOML file.")] = "none",
     rate: Annotated[
@@ -66,6 +66,7 @@ def simulate(
 
     It moves along the poses of a log, or as the samples of a simulated IMU say.
     """
+    from imutool.file_location import local
     from imutool.sensor.simulate import simulate as run
 
     along = None
@@ -76,7 +77,7 @@ def simulate(
     with common.progress("Simulating") as tell:
         simulation = run(
             trajectory,
-            target,
+            local(target, "target"),
             physics=physics,
             noise=noise,
             rate_hz=rate,

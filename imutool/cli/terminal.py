@@ -111,7 +111,10 @@ def _print(columns: Sequence[Sequence[str]], width: int) -> None:
     from rich.table import Table
 
     grid = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    tall = any("\n" in cell for _, *cells in columns for cell in cells)  # what a row begins with stands in its first line
+    folds = out.is_terminal and width > out.width
+    tall = folds or any(
+        "\n" in cell for _, *cells in columns for cell in cells
+    )  # what a row begins with stands in its first line
     for header, *cells in columns:
         numbers = all(NUMBER.fullmatch(cell) for cell in cells)
         grid.add_column(header, overflow="fold", justify="right" if numbers else "left", vertical="top" if tall else "bottom")
@@ -133,7 +136,8 @@ def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwri
         return False
     text = json_text(report)
     if where == "-":
-        sys.stdout.write(text)
+        sys.stdout.flush()
+        sys.stdout.buffer.write(text.encode())  # JSON is UTF-8, whatever the terminal is
         return True
     with Target(to_location(where), overwrite=overwrite) as target:
         target.write(text.encode())
@@ -166,11 +170,14 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, i
     from rich.progress import BarColumn, Progress, TextColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.percentage:>3.0f} %"))
-    with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, transient=True) as bar:
+    shown = err.is_terminal or err.is_jupyter  # elsewhere the library would print an empty line
+    room = max(err.width - len(what) - 26, 8)  # a longer word would take it from the bar
+    with Progress(*columns, TextColumn("{task.fields[word]}"), console=err, transient=True, disable=not shown) as bar:
         task = bar.add_task(what, total=None, word="")
 
         def tell(done: int, total: int, word: str) -> None:
-            bar.update(task, completed=done, total=total, word=plain(word))
+            short = plain(word) if len(word) <= room else f"{plain(word)[: room - 1]}…"
+            bar.update(task, completed=done, total=total, word=short)
             if word:
                 logger.info("%s %s", what, word)
 

@@ -24,10 +24,10 @@ from imutool.report import UNSET, Report, Section, UnsetType
 )
 def train(
     logs: Logs,
-    model: Annotated[Path, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model."), MODEL],
+    model: Annotated[str, typer.Option("-o", "--output", metavar="MODEL.safetensors", help="File of the new model."), MODEL],
     method: Annotated[str, typer.Option(help="Bias model from the list below.")] = "hybrid",
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.fit.TrainSettings lists them.")
+        Path | None, typer.Option(metavar="FILE.toml", help="Settings; imutool.training.settings.TrainSettings lists them.")
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="key=value", help="Change one setting. Repeatable.")
@@ -46,11 +46,12 @@ def train(
     """Train a bias model on logs of one sensor with true poses."""
     registry.load("imutool.bias", method, "method")  # refuse a wrong name before reading any log
     from imutool.config import load
+    from imutool.file_location import local
     from imutool.processes.forked import forking
     from imutool.training.run import train as run
     from imutool.training.settings import full_name, settings_of
 
-    words: list[str] = []
+    place, words = local(model, "model"), list[str]()
     if physics is not None:
         words, left = _named_by(physics, method)
         if left:
@@ -60,7 +61,7 @@ def train(
     with forking(), common.progress("Training") as tell:
         trained = run(
             logs,
-            model,
+            place,
             method=method,
             settings=settings,
             device=device,
@@ -70,7 +71,7 @@ def train(
             overwrite=common.overwrite,
             progress=lambda epoch: tell(*epoch_line(epoch)),
         )
-    if not common.write(training_report(model, trained.card), replace=resume):
+    if not common.write(training_report(place, trained.card), replace=resume):
         if "left_out" in trained.card and not common.quiet:
             with redirect_stdout(sys.stderr):  # how the model was chosen is no result
                 left_out_table(trained.card["left_out"])

@@ -17,18 +17,18 @@ from typing import Any
 from imutool import registry
 from imutool.conversion import Failure
 from imutool.conversion.corrections import parse_corrections
-from imutool.conversion.unread_formats import ENOUGH, describe_unread
+from imutool.conversion.unread_formats import ENOUGH, describe_folder, describe_unread
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import first_bytes, local
+from imutool.mcap_io.storage.local import removed_if_empty
 from imutool.processes.system import processors
 from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
 AUTO = "auto"
 SUFFIX = ".mcap"
-OF_FOLDER = "Name the file itself: in a folder, tables whose columns show no IMU are left out"
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
@@ -97,20 +97,16 @@ def convert(
     if sequences:
         source_sequences = _only(source_sequences, sequences)
     names = source_sequences.names()
-    targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
-    jobs = [
-        replace(ways, converter=job.converter, sequence=job.sequence, target=target)
-        for job, target in zip(source_sequences.jobs, targets, strict=True)
-    ]
-    if len(names) == 1 and source_sequences.errors:
-        raise source_sequences.errors[0][1]
-    _check_targets(jobs)
-    outcomes: dict[int, Outcome] = {}
-    for number, outcome in run_jobs(jobs, _worker_count(workers, len(jobs))):
-        outcomes[number] = outcome
-        done = len(source_sequences.errors) + len(outcomes)
-        if progress is not None:
-            progress(done, len(names), jobs[number].sequence.name)
+    with removed_if_empty(Path(out).parent), removed_if_empty(Path(out)):
+        targets = _targets([job.sequence.name for job in source_sequences.jobs], out, many=len(names) > 1)
+        jobs = [
+            replace(ways, converter=job.converter, sequence=job.sequence, target=target)
+            for job, target in zip(source_sequences.jobs, targets, strict=True)
+        ]
+        if len(names) == 1 and source_sequences.errors:
+            raise source_sequences.errors[0][1]
+        _check_targets(jobs)
+        outcomes = _outcomes(jobs, len(names), _worker_count(workers, len(jobs)), progress)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
     if len(names) == 1 and failed:
         raise failed[0][1]
@@ -119,6 +115,16 @@ def convert(
         if outcome.error is None:
             report.add(jobs[number].target, outcome)
     return report
+
+
+def _outcomes(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
+    """Outcomes of jobs by their numbers; `of` counts also sequences that cannot be read, and are no jobs."""
+    outcomes: dict[int, Outcome] = {}
+    for number, outcome in run_jobs(jobs, workers):
+        outcomes[number] = outcome
+        if progress is not None:
+            progress(of - len(jobs) + len(outcomes), of, jobs[number].sequence.name)
+    return outcomes
 
 
 def _find(source: Path, format: str, out: Path) -> _Sequences:
@@ -148,12 +154,12 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
         apart = ((key, log) for key, own in found for log in own if not log.path.resolve().is_relative_to(out.resolve()))
         claims = {str(log): [Job(key, log)] for key, log in apart}
     if not claims:
-        what, fix = ("", "") if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
+        what, fix = describe_folder(source) if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
         raise DataError(
             f"no sequence found: {what}" if what else "no sequence found",
             where=source,
             expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
-            fix=OF_FOLDER if source.is_dir() else fix,
+            fix=fix,
         )
     for place, jobs in claims.items():
         if len(jobs) > 1:

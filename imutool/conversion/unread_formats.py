@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from pathlib import Path
 
 from imutool.file_location import compression
 
@@ -47,6 +49,16 @@ def describe_unread(start: bytes) -> tuple[str, str]:
         return f"it is compressed with {program}", f"Unpack it first, for instance with {program} -d"
     found = (said for pattern, said in FORMATS.items() if re.match(pattern, start, re.DOTALL))
     return next(found, WITHOUT_NUMBERS if _is_text(start) else ("", ""))
+
+
+def describe_folder(folder: Path) -> tuple[str, str]:
+    """What a folder is in which no recording was found, and what to do."""
+    if any(files for _, _, files in os.walk(folder)):
+        return (
+            "",
+            "Name the file, or a folder nearer to it: four levels are searched, and tables that show no IMU are left out",
+        )
+    return "it holds no files", "See whether the recording lies elsewhere"
 
 
 def _is_text(start: bytes) -> bool:

@@ -15,6 +15,7 @@ from imutool.conversion.message_writer import write_log
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
 from imutool.mcap_io.log import Log
+from imutool.mcap_io.storage.target import writing
 from imutool.mcap_io.write import write
 from imutool.processes.worker_pool import WorkerBugError, WorkerPool
 from imutool.recording import Recording
@@ -64,6 +65,10 @@ def _convert_one(job: Job) -> Outcome:
             raise ConfigError(f"{job.converter} reads no tables", where="mapping", expected="a table")
         content = module.read_sequence(job.sequence, images=job.images, **given)
         return write_content(content, job)
+    except DataError as error:
+        known = error.where is not None and str(job.sequence.path) in error.where
+        where = str(job.sequence) if error.where is None else f"{job.sequence}: {error.where}"
+        return Outcome(error if known else type(error)(error.what, where=where, expected=error.expected, fix=error.fix))
     except ImutoolError as error:
         return Outcome(error)
 
@@ -75,7 +80,9 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         ImutoolError: it cannot be written.
     """
     if job.correct:
-        with TemporaryDirectory(prefix=".imutool-", dir=job.target.parent) as folder:
+        with writing(job.target):
+            holder = TemporaryDirectory(prefix=".imutool-", dir=job.target.parent)
+        with holder as folder:
             recorded = Path(folder) / job.target.name
             outcome = write_content(content, replace(job, target=recorded, correct=()))
             ways = {"compression": job.compression}

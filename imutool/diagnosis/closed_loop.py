@@ -93,6 +93,18 @@ def script_metric(script: Path, real: Path) -> Callable[[Path], float]:
     return metric
 
 
+def check_metric(metric: object, *, closes: bool) -> None:
+    """Check that a metric is a function, and that there are two simulations to compare by it.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if not callable(metric):
+        raise ConfigError("`metric` is no function", expected="a function of the path of a simulated log")
+    if not closes:
+        raise ConfigError("`metric` compares two simulations", fix="Give `close` and `sim`, or leave `metric` out")
+
+
 def figure(metric: Callable[[Path], float], log: Path) -> float:
     """Figure of a simulation's log by the user's metric.
 

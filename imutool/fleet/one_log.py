@@ -17,8 +17,10 @@ import msgspec
 from imutool.cleaning import UntrustedError
 from imutool.errors import LOST, ConfigError, ImutoolError, LogError, ModelError
 from imutool.file_location import Location, exists, identity, is_file, to_location
-from imutool.fleet.sources import partial_files, remove_files, simulation, within
+from imutool.fleet.sources import simulation
+from imutool.fleet.targets import is_current, page_name, partial_files, remove_files, within
 from imutool.fleet.task import Imu, Parameter, Result, Settings, Task
+from imutool.mcap_io.codec.joined_imu import parse_parts
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.losses import unchecked
 from imutool.mcap_io.storage.source import sha256
@@ -92,34 +94,6 @@ def _left_behind(task: Task) -> str:
     return ""
 
 
-def page_name(log: str) -> str:
-    """Name of the page about a log."""
-    return f"{without_suffix(log)}.html"
-
-
-def without_suffix(log: str) -> str:
-    """Name of a log without `.mcap`, in small or capital letters."""
-    return log[: -len(".mcap")] if log.lower().endswith(".mcap") else log
-
-
-def is_current(done: Result, target: Location, *, whole: bool = False) -> bool:
-    """Whether a target still has its recorded size and opens as a log.
-
-    With `whole`, whether its SHA-256 is unchanged.
-    """
-    if done.status == "quarantined":  # nothing was written
-        return True
-    try:
-        if identity(target)[0] != done.target_bytes or (done.page and not is_file(target.with_name(page_name(target.name)))):
-            return False
-        if whole or target.suffix.lower() != ".mcap":
-            return sha256(target) == done.target_sha256
-        with Log(target):
-            return True
-    except ImutoolError:
-        return False
-
-
 def _at_hand(settings: Settings, model: bytes | None) -> Settings:
     """Settings with the model file copied to this machine.
 
@@ -164,7 +138,7 @@ def _debias(job: _Job) -> dict[str, Any]:
     s = job.settings
     rules = CleaningSettings() if s.clean else None
     options: dict[str, Any] = {"init": s.init, "smooth": s.smooth, "force": s.force, "clean": rules, "check": s.check}
-    options["imus"] = () if s.imu is None else (s.imu,)
+    options["imus"] = _imus(job)
     report = debias(job.source, job.target, model=s.model, **options, overwrite=True)
     imus = tuple(
         Imu(topic, report.models[topic], start.how, tuple(start.rest[:3].tolist()), tuple(start.rest[3:].tolist()))
@@ -187,6 +161,23 @@ def _debias(job: _Job) -> dict[str, Any]:
     if s.pages:
         entries |= _page(job, list(report.starts), entries.get("warnings", ()))
     return entries
+
+
+def _imus(job: _Job) -> tuple[str, ...]:
+    """IMUs of a log among those that the settings name; none where they name none.
+
+    Raises:
+        LogError: it has none of them.
+    """
+    named = job.settings.imus
+    if not named:
+        return ()
+    with Log(job.source) as log:
+        found = tuple(imu for imu in named if {*(parse_parts(imu) or (imu,))} <= log.topics.keys())
+        if not found:
+            what = f"the log has no topic {' or '.join(named)}"
+            raise LogError(what, where=log.path, expected=log.listing(), fix="Give `imu` once more, for the IMU of this log")
+    return found
 
 
 def _page(job: _Job, topics: Sequence[str], warnings: tuple[str, ...]) -> dict[str, Any]:
@@ -254,7 +245,8 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     s = job.settings
     robot = robot_of(job.name, s.robot_from, job.source)
     sim = None if s.sim is None else simulation(to_location(s.sim), job.name)
-    fixed = effect_sizes(job.source, sim, imu=s.imu, truth=s.truth)
+    imu = next(iter(_imus(job)), None)
+    fixed = effect_sizes(job.source, sim, imu=imu, truth=s.truth)
     parameters = tuple(
         Parameter(physics.name, number.name, float(value), float(std), number.unit)
         for physics, theta in fixed.chosen
@@ -263,7 +255,7 @@ def _diagnose(job: _Job) -> dict[str, Any]:
     entries: dict[str, Any] = {"robot": robot, "parameters": parameters, "warnings": fixed.remarks}
     diagnosis: dict[str, Any] | UnsetType = UNSET
     if not s.quick:
-        found = diagnose([job.source], sim, imu=s.imu, truth=s.truth)
+        found = diagnose([job.source], sim, imu=imu, truth=s.truth)
         diagnosis = json_values(found.report)
         entries["effects"] = tuple(finding.effect for finding in found.findings)
         entries["warnings"] = tuple(dict.fromkeys((*fixed.remarks, *found.remarks)))
@@ -292,8 +284,3 @@ COMMANDS: dict[str, Callable[[_Job], dict[str, Any]]] = {
     "info": _info,
     "diagnose": _diagnose,
 }
-
-
-def target_name(name: str, command: str) -> str:
-    """Output name for a log: logs and bags keep their names, reports end in .json."""
-    return name if command in {"debias", "repair"} else f"{without_suffix(name)}.json"

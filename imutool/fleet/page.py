@@ -276,7 +276,7 @@ def _provenance(settings: Settings) -> Iterator[str]:
         entries["verified"] = f"structure, and contents: {settings.check}"
     if settings.command == "diagnose":
         entries |= {"robots": settings.robot_from or "by folder", "beside": settings.sim or "the true poses"}
-    entries |= {"IMU": settings.imu or "", "truth": settings.truth or ""}
+    entries |= {"IMU": ", ".join(settings.imus), "truth": settings.truth or ""}
     for name, value in entries.items():
         if value and (settings.command == "debias" or not name.startswith("model")):
             yield f"<dt>{text(name)}</dt><dd>{text(value)}</dd>"

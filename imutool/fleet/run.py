@@ -18,10 +18,11 @@ from imutool.fleet import results
 from imutool.fleet.engine import BUG, Engine
 from imutool.fleet.journal import NAME as JOURNAL
 from imutool.fleet.journal import Journal
-from imutool.fleet.one_log import page_name, target_name, write_json
+from imutool.fleet.one_log import write_json
 from imutool.fleet.results import FleetSummary, LogProblem
 from imutool.fleet.robots import Comparison, compare
-from imutool.fleet.sources import Found, find, partial_files, remove_files, with_simulations
+from imutool.fleet.sources import Found, find, with_simulations
+from imutool.fleet.targets import page_name, partial_files, remove_files, target_name
 from imutool.fleet.task import FINAL, Result, Settings, Source, Task
 from imutool.report import UNSET
 
@@ -144,13 +145,13 @@ def run(
     def tick(flying: int) -> None:
         tell(progress.bytes_done, progress.total_bytes, progress.line(flying))
 
-    with Journal(target, settings, resume=resume, overwrite=overwrite) as journal:
+    with engine() as workers, Journal(target, settings, resume=resume, overwrite=overwrite) as journal:  # workers first
         fleet.remove_partial()
         try:
             for result in fleet.refused(journal):
                 journal.finish(result)
                 progress.add(result)
-            with engine() as workers, closing(workers.run(fleet.tasks(journal), tick, model)) as finished:
+            with workers, closing(workers.run(fleet.tasks(journal), tick, model)) as finished:
                 for result in finished:
                     if result.status == "skipped":
                         fleet.skipped.add(result.key)
@@ -286,7 +287,6 @@ def _bytes(path: Path) -> bytes:
 
 
 def _key(where: str) -> str:
-    """Key of a refused log."""
     return hashlib.sha256(where.encode()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Source logs of a fleet, and their unique names below OUT."""
+"""Source logs of a fleet, each with its name below OUT."""
 
 from __future__ import annotations
 
@@ -8,26 +8,41 @@ import logging
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import msgspec
 
 from imutool.errors import ConfigError, redact
 from imutool.file_location import Location, exists, identity, io_errors, is_file, is_folder, reason, size_and_etag, to_location
+from imutool.fleet.targets import WEB, relative, shown
 from imutool.fleet.task import Source
 
 logger = logging.getLogger(__name__)
 
 LOG, BAG = ".mcap", ".bag"
-RAW = BAG, ".db3", ".ulg", ".csv", ".tsv", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".zip", ".tar", ".tgz", ".tar.gz"
+RAW = (
+    BAG,
+    ".db3",
+    ".ulg",
+    ".csv",
+    ".tsv",
+    ".xlsx",
+    ".parquet",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".zip",
+    ".tar",
+    ".tgz",
+    ".tar.gz",
+)
 CONVERT = "imutool convert makes logs of other recordings"
 PATTERN = re.compile(r"[*?\[]")
-LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
-PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8,24}\.partial", re.DOTALL)
-OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin
 
 
 class Found(NamedTuple):
@@ -80,7 +95,7 @@ def find(text: str, out: Location, *, bags: bool = False, once: bool = False) ->
                 raise ConfigError("is a pipe, a socket or a device", expected="a file", fix="Remove it")
             logs.append(Source(where, name, *(identity(Path(where)) if about is None else size_and_etag(about))))
         except ConfigError as error:
-            refused.append((_shown(where), str(error)))
+            refused.append((shown(where), str(error)))
     if not logs and not refused and outputs:
         what = f"its {outputs} logs lie below OUT ({redact(str(out))}), where outputs are and no sources"
         raise ConfigError(what, where=text, fix="Choose an OUT beside the logs")
@@ -112,7 +127,8 @@ def simulation(folder: Location, name: str) -> Location:
     Raises:
         ConfigError: there is none.
     """
-    found = folder if _ends(folder.name, (LOG,)) else folder / name
+    own = quote(name) if str(folder).startswith(WEB) else name
+    found = folder if _ends(folder.name, (LOG,)) else folder / own
     if not is_file(found):
         raise ConfigError("is not there", where=found, expected="the simulation of a log under the same name")
     return found
@@ -139,32 +155,6 @@ def with_simulations(found: Found, sim: str | None) -> Found:
         return source
 
     return Found([compared(source) for source in found.logs], found.refused)
-
-
-def relative(file: str, root: str) -> str:
-    """Name below OUT of a file below a root.
-
-    Raises:
-        ConfigError: the name leads elsewhere, or a terminal or a file system would not take it.
-    """
-    if not file.startswith(f"{root.rstrip('/')}/"):
-        raise ConfigError("lies outside the source", expected=f"something below {root}")
-    name = file[len(root.rstrip("/")) + 1 :]
-    parts = name.split("/")
-    if not name.isprintable() or _shown(name) != name:
-        raise ConfigError("has control characters in its name", expected="printable characters", fix="Rename the log")
-    if any(part in {"", ".", ".."} or "\\" in part for part in parts):
-        raise ConfigError("has a name that leads elsewhere", expected="plain folders and a plain name")
-    if parts[0].startswith(OWN) or any(part.startswith(".") for part in parts):
-        raise ConfigError("has a hidden name, or one that the fleet itself uses", fix="Rename the log")
-    if max(len(part.encode()) for part in parts) > LONGEST:
-        raise ConfigError(f"has a name of more than {LONGEST} bytes", fix="Rename the log")
-    return name
-
-
-def _shown(name: str) -> str:
-    """Printable name: bytes that are not UTF-8 become escapes."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _files(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]]:
@@ -229,7 +219,7 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
     try:
         if match is not None:
             found = root.fs.glob(root.path.rstrip("/") + text[len(fixed) :], detail=True)
-        elif fixed.startswith(("http://", "https://")) and _ends(fixed, endings):
+        elif fixed.startswith(WEB) and _ends(fixed, endings):
             found = {root.path: {}}  # one file: to list it, the library would fetch the whole log and look for links in it
         else:
             found = root.fs.find(root.path, detail=True)
@@ -249,52 +239,3 @@ def _in_store(text: str, endings: tuple[str, ...]) -> tuple[str, Iterator[_File]
         if about and about.get("type", "file") == "file" and _ends(path, endings)
     ]
     return whole, iter(files)
-
-
-def within(out: Location, name: str) -> Location:
-    """Target of a name below OUT.
-
-    Raises:
-        ConfigError: a link in OUT leads elsewhere.
-    """
-    target = out / name
-    if isinstance(target, Path) and isinstance(out, Path):
-        real = target.parent.resolve()
-        if not real.is_relative_to(out.resolve()):
-            raise ConfigError(f"leads to {real}, outside OUT", where=target.parent, fix="Remove the link")
-    return target
-
-
-def partial_files(out: Location, names: Iterable[str]) -> Iterator[Location]:
-    """Partial files that killed runs left beside these targets: .NAME.PID.RANDOM.partial."""
-    folders: dict[str, set[str]] = {}
-    for name in names:
-        folder, _, file = name.rpartition("/")
-        folders.setdefault(folder, set()).add(file)
-    for folder, ours in folders.items():
-        for path in _partial(out / folder if folder else out):
-            match = PARTIAL.fullmatch(path.name)
-            if match is not None and match["name"] in ours:
-                yield path
-
-
-def remove_files(leftover: Iterable[Location]) -> None:
-    """Remove files; a missing one is no error.
-
-    Raises:
-        ConfigError: the system refuses.
-    """
-    for path in leftover:
-        try:
-            path.unlink()
-        except FileNotFoundError:
-            continue
-        except io_errors(path) as error:
-            raise ConfigError(f"cannot be removed ({reason(error)})", where=path) from error
-
-
-def _partial(folder: Location) -> list[Location]:
-    try:
-        return list(folder.glob(".*.partial"))
-    except io_errors(folder) as error:
-        raise ConfigError(f"cannot be listed ({reason(error)})", where=folder) from error

@@ -33,10 +33,15 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     check: str = "imu"  # what of a new log is read back: all, imu or none
     damaged: str = "drop"
     sim: str | None = None
-    imu: str | None = None
+    imu: str | tuple[str, ...] | None = None  # of each log those that it has; a diagnosis takes the first of them
     truth: str | None = None
     robot_from: str | None = None  # a regular expression on the log's name, or metadata:RECORD.KEY; else its folder
     quick: bool = False  # diagnose: the effects that robots are compared by, and no search for others
+
+    @property
+    def imus(self) -> tuple[str, ...]:
+        """IMUs that are named."""
+        return self.imu if isinstance(self.imu, tuple) else () if self.imu is None else (self.imu,)
 
     @property
     def digest(self) -> str:

@@ -182,3 +182,9 @@ def plain(noise: Noise) -> dict[str, Any]:
 
 
 assert set(UNITS) == {field.name for field in msgspec.structs.fields(Noise)} - {"sources", "colour"}
+
+
+def unknown(noise: Noise) -> list[str]:
+    """Names of what a noise does not state: `gyro_walk`, or `gyro_walk (x, y)` of some axes."""
+    missing = {name: [axis for axis, value in zip("xyz", noise.values(name), strict=True) if np.isnan(value)] for name in UNITS}
+    return [name if len(axes) == len("xyz") else f"{name} ({', '.join(axes)})" for name, axes in missing.items() if axes]

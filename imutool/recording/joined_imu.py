@@ -224,7 +224,7 @@ def joined(
     """IMU on the gyro's stamps, with notes on what was interpolated and left out.
 
     Raises:
-        DataError: the two sensors share no time.
+        DataError: the two sensors share no time, or no sample of one is finite.
     """
     rates, forces = in_order(gyro_ns, gyro, f"{name} gyro"), in_order(accel_ns, accel, f"{name} accel")
     notes = rates.notes + forces.notes
@@ -233,6 +233,9 @@ def joined(
         alone = len(rates.t_ns) + len(forces.t_ns) - 2 * len(t_ns)
         notes += [f"{name}: {alone} samples that gyro or accel alone has are left out"] if alone else []
         return Imu(t_ns, rates.values[first], forces.values[second]), notes
+    for sensor, given, kept in (("gyro", gyro_ns, rates), ("accelerometer", accel_ns, forces)):
+        if len(given) and not len(kept.t_ns):
+            raise DataError(f"none of the {len(given)} samples of the {sensor} is finite", where=name, expected="numbers")
     if len(rates.t_ns) < 2 or len(forces.t_ns) < 2 or rates.t_ns[0] >= forces.t_ns[-1] or rates.t_ns[-1] <= forces.t_ns[0]:
         raise DataError("gyro and accelerometer share no time", where=name, expected="two sensors that run together")
     after = np.clip(np.searchsorted(forces.t_ns, rates.t_ns), 1, len(forces.t_ns) - 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from imutool import registry
 from imutool.errors import ConfigError
@@ -51,4 +52,8 @@ def trained(sensor: Sensor, names: Sequence[str] | None = None) -> tuple[LinearF
         raise ConfigError(f"{refused} does not act on the {sensor}", where=where, expected=f"some of {listed}")
     if names is not None and len(set(names)) < len(names):
         raise ConfigError(f"{', '.join(names)}: a name occurs twice", where=where, expected="each at most once")
-    return tuple(linear_form(effect, sensor) for effect in chosen)
+    return tuple(replace(linear_form(effect, sensor), recipe=(_form, (sensor, effect.name))) for effect in chosen)
+
+
+def _form(sensor: Sensor, name: str) -> LinearForm:
+    return trained(sensor, [name])[0]

@@ -7,10 +7,11 @@ takes the terms of the true motion, debiasing of the measured one, which differs
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from random import Random
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,8 @@ class LinearForm:
 
     columns: the signals' columns that are its terms; none where terms follow from `probes` (or the effect's own `basis`).
     base: values of the effect's parameters, zero but for those that training fixes; free: where the others stand.
+    recipe: a function of a module and its arguments that make the form again, for a copy or a pickle: an effect has functions
+        that do not pickle.
     """
 
     effect: Effect
@@ -51,6 +54,10 @@ class LinearForm:
     columns: Int64[np.ndarray, " q"] | None
     probes: tuple[Probe, ...]
     pattern: Float64[np.ndarray, "3 q p"]
+    recipe: tuple[Callable[..., LinearForm], tuple[Any, ...]] | None = None
+
+    def __reduce_ex__(self, protocol: Any) -> str | tuple[Any, ...]:
+        return self.recipe or super().__reduce_ex__(protocol)
 
     @property
     def name(self) -> str:
@@ -107,6 +114,11 @@ class CompiledEffects:
 
     matrix: Float64[np.ndarray, "60 3"]
     others: tuple[CompiledEffect, ...]
+    forms: tuple[LinearForm, ...]
+    theta: Float64[np.ndarray, " p"]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return compiled, (self.forms, self.theta)
 
     @property
     def wanted(self) -> int:
@@ -152,15 +164,15 @@ def terms_of(forms: Sequence[LinearForm], signals: Signals) -> Float64[np.ndarra
 
 def compiled(forms: Sequence[LinearForm], theta: Float64[np.ndarray, " p"]) -> CompiledEffects:
     """Several effects together, for given parameters in their order."""
-    matrix, others = np.zeros((COUNT, 3)), []
+    matrix, others, rest = np.zeros((COUNT, 3)), [], theta
     for form in forms:
         size = len(form.parameters)
-        own, theta = theta[:size], theta[size:]
+        own, rest = rest[:size], rest[size:]
         if form.columns is not None:
             matrix[form.columns] += form.matrix(own)
         else:
             others.append(form.compiled(own))
-    return CompiledEffects(matrix, tuple(others))
+    return CompiledEffects(matrix, tuple(others), tuple(forms), theta)
 
 
 @lru_cache(maxsize=256)

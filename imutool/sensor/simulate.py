@@ -254,9 +254,8 @@ def of_noise(noise: noises.Noise, rate_hz: float) -> Iterator[str]:
     """Remarks on what of a noise is not simulated."""
     if noise.colour is not None and not noise.colour.holds_at(rate_hz):
         yield f"the colour of the noise is that of {noise.colour.rate_hz:g} Hz, and not simulated at {rate_hz:g} Hz"
-    kinds = [name for name in noises.UNITS if "instability" not in name]
-    if lacking := [name for name in kinds if np.isnan(noise.values(name)).any()]:
-        yield f"{', '.join(lacking)} not known in the noise file, and not simulated"
+    if lacking := ", ".join(name for name in noises.unknown(noise) if "instability" not in name):
+        yield f"{lacking} not known in the noise file, and not simulated"
 
 
 def _rounded(rate_hz: float) -> float:

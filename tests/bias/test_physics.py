@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from imutool.bias.model_file import find_model
 from imutool.bias.physics import MOST_TAU_S, Model
-from imutool.bias_start.correction import apply
+from imutool.bias_start.correction import OnlineDebiaser, apply
 from imutool.bias_start.initial_bias import prior
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, ModelError
@@ -47,6 +48,10 @@ EFFECTS: Mapping[str, tuple[Mapping[str, float], float]] = {
     "clock_offset": ({"tau": 0.004}, BY_DERIVATIVE),
     "gyro_delay": ({"tau": 0.003}, BY_DERIVATIVE),
 }
+
+TERM = Term(signal="accel", term="omega_x omega_y", value=(0.2, 0.0, -0.1))
+BENT = (0.06, 0.0, 0.0), (0.0, 0.0, 0.0), (0.06, 0.0, 0.0)
+CURVE = Curve(signal="gyro", variable="f_x", unit="m/s²", x=(-3.0, 0.0, 3.0), y=BENT)
 
 
 def entry(name: str, values: Mapping[str, float], std: float | None = None) -> Entry:
@@ -115,12 +120,20 @@ def test_scale_misalignment_and_mount_together_are_exact(trajectory: Path, ideal
 
 
 def test_terms_and_curves_without_a_name_are_taken_off(trajectory: Path, ideal: Recording) -> None:
-    term = Term(signal="accel", term="omega_x omega_y", value=(0.2, 0.0, -0.1))
-    x = (-3.0, 0.0, 3.0)
-    curve = Curve(signal="gyro", variable="f_x", unit="m/s²", x=x, y=((0.06, 0.0, 0.0), (0.0, 0.0, 0.0), (0.06, 0.0, 0.0)))
-    file = written(trajectory.with_name("nameless.toml"), unknown=(curve,), term=(term,))
+    file = written(trajectory.with_name("nameless.toml"), unknown=(CURVE,), term=(TERM,))
     before, after = left(file, along(trajectory, file, "nameless"), ideal)
     assert after < FIRST_ORDER * before
+
+
+def test_an_online_debiaser_goes_to_another_process(trajectory: Path, ideal: Recording) -> None:
+    """Every effect that a file can hold, also those without a name."""
+    every = (entry(name, values) for name, (values, _) in EFFECTS.items())
+    path = written(trajectory.with_name("every.toml"), *every, unknown=(CURVE,), term=(TERM,))
+    online = OnlineDebiaser(find_model(path, RATE_HZ), with_covariance=True)
+    for t_ns, gyro, accel in zip(ideal.imu.t_ns[:20], ideal.imu.gyro, ideal.imu.accel, strict=False):
+        sent = pickle.loads(pickle.dumps(online))
+        here, there = online(int(t_ns), gyro, accel), sent(int(t_ns), gyro, accel)
+        np.testing.assert_array_equal(np.concatenate(there), np.concatenate(here))
 
 
 def test_blocks_and_single_samples_agree(trajectory: Path) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from imutool.bias.model_file import find_model, header_of, library, load, shared_model, shipped_for
+from imutool.bias_start.correction import OnlineDebiaser
 from imutool.conversion.run import convert
 from imutool.debiasing import debias
 from imutool.errors import ModelError
@@ -36,6 +39,24 @@ def test_a_worker_reads_a_model_once_and_again_when_its_file_has_changed(tmp_pat
     path.unlink()
     with pytest.raises(ModelError, match="No such file"):
         shared_model(path, 200.0)
+
+
+@pytest.mark.parametrize("with_covariance", [False, True])
+@pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)
+def test_an_online_debiaser_goes_to_another_process_in_the_middle_of_a_stream(path: Path, with_covariance: bool) -> None:
+    """Effects are functions inside functions, which do not pickle by themselves."""
+    model, rng = load(path), np.random.default_rng(1)
+    online = OnlineDebiaser(model, with_covariance=with_covariance)
+    stamps = 10**18 + np.arange(40) * round(1e9 / model.rate_hz)
+    u = rng.normal([0.0, 0.0, 0.0, 0.0, 0.0, 9.8], 0.5, (40, 6))
+    for t_ns, gyro, accel in zip(stamps[:20], u[:20, :3], u[:20, 3:], strict=True):
+        online(int(t_ns), gyro, accel)
+    sent = pickle.loads(pickle.dumps(online))
+    for t_ns, gyro, accel in zip(stamps[20:], u[20:, :3], u[20:, 3:], strict=True):
+        here, there = online(int(t_ns), gyro, accel), sent(int(t_ns), gyro, accel)
+        np.testing.assert_array_equal(np.concatenate(there), np.concatenate(here))
+        if with_covariance:
+            np.testing.assert_array_equal(sent.covariance, online.covariance)
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda path: path.stem)

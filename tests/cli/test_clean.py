@@ -183,6 +183,10 @@ def test_the_page_holds_every_finding_and_asks_nobody_for_anything(folder: Path,
     page = (tmp_path / "page.html").read_text()
     for rule, count in SPOILED.items():
         assert f'<td class="number">{rule}</td><td class="number">{count}</td>' in page
+    found = survey(folder / "spoiled.mcap")
+    whens = [finding.when(found.start_ns) for finding in found.findings]
+    assert all(f'<div class="note">{when} s</div>' in page for when in whens if when != "whole log")
+    assert any("–" in when for when in whens)
     assert page.count("<rect") == 3 + 1 + 1 + 1  # spikes, and one interval each of what lies close together
     assert "http://" not in page
     assert "https://" not in page

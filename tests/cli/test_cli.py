@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -207,6 +208,41 @@ def test_names_of_files_are_shown_as_they_are(tmp_path: Path, logs: Path, imutoo
     assert done.stdout.startswith(r"a [bold]b[] \x1b[31m.mcap: ")
 
 
+@pytest.mark.parametrize(
+    ("word", "usage"), [("view", "{LOG}..."), ("live", "[LOG]"), ("schema", "[NAME]"), ("convert", "{SRC} {OUT}")]
+)
+def test_help_names_each_argument_once_and_has_no_lines_of_the_source(
+    word: str, usage: str, imutool: Run, tmp_path: Path
+) -> None:
+    said = imutool(word, "--help", cwd=tmp_path, env={"COLUMNS": "200", "TERM": "dumb"}).stdout
+    assert f" {word} [OPTIONS] {usage}\n" in re.sub(r" +\n", "\n", said)
+    assert "an .rrd is saved." in said or word != "view"  # on one line
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_an_output_that_knows_few_letters_gets_a_report_and_json_stays_utf_8(
+    encoding: str, logs: Path, imutool: Run, tmp_path: Path
+) -> None:
+    """As Windows has it where stdout goes to a file: the root of rad/s/√Hz was a traceback."""
+    log = shutil.copy(logs / "flight_1.mcap", tmp_path / "Prüflauf.mcap")
+    env = {"PYTHONIOENCODING": encoding}
+    done = imutool("info", log, cwd=tmp_path, apart=True, env=env, encoding=encoding)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    assert "rad/s/?Hz" in done.stdout
+    words = [sys.executable, "-m", "imutool", "info", str(log), "--json", "-"]
+    said = subprocess.run(words, env=os.environ | env, capture_output=True, check=True).stdout
+    assert json.loads(said.decode("utf-8"))["log"] == log.stem
+
+
+def test_a_usage_error_says_how_to_give_many_logs_and_a_name_that_begins_with_a_dash(imutool: Run, tmp_path: Path) -> None:
+    done = imutool("debias", "a.mcap", "b.mcap", "c.mcap", cwd=tmp_path)
+    assert done.returncode == errors.UsageError.exit_code
+    assert "imutool fleet debias takes many logs" in " ".join(done.stderr.replace("│", " ").split())
+    (tmp_path / "-x.mcap").write_bytes(b"")
+    done = imutool("info", "-x.mcap", cwd=tmp_path)
+    assert "No such option: -x; the file of that name is ./-x.mcap" in " ".join(done.stderr.replace("│", " ").split())
+
+
 # ── tables and progress ──
 
 
@@ -240,6 +276,22 @@ def test_a_table_too_wide_goes_on_below_with_its_keys(
     terminal.table([("log", "aaaaaaaa", "bbbbbbbb", "cccccccc", "dddddddd"), ("x" * 8, *"1234")], keys=1)
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.strip() and "─" not in line]
     assert lines == [["log", "aaaaaaaa", "bbbbbbbb"], ["x" * 8, "1", "2"], ["log", "cccccccc", "dddddddd"], ["x" * 8, "3", "4"]]
+
+
+def test_a_row_whose_value_is_folded_begins_in_its_first_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The topic and the property stood beside the last line of the value."""
+    monkeypatch.setattr(terminal, "out", type(terminal.out)(width=30, force_terminal=True, no_color=True, highlight=False))
+    terminal.table([("topic", "value"), ("/imu0", "cannot be judged: the log has no poses")], keys=1)
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+    assert shown[2].split() == ["/imu0", "cannot", "be", "judged:", "the"]
+    assert shown[3].split() == ["log", "has", "no", "poses"]
+
+
+def test_without_a_terminal_stderr_has_no_empty_line_of_the_progress(logs: Path, imutool: Run, tmp_path: Path) -> None:
+    done = imutool("debias", logs / "flight_2.mcap", "out.mcap", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_nothing_is_folded_where_nobody_looks_at_a_terminal(

@@ -17,10 +17,11 @@ from typer.testing import CliRunner, Result
 from imutool import diagnosis_output
 from imutool.cli import load
 from imutool.cli.train import lines_of_choice
-from imutool.errors import DataError, ModelError
+from imutool.errors import ConfigError, DataError, ModelError
 from imutool.file_location import identity
 from imutool.fleet import page as fleet_page
-from imutool.fleet.one_log import is_current, work
+from imutool.fleet.one_log import work
+from imutool.fleet.targets import is_current
 from imutool.fleet.task import Result as Done
 from imutool.fleet.task import Settings, Source, Task, with_model_hash
 from imutool.mcap_io.read import read
@@ -39,6 +40,19 @@ def run(*words: str | Path) -> Result:
 def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures are looked at in view/test_report.py; here one of them is enough."""
     monkeypatch.setattr(report, "PICTURES", (report_paths.paths,))
+
+
+def test_a_full_disk_names_the_folder_of_a_diagnosis_and_no_temporary_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(d: object, folder: Path, *_: object) -> list[str]:
+        raise ConfigError("cannot be written (No space left on device)", where=folder / "view.rrd")
+
+    monkeypatch.setattr(diagnosis_output, "_make", full)
+    with pytest.raises(ConfigError) as error:
+        diagnosis_output.write(diagnoses.NOTHING, tmp_path / "found")
+    assert error.value.where == str(tmp_path / "found" / "view.rrd")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_evaluate_writes_the_numbers_of_its_table(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

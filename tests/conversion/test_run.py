@@ -113,7 +113,28 @@ def test_the_only_sequence_raises_its_own_error_and_leaves_nothing(tmp_path):
     sequence(tmp_path / "broken", bad_line=7)
     with pytest.raises(DataError, match=r"data\.csv:7"):
         convert(tmp_path / "broken", tmp_path / "out" / "log.mcap")
-    assert content(tmp_path / "out") == {}
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "kept").mkdir()
+    sequence(tmp_path / "several" / "a", bad_line=7)
+    sequence(tmp_path / "several" / "b", bad_line=7)
+    for out in ("out", "kept"):
+        assert len(convert(tmp_path / "several", tmp_path / out, workers=1).failures) == 2
+    assert [(tmp_path / out).exists() for out in ("out", "kept")] == [False, True]
+
+
+def test_what_is_wrong_with_the_data_names_the_file_also_where_only_a_topic_is_known(tmp_path):
+    header = "time [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+    rows = "".join(f"{0.01 * k:.2f},nan,nan,nan,0.0,0.1,9.8\n" for k in range(200))
+    (tmp_path / "bench.csv").write_text(f"{header}\n{rows}")
+    with pytest.raises(DataError, match=r"bench\.csv: /imu0: none of the 200 samples of the gyro is finite"):
+        convert(tmp_path / "bench.csv", tmp_path / "out.mcap")
+
+
+def test_a_table_of_one_row_has_a_row(tmp_path):
+    """It was said to be text without a row of four numbers: the last line of a file was taken for one that is cut."""
+    (tmp_path / "one.csv").write_text("time [s],gx,gy,gz,ax,ay,az\n0.1,0.2,0.3,0.4,0.0,0.1,9.8\n")
+    with pytest.raises(ConfigError, match="'time \\[s\\]' is named as a time and does not rise: 1 different values in 1 rows"):
+        convert(tmp_path / "one.csv", tmp_path / "out.mcap")
 
 
 def test_sequences_are_chosen_by_name(source, tmp_path):
@@ -148,10 +169,11 @@ def test_where_nothing_is_recognised_the_message_says_what_was_looked_for(tmp_pa
         source.mkdir()
         if kind == "folder of notes":
             (source / "notes.txt").write_text("notes")
-    what = (
-        "" if source.is_dir() else ": it is empty" if kind == "empty file" else ": it is text without a row of four numbers.*"
-    )
-    fix = "Name the file itself" if source.is_dir() else "See whether the recorder"
+    what, fix = {
+        "empty folder": (": it holds no files", "See whether the recording lies elsewhere"),
+        "folder of notes": ("", "Name the file, or a folder nearer to it: four levels"),
+        "empty file": (": it is empty", "See whether the recorder"),
+    }.get(kind, (": it is text without a row of four numbers.*", "See whether the recorder"))
     with pytest.raises(DataError, match=rf"no sequence found{what}; expected a ROS bag, an MCAP log.*{fix}"):
         convert(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -213,6 +235,8 @@ def test_a_source_is_never_the_target(tmp_path):
 def test_a_read_only_target_is_refused(source):
     with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):
         convert(source / "a", Path("/proc/a.mcap"))
+    with pytest.raises(ConfigError, match=r"/proc/a\.mcap: cannot be written"):  # and no temporary folder beside it
+        convert(source / "a", Path("/proc/a.mcap"), correct=["conventions"])
     with pytest.raises(ConfigError, match="/proc/imutool: cannot be made"):
         convert(source, Path("/proc/imutool"))
 

@@ -146,14 +146,14 @@ def test_the_unit_beside_an_array_in_hdf5_counts(tmp_path):
     np.testing.assert_allclose(imu.accel, ACCEL * G)
 
 
-def test_a_spreadsheet_is_refused_with_what_to_do(convert, tmp_path):
-    with zipfile.ZipFile(tmp_path / "log.xlsx", "w") as archive:
+def test_a_spreadsheet_of_another_format_is_refused_with_what_to_do(convert, tmp_path):
+    with zipfile.ZipFile(tmp_path / "log.xlsb", "w") as archive:
         archive.writestr("[Content_Types].xml", "<Types/>")
-        archive.writestr("xl/workbook.xml", "<workbook/>")
-    done = convert(tmp_path / "log.xlsx", tmp_path / "out.mcap")
+        archive.writestr("xl/workbook.bin", "")
+    done = convert(tmp_path / "log.xlsb", tmp_path / "out.mcap")
     assert done.returncode == 4
     assert "is a spreadsheet" in done.stderr
-    assert "as CSV" in done.stderr
+    assert "as .xlsx or CSV" in done.stderr
 
 
 def test_seconds_in_decimals_are_exact_and_further_columns_become_topics(convert, tmp_path):

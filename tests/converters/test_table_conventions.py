@@ -300,7 +300,7 @@ def test_an_object_of_matlab_hides_no_array_that_is_too_large(tmp_path, monkeypa
     scipy.io.savemat(tmp_path / "log.mat", {"zeros": np.zeros(10_000)}, do_compression=True)
     with (tmp_path / "log.mat").open("ab") as file:
         file.write(np.array([14, 16, 6, 8, 17, 0], np.uint32).tobytes())
-    monkeypatch.setattr("imutool.converters._table_files.LIMIT", 50_000)
+    monkeypatch.setattr("imutool.converters._table_mat.LIMIT", 50_000)
     with pytest.raises(DataError, match="unpacks to"):
         load(tmp_path / "log.mat", "mat")
 
@@ -356,7 +356,11 @@ def test_several_imus_of_one_table_are_several_imus_of_one_log(tmp_path, written
     late_ns = log.imus["/right/imu"].t_ns - log.imus["/left/imu"].t_ns[:length]
     assert np.array_equal(late_ns, np.full(length, 1_000_000 if written_by == "groups with clocks" else 0))
     assert log.scalars == {}
-    assert log.metadata["imutool/map/right/imu"]["topic"] == "/right/imu"
+    stated = log.metadata["imutool/map/right/imu"]  # and nothing of what the map leaves open
+    assert (stated["topic"], stated["gyro_unit"]) == ("/right/imu", "rad/s")
+    assert all(stated.values())
+    assert "[" not in stated["gyro"][0]
+    assert not {"truth_file", "rotation_matrix", "gyro_scale"} & stated.keys()
 
 
 @pytest.mark.parametrize("form", ["{s}{a}{n}", "{s}_{a}_{n}", "{s}{n}_{a}"])

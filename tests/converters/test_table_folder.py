@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imutool.converters import sensor_tables, table
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 
 COUNT = 400
 T_S = 1_600_000_000.0 + np.arange(COUNT) / 100.0
@@ -279,3 +279,45 @@ def test_a_file_with_arrays_of_different_lengths_beside_tables_is_left_out(tmp_p
     savemat(tmp_path / "gps.mat", {f"channel{n}": np.arange(10.0 + n) for n in range(8)})
     (sequence,) = table.sequences(tmp_path)
     np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].gyro, GYRO)
+
+
+@pytest.mark.parametrize("suffix", ["", ".npy"])
+def test_a_folder_of_arrays_for_each_sensor_is_a_table_for_each(tmp_path, suffix):
+    """Arrays are known by their first bytes: comma2k19 has them in files without a suffix."""
+    turn = GYRO + TURN[:, None]  # so that gravity shows the unit
+    arrays = {
+        "gyro": {"t": T_S, "value": np.asfortranarray(turn)},
+        "gyro_bias": {"t": T_S, "value": 0.0 * turn},
+        "accelerometer": {"t": T_S, "value": ACCEL},
+        "magnetometer": {"t": T_S[::10], "value": turn[::10]},
+    }
+    for sensor, files in arrays.items():
+        (tmp_path / "drive" / "IMU" / sensor).mkdir(parents=True)
+        for name, values in files.items():
+            with (tmp_path / "drive" / "IMU" / sensor / f"{name}{suffix}").open("wb") as file:
+                np.save(file, values)
+    (tmp_path / "drive" / "IMU" / "gyro" / "notes").write_text("no array")
+    (sequence,) = table.sequences(tmp_path)
+    assert sequence.name == "IMU"
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_array_equal(log.imus["/imu0"].gyro, turn)
+    np.testing.assert_array_equal(log.imus["/imu0"].accel, ACCEL)
+    assert len(log.scalars["/magnetometer_value_2"].t_ns) == COUNT // 10
+    assert {topic.split("_")[0] for topic in log.scalars} == {"/magnetometer", "/gyro"}
+    assert not log.remarks.losses
+    (tmp_path / "drive" / "IMU" / "gyro" / f"value{suffix}").write_bytes(b"\x93NUMPY\x01\x00")
+    with pytest.raises(DataError, match=rf"gyro/value{suffix}: cannot be read"):
+        table.read_sequence(sequence)
+
+
+def test_a_damaged_table_in_a_folder_is_told_and_a_file_of_settings_is_not(tmp_path, caplog):
+    names = ["t_s", *(f"gyro_{axis} [rad/s]" for axis in "xyz"), *(f"acc_{axis} [m/s^2]" for axis in "xyz")]
+    (tmp_path / "walk.csv").write_text(",".join(names) + "\n" + rows(T_S, GYRO, ACCEL))
+    np.savez(tmp_path / "run.npz", gyro=GYRO, accel=ACCEL)
+    raw = (tmp_path / "run.npz").read_bytes()
+    (tmp_path / "run.npz").write_bytes(raw[:300] + bytes(50) + raw[350:])
+    (tmp_path / "settings.json").write_text('{"rate": 100, "name": "walk"}')
+    (sequence,) = table.sequences(tmp_path)
+    assert sequence.path.name == "walk.csv"
+    (told,) = caplog.messages
+    assert re.match(r"left out: .*run\.npz: cannot be read", told)

@@ -15,6 +15,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,13 @@ def rows(out: Path) -> dict[str, dict[str, Any]]:
 
 def digests(out: Path) -> dict[str, str]:
     return {str(path.relative_to(out)): sha256(path) for path in sorted(out.rglob("*.mcap"))}
+
+
+class Idle(ProcessEngine):
+    """Workers that start and have nothing to do."""
+
+    def run(self, *_: object, **__: object) -> Generator[Result]:
+        raise AssertionError("no worker is needed")
 
 
 def never() -> Engine:
@@ -120,7 +128,7 @@ def test_a_second_run_skips_all_and_a_changed_log_is_done_again(
     run(str(fleet), str(out), settings, engine)
     before = {path: (path.stat().st_mtime_ns, path.stat().st_ino) for path in out.rglob("*.mcap")}
     with pytest.raises(ConfigError, match="`resume`"):
-        run(str(fleet), str(out), settings, never)
+        run(str(fleet), str(out), settings, Idle)
     again = run(str(fleet), str(out), settings, engine, resume=True)
     assert dict(again.progress.statuses) == {"skipped": 2}
     assert {row["earlier"] for row in rows(out).values()} == {"ok"}
@@ -192,7 +200,7 @@ def test_there_are_as_many_workers_as_there_is_memory_for(monkeypatch: pytest.Mo
 
 
 def test_a_cluster_that_cannot_be_reached_is_told_without_its_secrets(
-    monkeypatch: pytest.MonkeyPatch, ray_started: None
+    monkeypatch: pytest.MonkeyPatch, ray_started: None, fleet: Path, tmp_path: Path
 ) -> None:
     import ray
 
@@ -206,8 +214,9 @@ def test_a_cluster_that_cannot_be_reached_is_told_without_its_secrets(
         RayEngine("auto")
     for address in ("ray://me:hush@127.0.0.1:1", "127.0.0.1:1"):
         with pytest.raises(ConfigError, match=r"address=.*127\.0\.0\.1:1: no answer") as error:
-            RayEngine(address)
+            run(str(fleet), str(tmp_path / "out"), INFO, partial(RayEngine, address))
         assert "hush" not in str(error.value)
+        assert not (tmp_path / "out").exists()  # nothing to resume, and nothing to overwrite
 
 
 def test_a_port_where_something_else_listens_is_refused_in_time(monkeypatch: pytest.MonkeyPatch, ray_started: None) -> None:

@@ -12,15 +12,17 @@ import msgspec
 import pytest
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
+from support.two_imus import write_two_imus
 
 from fuzz.numbers import put_log
 from imutool.bag.repair import repair_bag
 from imutool.cleaning import CleaningSettings
 from imutool.debiasing import debias
 from imutool.errors import ConfigError, LogError
-from imutool.fleet.one_log import COMMANDS, page_name, target_name, work
+from imutool.fleet.one_log import COMMANDS, work
 from imutool.fleet.robots import robot_of, robot_pattern
 from imutool.fleet.sources import find
+from imutool.fleet.targets import page_name, target_name
 from imutool.fleet.task import Result, Settings, Source, Task, with_model_hash
 from imutool.mcap_io.read import read
 from imutool.mcap_io.storage.source import sha256
@@ -74,10 +76,25 @@ def test_a_model_of_another_sensor_is_refused_or_warned_of(logs: Path, tmp_path:
 
 
 def test_the_imu_is_the_one_that_is_named(logs: Path, tmp_path: Path, settings: Settings) -> None:
-    named = msgspec.structs.replace(settings, imu="gyro=/imu0,accel=/imu1")
+    named = msgspec.structs.replace(settings, imu=("gyro=/imu0,accel=/imu1",))
     refused = work(task(logs / "flight_1.mcap", tmp_path / "out", named))
     assert refused.status == "failed"
-    assert "there is no topic /imu1" in refused.error
+    assert "the log has no topic gyro=/imu0,accel=/imu1; expected /imu0 (sensor_msgs/msg/Imu)" in refused.error
+
+
+def test_a_fleet_names_the_imus_of_all_its_logs(logs: Path, tmp_path: Path, settings: Settings) -> None:
+    """Logs with one IMU and logs with two in one run: each takes what it has of the named ones."""
+    two = tmp_path / "two.mcap"
+    write_two_imus(flight(2, duration_s=10.0), two)
+    alone = work(task(two, tmp_path / "out", settings, name="two.mcap"))
+    assert (alone.status, alone.exit_code) == ("failed", 5)
+    assert "2 IMU topics: /imu0, /imu1. Choose one with `imu`" in alone.error
+    named = msgspec.structs.replace(settings, imu=("/imu1", "/imu0"))
+    for log, topics in ((two, ["/imu1", "/imu0"]), (logs / "flight_1.mcap", ["/imu0"])):
+        done = work(task(log, tmp_path / "out", named, name=log.name))
+        assert (done.status, [imu.topic for imu in done.imus]) == ("ok", topics), done.error
+    quick = Settings(command="diagnose", quick=True, imu=("/imu1", "/imu0"))
+    assert work(task(logs / "flight_1.mcap", tmp_path / "found", quick, name="flight_1.json")).status == "ok"
 
 
 def test_done_again_it_is_the_same_byte_for_byte(done: Result, logs: Path, tmp_path: Path, settings: Settings) -> None:

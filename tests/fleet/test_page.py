@@ -37,7 +37,7 @@ def test_of_logs_that_are_not_whole_the_common_folder_stands_once() -> None:
 
 
 def test_the_page_of_a_diagnosis_says_what_it_takes_to_do_it_again() -> None:
-    settings = Settings(command="diagnose", robot_from=r"^(\w+)/", sim="/sims", imu="/imu1", truth="/mocap")
+    settings = Settings(command="diagnose", robot_from=r"^(\w+)/", sim="/sims", imu=("/imu1",), truth="/mocap")
     said = page.html([], settings, seconds=1.0, source="logs")
     assert all(f"<dd>{words}</dd>" in said for words in (r"^(\w+)/", "/sims", "/imu1", "/mocap"))
 

@@ -220,6 +220,10 @@ def test_the_seed_alone_decides_the_noise() -> None:
 def test_noise_that_is_not_known_is_said_to_be_missing() -> None:
     found = simulated(recording(resting()), [], noises.Noise(gyro_density=(1e-3,) * 3), RATE_HZ, 0)
     assert found.remarks == ("accel_density, gyro_walk, accel_walk not known in the noise file, and not simulated",)
+    of_some = noises.Noise(gyro_density=(float("nan"), 1e-3, 1e-3), accel_density=(1e-3,) * 3, gyro_walk=(0.0,) * 3)
+    found = simulated(recording(resting()), [], of_some, RATE_HZ, 0)
+    assert found.remarks == ("gyro_density (x), accel_walk not known in the noise file, and not simulated",)
+    assert (found.recording.imu.gyro.std(axis=0) > 1e-4).tolist() == [False, True, True]
 
 
 def test_the_truth_is_copied_and_the_exact_motion_lies_beside_it() -> None:

@@ -63,4 +63,4 @@ def test_turns_that_the_gyro_does_not_show_count_for_no_candidate() -> None:
         _score(with_gap, "raw", "", with_gap.imu, rows) for rows in (nothing, poses_turn_alone(with_gap.imu, made.truth))
     )
     assert shown.aoe_deg > 10.0
-    assert hidden.aoe_deg < 0.1
+    assert hidden.aoe_deg < 0.5

@@ -39,6 +39,18 @@ OPEN_FILE = re.compile(r"/(?:dev|proc/self)/fd/(\d+)")
 STANDARD = {"/dev/stdout": 1, "/dev/stderr": 2}
 
 
+@contextlib.contextmanager
+def removed_if_empty(folder: Path) -> Iterator[None]:
+    """Remove a folder that was not there before, if nothing is in it afterwards."""
+    existed = folder.exists()
+    try:
+        yield
+    finally:
+        if not existed:
+            with contextlib.suppress(OSError):  # a file, or a folder with something in it
+                folder.rmdir()
+
+
 class LocalFile:
     """File under its temporary name beside its place."""
 

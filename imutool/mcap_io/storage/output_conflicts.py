@@ -67,7 +67,7 @@ def check_outputs(outputs: Iterable[OutputFile], inputs: Iterable[object] = (), 
     """
     wanted = [output for output in outputs if output.place is not None]
     for output in wanted:
-        _check_suffix(output)
+        _check_name(output)
     files = [output for output in wanted if not (isinstance(output.where, Path) and is_stream(output.where))]
     read = [place for given in inputs for place in _places(given)]
     for output in files:
@@ -108,8 +108,16 @@ def refuse_existing(path: Location, *, overwrite: bool, choose: str = "Choose an
         raise ConfigError("the target exists", where=path, fix=f"{choose}, or add `overwrite=True`")
 
 
-def _check_suffix(output: OutputFile) -> None:
+def _check_name(output: OutputFile) -> None:
+    """Refuse a file whose suffix does not fit, or that is named as a folder.
+
+    Raises:
+        UsageError: with the suffix, or the slash.
+    """
     place = output.where
+    if output.files is None and not output.may_be_folder and str(output.place).endswith(("/", os.sep)):
+        fix = f"Write the file's own name behind the slash, as {output.place}NAME{next(iter(output.suffixes), '')}"
+        raise UsageError("ends in a slash, as the name of a folder", where=output.place, expected="the name of a file", fix=fix)
     if not output.suffixes or place.suffix.lower() in (*output.suffixes, ""):  # a name without a suffix claims nothing
         return
     if isinstance(place, Path) and (is_stream(place) or (output.may_be_folder and place.is_dir())):

@@ -251,6 +251,8 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if isinstance(error, FileExistsError) and path.is_file():
+            raise ConfigError("is a file", where=path, expected="a folder, which need not exist") from error
         reason = error.strerror or type(error).__name__
         fix = "Choose a place that can be written and has room"
         raise ConfigError(f"cannot be written ({reason})", where=path, fix=fix) from error

@@ -80,12 +80,13 @@ def _as_text(value: Any) -> str:
 def _strip(finding: Finding, survey: Survey) -> str:
     """Intervals of a finding, drawn along the log."""
     length = max(survey.end_ns - survey.start_ns, 1)
+    when = finding.when(survey.start_ns)
     if not finding.intervals_ns:
-        return "whole log"
+        return when
     marks = []
     for first, last in finding.intervals_ns:
         at = min(max((first - survey.start_ns) / length, 0.0), 1.0 - MIN_WIDTH)
         width = min(max((last - first) / length, MIN_WIDTH), 1.0 - at)
         marks.append(f'<rect x="{1000 * at:.2f}" width="{1000 * width:.2f}" height="14" fill="{COLORS[finding.severity]}"/>')
-    more = f'<div class="note">and {finding.intervals_left_out} more</div>' if finding.intervals_left_out else ""
-    return f'<svg viewBox="0 0 1000 14" preserveAspectRatio="none" style="{STRIP}">{"".join(marks)}</svg>{more}'
+    svg = f'<svg viewBox="0 0 1000 14" preserveAspectRatio="none" style="{STRIP}">{"".join(marks)}</svg>'
+    return f'{svg}<div class="note">{when} s</div>'

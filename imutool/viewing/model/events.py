@@ -151,8 +151,9 @@ def finding_events(folder: Path, log: str, start_ns: int, end_ns: int) -> tuple[
     """
     diagnosis = _read(folder if folder.is_file() else folder / FINDINGS)
     first = diagnosis.real[0] if diagnosis.real else "no log"
-    here = [place for place in diagnosis.located if Path(place.log or first).name == log]
-    if Path(first).name != log and not here:
+    own = log, Path(log).stem  # of a recording of arrays a diagnosis holds the name
+    here = [place for place in diagnosis.located if Path(place.log or first).name in own]
+    if Path(first).name not in own and not here:
         return [], [f"The findings of {folder.name} are on the clock of {Path(first).name} and are not marked in {log}."]
     events, notes = [], []
     for place in here:

@@ -190,7 +190,9 @@ class _Session:
             start = auto(model, without_drift(model, seen))
         except DataError as error:
             fix = f"Leave the sensor still for {START_S:g} s when the stream begins, or choose a trained model"
-            raise DataError("it does not start at rest", where=STREAM, fix=fix) from error
+            span_s = 1e-9 * (last_ns - first_ns)
+            ended = f"it ended after {len(seen)} sample{'s' * (len(seen) > 1)}, {span_s:.2g} s"
+            raise DataError("it does not start at rest" if span_s > 0.9 * START_S else ended, where=STREAM, fix=fix) from error
         self._fit = StreamFit(model, start, seen, self._force)
         self._how, self._std = start.how, start.std
         self._online = OnlineDebiaser(after_load(self._model, model.load_before), start)

@@ -19,7 +19,7 @@ from imutool.mcap_io.codec.decode import ImuBatch
 from imutool.mcap_io.codec.encode import encode_imu
 from imutool.mcap_io.passthrough.added_topics import DerivedBatch, NewTopic
 from imutool.mcap_io.rewrite import rewrite
-from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.storage.target import Target, writing
 from imutool.mcap_io.write import write
 from imutool.recording import Frames, Recording
 
@@ -201,3 +201,10 @@ def test_position_and_crc_are_those_of_the_bytes(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == [target.temporary]
     assert (tmp_path / "out").read_bytes() == b"123456789"
     assert list(tmp_path.iterdir()) == [tmp_path / "out"]
+
+
+def test_a_file_in_the_place_of_a_folder_is_told_as_one(tmp_path: Path) -> None:
+    (tmp_path / "log.mcap").write_bytes(b"precious")
+    with pytest.raises(ConfigError, match=r"log\.mcap: is a file; expected a folder"), writing(tmp_path / "log.mcap"):
+        (tmp_path / "log.mcap").mkdir(parents=True, exist_ok=True)
+    assert (tmp_path / "log.mcap").read_bytes() == b"precious"

@@ -208,6 +208,8 @@ def test_a_stream_without_samples_and_one_without_rest_say_what_to_do(imu: Imu) 
     moving = imu.rows(slice(800, None))
     with pytest.raises(DataError, match=r"the stream: it does not start at rest\. Leave the sensor still for 2 s"):
         run(stream(moving), api.load_model("static"), Malformed())
+    with pytest.raises(DataError, match=r"the stream: it ended after 1 sample, 0 s\. Leave the sensor still"):
+        run(stream(moving.rows(slice(0, 1))), api.load_model("static"), Malformed())
 
 
 @pytest.mark.parametrize(

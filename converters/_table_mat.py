@@ -1,0 +1,91 @@
+"""MATLAB's .mat files: arrays of structures, labels of columns; objects are left out."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imutool.errors import DataError, required
+
+from ._table_text import Columns
+
+LIMIT = 4 << 30  # bytes of numbers in one file
+MAT_HEADER, MAT_COMPRESSED, MAT_STEP = 128, 15, 1 << 20  # bytes before the first element, type of a packed one, bytes at once
+
+
+def load_mat(path: Path, columns: Columns) -> None:
+    """Add the columns of a .mat file.
+
+    Raises:
+        DataError: damaged, too large, or of nothing but objects.
+    """
+    scipy_io = required("scipy.io", "tables", where=path, user="reading it")
+    try:
+        size = sum(8 * int(np.prod(shape, dtype=float)) for _, shape, _ in scipy_io.whosmat(path))
+        has_objects = False
+    except TypeError:  # scipy reads no header of an object
+        size, has_objects = _unpacked_bytes(path), True
+    check_size(path, size)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # objects share a name
+            content = scipy_io.loadmat(path, simplify_cells=True)
+    except Exception as error:  # scipy raises whatever damaged bytes lead to
+        if not has_objects:
+            raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
+        content = {}
+    for name, value in _flat(content):
+        labels = [str(label) for label in np.ravel(content.get(f"{name}_label", []))]  # as Mission Planner writes a log
+        if np.ndim(value) == 2 and len(labels) == value.shape[1]:
+            for label, column in zip(labels, value.T, strict=True):
+                columns.add(f"{name}/{label}", column)
+        else:
+            columns.add(name, value)
+    if has_objects:
+        fix = "Save arrays from MATLAB (of an object struct(...), of a table table2array), or a table with writetable as CSV"
+        if not columns.values:
+            raise DataError("holds MATLAB objects, as tables and timetables are", where=path, expected="arrays", fix=fix)
+        columns.remarks.losses.append(f"its MATLAB objects are left out. {fix}")
+
+
+def check_size(path: Path, size: int) -> None:
+    """Refuse a file that unpacks to more bytes than fit.
+
+    Raises:
+        DataError: with the size.
+    """
+    if size > LIMIT:
+        raise DataError(f"unpacks to {size} bytes", where=path, expected=f"at most {LIMIT}")
+
+
+def _unpacked_bytes(path: Path) -> int:
+    """Bytes of the elements of a .mat file, unpacked; no further than the limit."""
+    with path.open("rb") as file:
+        order = "<" if file.read(MAT_HEADER).endswith(b"IM") else ">"
+        total = 0
+        while len(tag := file.read(8)) == 8 and total <= LIMIT:
+            kind, size = struct.unpack(f"{order}II", tag)
+            if kind != MAT_COMPRESSED:
+                total += size
+                file.seek(size, 1)
+                continue
+            unpacker, packed = zlib.decompressobj(), file.read(size)
+            while packed and total <= LIMIT:
+                total += len(unpacker.decompress(packed, MAT_STEP))
+                packed = unpacker.unconsumed_tail
+    return total
+
+
+def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Arrays of nested structures, with dotted names."""
+    for name, value in content.items():
+        if not name.startswith("__"):
+            if isinstance(value, dict):
+                yield from _flat(value, f"{prefix}{name}.")
+            elif isinstance(value, np.ndarray | int | float):
+                yield f"{prefix}{name}", value
