@@ -37,6 +37,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
 from imutool.sensor.effect import Effect
+from imutool.sensor.effects.low_pass import Design
 
 
 @dataclass(eq=False)
@@ -175,6 +176,8 @@ class Trial:
         effect, theta = whole.chosen[k]
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
+        if effect.lagless is not None:
+            std[0] = np.hypot(std[0], theta[0] * Design.of(effect, theta).digital_share)
         no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
         no_answer = no_answer or is_coloured_noise(effect, theta, whole)
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
