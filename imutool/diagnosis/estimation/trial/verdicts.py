@@ -109,7 +109,8 @@ class Trial:
         found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
         without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
         least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
-        for _, effect, start, promised in self.candidates.ranked(without, self.named, most)[:most]:
+        named = tuple(effect for effect in self.named if effect.lagless is None or not effect.constants)  # one order of a name
+        for _, effect, start, promised in self.candidates.ranked(without, named, most)[:most]:
             if effect.name != mine.name and effect.meets(mine) and promised > least:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
                 if leaves_as_little(trial, effect.key, aic):
