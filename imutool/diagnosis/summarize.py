@@ -137,13 +137,13 @@ def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d:
     """Physics file of the findings, fitted without held-out time and without quantization."""
     theta = {effect.key: value for effect, value in selection.fitted.chosen}
     refitted = [replace(effect, theta=theta[effect.effect.key]) for effect in selection.selected]
-    by_equation = {(effect.effect.name, effect.effect.equation): effect for effect in refitted}
     pairs = [log.pair for log in logs]
 
     def fitted(finding: Finding) -> Finding:
-        selected = by_equation.get((finding.effect, finding.equation))
-        if selected is None:
+        alike = [one for one in refitted if (one.effect.name, one.effect.equation) == (finding.effect, finding.equation)]
+        if not alike:
             return finding
+        selected = next((one for one in alike if one.effect.sensors == (finding.signal,)), alike[-1])
         curve = _curve(selected, selection.fitted)
         return msgspec.structs.replace(finding, parameters=_parameters(pairs, selected), curve=curve)
 
