@@ -32,6 +32,7 @@ from imutool.diagnosis.held_out import (
 from imutool.diagnosis.localization import locate_findings, locate_residual
 from imutool.diagnosis.reference.coverage import locate_stuck, unusable_axes
 from imutool.diagnosis.reference.own_poses import is_in_raw_poses
+from imutool.diagnosis.reference.taken_samples import batched
 from imutool.diagnosis.result import Curve, Diagnosis, Estimate, Finding, Traces
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.to_sensor_files import to_physics_file
@@ -70,11 +71,11 @@ def summarize(
         all_findings += late_stamps(pairs) + vibration_above_band(logs, selection.whole.chosen)
     elif not any(finding.effect in RESONANT for finding in all_findings):
         all_findings += ringing(logs, after, settings.ringing)
+    all_findings += batched(pairs, all_findings)
     findings, both_have = [one for one in all_findings if not shared(one, sim_findings)], remarks(all_findings, sim_findings)
     both, chosen = zip(selection.selected, named, strict=True), selection.fitted.chosen
-    expected_too = {effect.effect.key for effect, finding in both if shared(finding, sim_findings)}
     clock = chosen[: selection.always]  # where logs share no epoch
-    expected_too |= {effect.key for effect, _ in clock}
+    expected_too = {one.effect.key for one, finding in both if shared(finding, sim_findings)} | {of.key for of, _ in clock}
     before = [with_effects(pair, tuple(entry for entry in chosen if entry[0].key in expected_too)) for pair in pairs]
     p_values = {str(signal): _p_value(findings, signal) for signal in SENSORS}
     discounted = expected_too | {JITTER}  # where stamps are wrong, signals are not
@@ -136,13 +137,13 @@ def physics_of_fitted_time(logs: Sequence[WhitenedImu], selection: Selection, d:
     """Physics file of the findings, fitted without held-out time and without quantization."""
     theta = {effect.key: value for effect, value in selection.fitted.chosen}
     refitted = [replace(effect, theta=theta[effect.effect.key]) for effect in selection.selected]
-    by_equation = {(effect.effect.name, effect.effect.equation): effect for effect in refitted}
     pairs = [log.pair for log in logs]
 
     def fitted(finding: Finding) -> Finding:
-        selected = by_equation.get((finding.effect, finding.equation))
-        if selected is None:
+        alike = [one for one in refitted if (one.effect.name, one.effect.equation) == (finding.effect, finding.equation)]
+        if not alike:
             return finding
+        selected = next((one for one in alike if one.effect.sensors == (finding.signal,)), alike[-1])
         curve = _curve(selected, selection.fitted)
         return msgspec.structs.replace(finding, parameters=_parameters(pairs, selected), curve=curve)
 
@@ -244,7 +245,7 @@ def _parameters(pairs: Sequence[AlignedLog], selected: SelectedEffect) -> dict[s
         return {}
     if selected.effect.name == JITTER:
         jitter_s = np.concatenate([pair.stamp_s - timestamps.even(pair.stamp_s)[0] for pair in pairs])
-        std = float(jitter_s.std())
+        std = float(np.hypot(jitter_s.std(), max(pair.batched_s for pair in pairs if isinstance(pair, Pair))))
         return {"std": Estimate(std, std / np.sqrt(2.0 * len(jitter_s)), "s")}
     fitted = {
         parameter.name: Estimate(float(value), float(std), parameter.unit)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -33,11 +34,16 @@ def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> C
     found = dict[str, tuple[Effect, Theta]]()
     for finding in findings:
         alike = [effect for effect in candidates if effect.name == finding.effect and finding.effect not in NO_EFFECT]
-        on_it = [effect for effect in alike if effect.sensors == (finding.signal,)]
-        on_it += [one for one in alike for of, value in one.constants if finding.parameters.get(of.name, NONE).value == value]
-        if alike and (effect := [*on_it, *alike][0]).key not in found:
+        effect = max(alike, key=partial(_likeness, finding), default=None)
+        if effect is not None and effect.key not in found:
             found[effect.key] = _started(effect, finding.parameters)
     return tuple(found.values())
+
+
+def _likeness(finding: Finding, effect: Effect) -> tuple[bool, bool, int]:
+    """How alike an effect of the name of a finding is: its constants, its sensor, and how many constants agree."""
+    agree = all(finding.parameters.get(of.name, NONE).value == value for of, value in effect.constants)
+    return agree, effect.sensors == (finding.signal,), len(effect.constants)
 
 
 def _started(effect: Effect, parameters: Mapping[str, Estimate]) -> tuple[Effect, Theta]:

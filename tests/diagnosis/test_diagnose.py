@@ -408,3 +408,21 @@ def test_logs_are_left_as_they_are_and_progress_is_told_and_the_answer_is_the_sa
     assert told[0][0] == 0
     assert told[-1][0] == told[-1][1]
     assert sorted(path.name for path in real.parent.iterdir()) == ["real.mcap", "sim.mcap"]
+
+
+def test_a_second_simulation_has_the_filter_of_each_sensor(made: Made) -> None:
+    """Both have one equation, and the filter of one sensor was simulated on the other as well."""
+
+    def filtered(felt: Any) -> np.ndarray:
+        of_each = (planted.ideal(felt, planted.acting({"second_order_low_pass": [hz, 0.7]})) for hz in (3.0, 6.0))
+        gyro, accel = (x - planted.ideal(felt, ()) for x in of_each)
+        return np.concatenate([gyro[:, :3], accel[:, 3:]], axis=1)
+
+    real, sim = made(added=filtered, sim_noise=False)
+    found = diagnose([real], sim)
+    assert effects(found) == ["second_order_low_pass"] * 2
+    by_signal = {one.signal: one.parameters["f_c"] for one in found.findings}
+    assert by_signal["gyro"].value == pytest.approx(3.0, abs=SURE * by_signal["gyro"].std)
+    assert by_signal["accel"].value == pytest.approx(6.0, abs=SURE * by_signal["accel"].std)
+    for closer in found.closer.values():
+        assert closer.share == pytest.approx(1.0, abs=0.02)

@@ -13,6 +13,7 @@ from support import diagnoses
 from support.diagnoses import replace as replace_struct
 
 from imutool.bias.physics import load
+from imutool.diagnosis.estimation.trial.effect_forms import in_forms
 from imutool.diagnosis.result import Estimate, Traces
 from imutool.diagnosis.to_sensor_files import start_values, to_noise_file, to_physics_file
 from imutool.sensor import catalogue, physics_file
@@ -40,6 +41,18 @@ def test_a_search_begins_with_the_first_values_of_what_was_found_and_nothing_for
     ((effect, theta),) = start_values([some, jitter, again], [delay, arm])
     assert effect is arm
     assert theta.tolist() == [0.2, 0.0, 0.1]
+
+
+def test_a_search_begins_with_the_low_pass_of_the_sensor_and_order_that_were_found() -> None:
+    candidates = in_forms(catalogue.diagnosed(["low_pass"]), exact=True)
+    average = {"f_c": Estimate(11.0, 0.1, "Hz"), "order": Estimate(0.0, 0.0, "-")}
+    found = replace_struct(diagnoses.LEVER_ARM, effect="low_pass", signal="accel", parameters=average)
+    first = replace_struct(found, signal="gyro", parameters={"f_c": Estimate(20.0, 0.1, "Hz")})
+    chosen = start_values([found, first], candidates)
+    assert [(effect.key, theta.tolist()) for effect, theta in chosen] == [
+        ("low_pass:accel order 0", [11.0]),
+        ("low_pass:gyro", [20.0]),
+    ]
 
 
 def test_without_samples_there_is_no_noise() -> None:

@@ -375,6 +375,17 @@ def test_exponential_smoothing_is_its_recursion_on_the_samples(cutoff_hz: float)
     assert design.lag_s == pytest.approx(-np.angle(design.answer(f_hz))[0] / (2.0 * np.pi * f_hz[0]), rel=1e-4)
 
 
+@pytest.mark.parametrize(("cutoff_hz", "zeta"), [(12.0, 1.2), (20.0, 0.7)])
+def test_exponential_smoothing_of_second_order_is_two_in_a_row(cutoff_hz: float, zeta: float) -> None:
+    felt = lively()
+    felt = replace(felt, gyro=felt.gyro + np.random.default_rng(1).normal(size=felt.gyro.shape))
+    poles = np.exp(2.0 * np.pi * cutoff_hz / felt.rate_hz * np.roots([1.0, 2.0 * zeta, 1.0]).astype(complex))
+    out, a = act("second_order_low_pass", felt, cutoff_hz, zeta, math.inf, felt.rate_hz), np.poly(poles).real
+    np.testing.assert_allclose(out.gyro[200:-200], lfilter([a.sum()], a, felt.gyro, axis=0)[200:-200], atol=1e-6)
+    design, f_hz = low_pass.Design(cutoff_hz, zeta, smoothing_hz=felt.rate_hz), np.array([0.01])
+    assert design.lag_s == pytest.approx(-np.angle(design.answer(f_hz))[0] / (2.0 * np.pi * f_hz[0]), rel=1e-4)
+
+
 @pytest.mark.parametrize("order", [0.0, 1.0, 3.0, 4.0])
 @pytest.mark.parametrize("rate_hz", [math.inf, 200.0])
 def test_the_lag_of_a_low_pass_is_that_of_slow_motion(order: float, rate_hz: float) -> None:

@@ -29,8 +29,10 @@ from imutool.diagnosis.estimation.observability import (
 )
 from imutool.diagnosis.estimation.significance import bic, gain_for, unnamed_count
 from imutool.diagnosis.estimation.trial.lag_start import (
+    LAGS,
     beside_offset,
     with_delay_of_accel,
+    with_filter_of_each_sensor,
     with_form_of_low_pass,
     with_form_of_resonance,
     without_unseen_low_pass,
@@ -104,6 +106,8 @@ def _grown(first: _Search, now: Fit, unnamed: Sequence[Effect], later: Sequence[
             if better.chosen[-1][0].name in LOW_PASSES:
                 better = with_form_of_low_pass(search.logs, better, search.named)
                 better = with_delay_of_accel(search.logs, better, search.named)
+            if better.chosen[-1][0].name in LAGS:
+                better = with_filter_of_each_sensor(search.logs, better, search.named)
             better = with_form_of_resonance(search.logs, better, search.named)
             before, now = now.objective, search.pruned(search.exchanged(better))
         elif waiting:
@@ -199,6 +203,7 @@ class _Search(Trial):
             left = bic if effect.kind == "driven" else lambda found: found.objective  # a lag that is zero leaves a little less
             now = next((trial for trial in rivals if left(trial) < left(now)), now)
         now = with_delay_of_accel(self.logs, with_form_of_low_pass(self.logs, now, self.named), self.named)
+        now = with_filter_of_each_sensor(self.logs, now, self.named)
         now = with_plainer_effects(self.logs, with_steady_clock(self.logs, now, self.named, self.candidates.starts), self.named)
         now = without_unseen_low_pass(self.logs, now, self.named, self.settings)
         log_p, most = self.candidates.log_p, self.threshold

@@ -1,9 +1,7 @@
 """Misfits without a name in the catalogue: driven by another channel of the log, or unknown.
 
-Each becomes a `Effect` of its own, made for the log at hand, so that it is fitted, tested, simulated and removed like any
-other. `driven`: gain on every axis times a channel, some time later. `unknown`: a smooth curve of one variable (cubic
-B-splines), or a short equation out of a library of products and powers; whichever explains more is kept, and no name is given
-to it.
+Each becomes a `Effect` of its own, made for the log at hand. `driven`: gain on every axis times a channel, some time later.
+`unknown`: a smooth curve of one variable (cubic B-splines) or a short equation of products and powers; which explains more.
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import AddedColumns, Chosen, SplineBasis, SplineCurve, expected
 from imutool.diagnosis.estimation.observability import values_of, without_implausible
 from imutool.diagnosis.estimation.significance import bic
+from imutool.diagnosis.estimation.trial.lag_start import is_late
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
@@ -274,7 +273,8 @@ def has_no_size(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> boo
 def smoothing(found: Fit, first: int) -> Chosen:
     """Low-passes that only smooth what is left of a simulation's noise, without their lag."""
     filters = [one for one in found.chosen[first:] if one[0].lagless and any(log.pair.denoised for log in found.logs)]
-    return tuple((effect.without_lag(theta), theta) for effect, theta in filters if _only_smooths(effect, theta, found))
+    early = ((effect, theta) for effect, theta in filters if not is_late(found, effect))
+    return tuple((effect.without_lag(theta), theta) for effect, theta in early if _only_smooths(effect, theta, found))
 
 
 def _only_smooths(effect: Effect, theta: Theta, found: Fit) -> bool:

@@ -15,13 +15,13 @@ from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation
 from imutool.diagnosis.reference.own_poses import align_with_poses, band_hz
+from imutool.diagnosis.reference.taken_samples import batch_remark, new_samples, on_own_clock, repeats
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
 from imutool.errors import DataError, ImutoolError, NumericsError
 from imutool.inertial.stationary import white_noise
 from imutool.recording import Recording, seconds
-from imutool.recording.columns import true_ranges
 from imutool.sensor import catalogue
 from imutool.sensor.effect import Effect
 from imutool.sensor.samples import IdealMotion
@@ -30,10 +30,6 @@ from imutool.sensor.trajectory import Stretch, smooth_motion
 from imutool.units import AXES, SENSORS, UNITS
 
 SOME = 0.05  # of the samples of an axis at its limit, from which it is reported
-SELDOM = 0.1  # of the samples of an axis that are equal to the one before: digits are finer than the noise
-MOSTLY_NEW = 0.3  # of the samples that repeat the one before: more is a topic that is faster than its sensor
-LEAST_NEW = 0.05  # of the samples with news of both sensors: two that take turns have none
-STUCK = 10  # samples in a row that a sensor stands still, and is not held
 MOVES = 5.0  # times its noise: an axis should have moved so much to be called stuck
 COPIED = 0.5  # share of a simulation's poses whose stamps the recording has, too: above, it may follow them
 DRIFTING = frozenset({"clock_skew", "clock_jump", "clock_wander"})
@@ -64,6 +60,7 @@ def align_all(
         if held := len(recording.imu) - len(new_samples(recording).imu):
             what = f"{held} samples repeat gyro or accel of the one before, and do not count"
             remarks.append(f"{recording.name}: {what}: the topic is faster than its sensor")
+        remarks += batch_remark(recording)
         if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
             remarks.append(f"{recording.name}: {again} samples repeat the one before on every axis, and do not count")
         covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
@@ -133,7 +130,12 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """Intervals of the recording that the simulation or its own poses cover without a hole."""
-    real = new_samples(real)
+    real, batched_s = on_own_clock(new_samples(real))
+    for pair in _aligned(real, sim, truth, settings):
+        yield replace(pair, batched_s=batched_s)
+
+
+def _aligned(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     if sim is not None:
         shared = _shared_stretches(real, sim)
         for pair in with_simulation(real, sim, settings, own_poses=bool(shared)):
@@ -199,36 +201,6 @@ def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
             fix="Record with a sensor that works, of a wider range or of finer digits",
         )
     return reduced
-
-
-def new_samples(recording: Recording) -> Recording:
-    """Recording without readings that are held, where a topic is faster than its sensor.
-
-    Half of the samples of a gyro at half of the rate are late by a sample, and look like a low-pass.
-    """
-    held = np.zeros(len(recording.imu), bool)
-    for sensor in (recording.imu.gyro, recording.imu.accel):
-        equal = np.concatenate([np.zeros((1, 3), bool), np.diff(sensor, axis=0) == 0])[: len(sensor)]
-        again = np.asarray(equal.all(axis=1))
-        for start, end in true_ranges(again):
-            again[start:end] = end - start < STUCK
-        if again.any() and again.mean() >= MOSTLY_NEW and equal[~again].mean(axis=0).max() < SELDOM:
-            held |= again
-    if not held.any() or (~held).mean() < LEAST_NEW:
-        return recording
-    return replace(recording, imu=recording.imu.rows(~held))
-
-
-def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
-    """Samples that repeat the one before on every axis.
-
-    The axes seldom read the same twice otherwise. A driver that missed a sample may send the last one again. Digits that are
-    coarser than the noise repeat by themselves.
-    """
-    equal = np.concatenate([np.zeros((1, 6), bool), np.diff(real, axis=0) == 0])[: len(real)]
-    again = equal.all(axis=1)
-    by_chance = equal[~again].mean(axis=0) if (~again).any() else np.ones(6)
-    return np.asarray(again & bool(by_chance.max() < SELDOM and again.mean() < MOSTLY_NEW))
 
 
 # ── without a reference ──

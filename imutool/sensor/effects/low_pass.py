@@ -15,6 +15,7 @@ is the mean of the last T seconds, f_c = 0.443 / T, and at a rate that of the la
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -41,6 +42,7 @@ WEIGHT = 1.0 / (SLOW**FALL + (OMEGA / np.pi) ** FALL)
 RATE = Parameter("rate", "Hz", 200.0, positive=True, null_value=math.inf)  # of a digital filter
 ORDER = Parameter("order", "-", 1.0, null_value=1.0)  # of a Butterworth filter; 0: a moving average
 SMOOTHING = Parameter("smoothing_rate", "Hz", 200.0, positive=True, null_value=math.inf)  # of y += k (x - y) at each sample
+CHIP_HZ = 1000.0  # at which a sensor filters at least (MPU-6050 and ICM-20948: 1 kHz to 1.1 kHz; BMI160: 1.6 kHz)
 AVERAGE = 0.4429  # f_c T of a moving average: there it has lost half of the power
 WAVES = np.exp(-1j * OMEGA[:, None] * np.arange(-AHEAD, BEHIND + 1))
 
@@ -64,6 +66,7 @@ class Design(NamedTuple):
     """Design of a low-pass: of second order if it has a damping, digital if it has a rate.
 
     Exponential smoothing, y += k (x - y) with k = 1 - exp(-2 pi f_c / rate), lags by half a sample less than the analog filter.
+    Of second order it is two in a row, whose poles are the exponentials of the analog ones.
     """
 
     cutoff_hz: float
@@ -81,9 +84,12 @@ class Design(NamedTuple):
         return cls(float(theta[0]), values.get("zeta"), next(rates), values.get(ORDER.name, 1.0), next(rates))
 
     @property
-    def kept(self) -> float:
-        """What exponential smoothing keeps of the sample before."""
-        return math.exp(-2.0 * math.pi * self.cutoff_hz / self.smoothing_hz)
+    def kept(self) -> Complex128[np.ndarray, " order"]:
+        """What exponential smoothing keeps of the sample before, by pole."""
+        root = 0.0 if self.zeta is None else cmath.sqrt(self.zeta**2 - 1.0)
+        zeta = 1.0 if self.zeta is None else self.zeta
+        poles = np.array([-zeta - root, -zeta + root][: 1 if self.zeta is None else 2], complex)
+        return np.asarray(np.exp(2.0 * np.pi * self.cutoff_hz / self.smoothing_hz * poles))
 
     @property
     def lag_s(self) -> float:
@@ -91,12 +97,20 @@ class Design(NamedTuple):
         if not self.order:
             return 0.5 * (AVERAGE / self.cutoff_hz - (1.0 / self.rate_hz if math.isfinite(self.rate_hz) else 0.0))
         if math.isfinite(self.smoothing_hz):
-            return self.kept / (1.0 - self.kept) / self.smoothing_hz
+            return float((self.kept / (1.0 - self.kept)).real.sum()) / self.smoothing_hz
         twice_zeta = float(-self.poles.real.sum()) if self.zeta is None else 2.0 * self.zeta
         cutoff = math.pi * self.cutoff_hz
         if math.isfinite(self.rate_hz):
             cutoff = self.rate_hz * math.tan(min(cutoff / self.rate_hz, math.pi * MOST))
         return 0.5 * twice_zeta / cutoff
+
+    @property
+    def digital_share(self) -> float:
+        """Relative error of the cut-off if the filter is digital, of a chip's rate: slow motion shows its lag alone."""
+        if math.isfinite(min(self.rate_hz, self.smoothing_hz)):
+            return 0.0
+        cycles = min(self.cutoff_hz / CHIP_HZ, 0.25)  # a sample
+        return cycles / AVERAGE if not self.order else (math.pi * cycles) ** 2 / 3.0
 
     @property
     def poles(self) -> Complex128[np.ndarray, " order"]:
@@ -111,7 +125,8 @@ class Design(NamedTuple):
             own = np.sinc(np.clip(f_hz / self.rate_hz, 0.0, 0.5))  # of a mean of samples, up to half of their rate
             return np.asarray(np.sinc(f_hz * window_s) / own * np.exp(-2j * np.pi * f_hz * self.lag_s))
         if math.isfinite(self.smoothing_hz):
-            return np.asarray((1.0 - self.kept) / (1.0 - self.kept * np.exp(-2j * np.pi * f_hz / self.smoothing_hz)))
+            one_later = np.exp(-2j * np.pi * f_hz / self.smoothing_hz)[:, None]
+            return np.asarray(np.prod((1.0 - self.kept) / (1.0 - self.kept * one_later), axis=1))
         x = f_hz / self.cutoff_hz
         if math.isfinite(self.rate_hz):
             x = _folded_tan(f_hz / self.rate_hz) / math.tan(math.pi * min(self.cutoff_hz / self.rate_hz, MOST))

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from imutool.sensor.effect import Effect, Parameter, Stage, Theta
-from imutool.sensor.effects.low_pass import OMEGA, RATE, Design, Filter, behind_gain, digital_starts, slowed
+from imutool.sensor.effects.low_pass import OMEGA, RATE, SMOOTHING, Design, Filter, behind_gain, digital_starts, slowed
 from imutool.sensor.samples import IdealMotion
 
 BUTTERWORTH = 0.7  # damping, nearly
@@ -23,21 +23,26 @@ START_HZ = (5.0, 12.0, 30.0, 80.0)
 
 
 def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    """f_c (Hz), zeta, and the rate of a digital filter.
+    """f_c (Hz), zeta, the rate of a digital filter, and that of exponential smoothing twice.
 
     The filter starts settled, and an infinite cut-off frequency lets everything pass.
     """
     if math.isinf(theta[0]):
         return motion
-    if len(theta) > 2 and math.isfinite(theta[2]):
-        return behind_gain(motion, Design(*theta.tolist()), lag=True)
+    if np.isfinite(theta[2:]).any():
+        return behind_gain(motion, _design(theta), lag=True)
     by = _second_order(2.0 * math.pi * float(theta[0]) / motion.rate_hz, float(theta[1]))
     gyro, accel, alpha = (slowed(motion, x, by) for x in (motion.gyro, motion.accel, motion.alpha))
     return replace(motion, gyro=gyro, accel=accel, alpha=alpha)
 
 
 def _without_lag(motion: IdealMotion, theta: Theta) -> IdealMotion:
-    return behind_gain(motion, Design(*theta.tolist()), lag=False)
+    return behind_gain(motion, _design(theta), lag=False)
+
+
+def _design(theta: Theta) -> Design:
+    rates = [*map(float, theta[2:]), math.inf, math.inf]
+    return Design(float(theta[0]), float(theta[1]), rates[0], smoothing_hz=rates[1])
 
 
 @lru_cache(maxsize=64)
@@ -58,10 +63,11 @@ EFFECT = Effect(
         Parameter("f_c", "Hz", 40.0, positive=True, null_value=math.inf),
         Parameter("zeta", "-", BUTTERWORTH, positive=True, null_value=BUTTERWORTH, least=LEAST_DAMPING),
         RATE,
+        SMOOTHING,
     ),
     "it moves at frequencies near f_c; a delay alone is a clock_offset",
     _forward,
     linear=False,
-    starts=digital_starts(*([hz, BUTTERWORTH] for hz in START_HZ)),
+    starts=digital_starts(*([hz, BUTTERWORTH] for hz in START_HZ), order=[SMOOTHING.plausible]),
     lagless=_without_lag,
 )

@@ -11,7 +11,8 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
-from imutool.diagnosis.reference.coverage import align, align_all, new_samples, repeats
+from imutool.diagnosis.reference.coverage import align, align_all
+from imutool.diagnosis.reference.taken_samples import batched, new_samples, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
@@ -128,6 +129,26 @@ def test_a_topic_that_is_faster_than_its_sensor_is_read_at_the_rate_of_the_senso
     stuck = imu.gyro.copy()
     stuck[1000:] = stuck[999]
     assert len(new_samples(replace(real, imu=replace(imu, gyro=stuck))).imu) == len(imu)
+
+
+@pytest.mark.parametrize("with_simulation", [True, False])
+def test_samples_stamped_in_batches_are_read_on_the_clock_of_the_sensor(with_simulation: bool) -> None:
+    """A driver that reads five samples at a time stamps them together; every step between batches was a gap."""
+    real, size = made(EXACT), 5
+    imu = along(real, 1).imu
+    count = len(imu) // size * size
+    t_ns = np.repeat(imu.t_ns[:count][size - 1 :: size], size) + np.tile(np.arange(size) * 50_000, count // size)
+    late = replace(real, imu=Imu(t_ns, imu.gyro[:count], imu.accel[:count]))
+    (pair,), remarks = align_all([late], along(real) if with_simulation else None, None, DiagnoseSettings())
+    assert pair.period_s == pytest.approx(1.0 / RATE_HZ, rel=1e-3)
+    np.testing.assert_allclose(np.diff(pair.stamp_s), 1.0 / RATE_HZ, atol=1e-4)
+    assert any(pair.fitted)
+    assert any(pair.held_out)
+    assert "stamps come in batches of about 5.0 samples" in remarks[0]
+    (finding,) = batched([pair], [])
+    assert finding.effect == "timestamp_jitter"
+    assert finding.parameters["std"].value == pytest.approx(np.std(np.arange(size)) / RATE_HZ, rel=0.02)
+    assert batched([pair], [finding]) == []
 
 
 def test_a_sample_that_repeats_the_one_before_does_not_count() -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imutool.diagnosis.estimation.observability import SHARED
+from imutool.diagnosis.estimation.observability import LOW_PASSES, SHARED
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.gyro_hysteresis import LEAST, SHARE, error_and_ideal, play
 from imutool.sensor.effects.low_pass import ORDER, RATE, SMOOTHING, of_one
@@ -40,16 +40,19 @@ def digital(of_analog: Effect) -> Effect:
 
 
 def exponential(of_analog: Effect) -> Effect:
-    """The low-pass of first order as exponential smoothing, with its rate."""
-    lagless = of_analog.lagless
+    """The low-pass as exponential smoothing with its rate; of second order it smooths twice."""
+    lagless, twice = of_analog.lagless, of_analog.name == LOW_PASSES[1]
     assert lagless is not None, "a low-pass has a lag"
+    text = "y += (1 - exp(-2 pi f_c / smoothing_rate)) (x - y) at each sample x, y read in its place"
+    poles = "y[k] = (p + q) y[k-1] - p q y[k-2] + (1 - p) (1 - q) x[k] at each sample k, read in its place, "
+    poles += "p, q = exp(-2 pi f_c (zeta +- sqrt(zeta^2 - 1)) / smoothing_rate)"
 
     def full(theta: Theta) -> Theta:
-        return np.array([theta[0], RATE.null_value, ORDER.null_value, theta[1]])
+        return np.array([*theta[:-1], RATE.null_value, *([] if twice else [ORDER.null_value]), theta[-1]])
 
     return replace(
         of_analog,
-        equation="y += (1 - exp(-2 pi f_c / smoothing_rate)) (x - y) at each sample x, y read in its place",
+        equation=poles if twice else text,
         parameters=(*of_analog.parameters, SMOOTHING),
         forward=lambda motion, theta: of_analog.forward(motion, full(theta)),
         lagless=lambda motion, theta: lagless(motion, full(theta)),
@@ -66,7 +69,8 @@ def _of_low_pass(effect: Effect, *, exact: bool) -> list[Effect]:
     both, higher = analog(effect), HIGHER if ORDER in effect.parameters else ()
     if not exact:
         return [both]
-    return [both, *(of_one(both, sensor) for sensor in SENSORS), *(of_order(both, order) for order in higher)]
+    each = [both, *(of_one(both, sensor) for sensor in SENSORS)]
+    return [*each, *(of_order(one, order) for one in each for order in higher)]
 
 
 def analog(effect: Effect) -> Effect:
@@ -86,7 +90,7 @@ def of_order(first: Effect, order: float) -> Effect:
 
     return replace(
         first,
-        variant=f"order {order:g}",
+        variant=f"{first.variant} order {order:g}".strip(),
         constants=((ORDER, float(order)),),
         forward=lambda motion, theta: first.forward(motion, full(theta)),
         lagless=lambda motion, theta: lagless(motion, full(theta)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.optimize import brentq
 
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
@@ -17,7 +18,12 @@ from imutool.diagnosis.settings import SearchSettings
 from imutool.sensor.effect import Effect, Theta
 from imutool.sensor.effects.low_pass import RATE, SMOOTHING, Design
 from imutool.sensor.effects.second_order_low_pass import BUTTERWORTH
+from imutool.units import SENSORS
 
+LAGS = (*LOW_PASSES, "clock_offset", "gyro_delay")
+LEAST_LAG = 0.05  # of a sample period: less is no filter that a log shows
+CLOCKS_SHARE = 0.5  # of the lag that both sensors have, from where the fit of a clock beside filters starts
+TAKEN_BACK = 0.5  # of a low-pass's lag: a clock that leaves less takes it back
 SLOWEST = 0.9  # samples of a digital filter for one that is recorded
 
 
@@ -63,15 +69,15 @@ def with_form_of_low_pass(logs: Sequence[WhitenedLog], now: Fit, named: Sequence
     if not all(isinstance(log.pair, Pair) and log.pair.exact for log in logs):
         return now
     settings, period_s = logs[0].pair.settings.search, logs[0].pair.period_s
-    error = settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
+    error = _model_error(logs)
     for k, (effect, _) in enumerate(now.chosen):
         if effect.name not in LOW_PASSES or {RATE, SMOOTHING} & {*effect.parameters}:
             continue
         errs, best = error * _taken(now, k), now
-        for chosen in _forms(now, k, named, 1.0 / period_s):
+        for chosen in _forms(now, k, _allowed(now, k, named), 1.0 / period_s):
             least = settings.clearly_better if _sensors(chosen) == _sensors(now.chosen) else max(settings.clearly_better, errs)
             trial = fit(logs, chosen, near=now, give_up_above=bic(best) - least)
-            if bic(trial) < min(bic(best), bic(now) - least) and not _folds(trial, period_s):
+            if _form_bic(trial) < _form_bic(best) and bic(trial) < bic(now) - least and not _folds(trial, period_s):
                 best = trial
         if best is not now:
             return with_form_of_low_pass(logs, best, named)
@@ -111,17 +117,104 @@ def with_delay_of_accel(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[E
     return now
 
 
+def with_filter_of_each_sensor(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
+    """Fit with a low-pass of each sensor for lags of both, in its own form, if better (BIC).
+
+    Chips filter gyro and accelerometer each in its own way. The search finds the larger filter on both sensors, and then a
+    clock, or a gyro, that takes some of the lag back.
+    """
+    if not all(isinstance(log.pair, Pair) and log.pair.exact for log in logs):
+        return now
+    lags = [k for k, (effect, _) in enumerate(now.chosen) if effect.name in LAGS]
+    if not {now.chosen[k][0].name for k in lags} - {"clock_offset"} or (
+        len(lags) == 1 and now.chosen[lags[0]][0].name in LOW_PASSES
+    ):
+        return now
+    others, period_s = tuple(entry for k, entry in enumerate(now.chosen) if k not in lags), logs[0].pair.period_s
+    lag_s: dict[tuple[str, ...], float] = {(sensor,): sum(_lag_s(*now.chosen[k], sensor) for k in lags) for sensor in SENSORS}
+    second = [of for of in named if of.name == LOW_PASSES[1] and lag_s.get(of.sensors, 0.0) > LEAST_LAG * period_s]
+    if not second or min(lag_s.values()) < -LEAST_LAG * period_s:
+        return now
+
+    def beside(shared_s: float, *clock: tuple[Effect, Theta]) -> Fit:
+        each = ((of, np.array([_cutoff_hz(of, [BUTTERWORTH], lag_s[of.sensors] - shared_s), BUTTERWORTH])) for of in second)
+        return fit(logs, (*others, *clock, *each), near=now)
+
+    best = beside(0.0)
+    for of in second:
+        best = _with_own_form(logs, best, of.sensors, named)
+    shared_s = CLOCKS_SHARE * min(lag_s.values())  # of the lag of both may be the clock's
+    offsets = [beside(shared_s, (of, np.array([-shared_s]))) for of in named if of.name == "clock_offset" and len(second) > 1]
+    best = min((best, *offsets), key=_form_bic)
+    if len(best.prior) < len(now.prior):  # simpler
+        return best if _form_bic(best) < _form_bic(now) else now
+    least = logs[0].pair.settings.search.clearly_better if len(best.prior) > len(now.prior) else 0.0
+    errs = _model_error(logs) * sum(_taken(now, k) for k in lags if now.chosen[k][0].name in LOW_PASSES)
+    return best if _form_bic(best) < _form_bic(now) - max(least, errs) else now
+
+
+def _model_error(logs: Sequence[WhitenedLog]) -> float:
+    """Share of the squares of a filter by which its model may err, beside a simulation."""
+    settings = logs[0].pair.settings.search
+    return settings.model_error_denoised if any(log.pair.denoised for log in logs) else settings.model_error
+
+
+def _with_own_form(logs: Sequence[WhitenedLog], now: Fit, sensors: tuple[str, ...], named: Sequence[Effect]) -> Fit:
+    """Fit with the filter of one sensor in another form, if better."""
+    k = next(k for k, (effect, _) in enumerate(now.chosen) if effect.name in LOW_PASSES and effect.sensors == sensors)
+    period_s, best = logs[0].pair.period_s, now
+    forms = [of for of in named if of.name in LOW_PASSES and of.sensors == sensors]  # the other sensor may have another order
+    for chosen in _forms(now, k, forms, 1.0 / period_s):
+        trial = fit(logs, chosen, near=now, give_up_above=bic(best))
+        best = trial if _form_bic(trial) < _form_bic(best) and not _folds(trial, period_s) else best
+    return best
+
+
+def _form_bic(found: Fit) -> float:
+    """BIC in which another order counts as a parameter, and any form but an analog first or second order has to be clear.
+
+    A filter far above the motion shows its lag alone, which every form has.
+    """
+    filters = [effect for effect, _ in found.chosen if effect.name in LOW_PASSES]
+    orders, rare = (
+        sum(len(of.constants) for of in filters),
+        sum(bool(of.constants or {RATE, SMOOTHING} & {*of.parameters}) for of in filters),
+    )
+    return bic(found) + orders * float(np.log(found.numbers)) + rare * found.logs[0].pair.settings.search.clearly_better
+
+
+def is_late(found: Fit, low_pass: Effect) -> bool:
+    """Whether a sensor is late behind its low-pass, whose lag no clock takes back."""
+    own_s = next(Design.of(low_pass, theta).lag_s for effect, theta in found.chosen if effect is low_pass)
+    lags_s = (sum(_lag_s(*entry, sensor) for entry in found.chosen) for sensor in low_pass.sensors)
+    return not any(log.pair.aligned_s for log in found.logs) and min(lags_s, default=0.0) > TAKEN_BACK * own_s
+
+
+def _lag_s(effect: Effect, theta: Theta, sensor: str) -> float:
+    """Lag of one sensor far below any cut-off."""
+    if effect.name in LOW_PASSES:
+        return Design.of(effect, theta).lag_s if sensor in effect.sensors else 0.0
+    if effect.name == "gyro_delay":
+        return float(theta[0]) if sensor == "gyro" else 0.0
+    return -float(theta[0]) if effect.name == "clock_offset" else 0.0
+
+
 def _sensors(chosen: Chosen) -> list[tuple[str, ...]]:
     """Sensors on which low-passes act."""
     return sorted(effect.sensors for effect, _ in chosen if effect.name in LOW_PASSES)
+
+
+def _allowed(now: Fit, k: int, named: Sequence[Effect]) -> list[Effect]:
+    """Effects that may act beside all others but one."""
+    others = (*now.chosen[:k], *now.chosen[k + 1 :])
+    return [of for of in named if of.name not in LOW_PASSES or not any(exclude_each_other(of, one) for one, _ in others)]
 
 
 def _forms(now: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterator[Chosen]:
     """Effects with another form of a low-pass; a clock offset may share its lag."""
     (effect, theta), others = now.chosen[k], (*now.chosen[:k], *now.chosen[k + 1 :])
     offset = next((one for one in named if one.name == "clock_offset"), None)
-    lag_s = Design.of(effect, theta).lag_s
-    forms = [of for of in named if of.name in LOW_PASSES and not any(exclude_each_other(of, one) for one, _ in others)]
+    lag_s, forms = Design.of(effect, theta).lag_s, [of for of in named if of.name in LOW_PASSES]
     for form in forms:
         for start in _starts(form, effect, theta, lag_s, rate_hz):
             yield (*others, start)
@@ -136,15 +229,24 @@ def _forms(now: Fit, k: int, named: Sequence[Effect], rate_hz: float) -> Iterato
 
 
 def _starts(other: Effect, effect: Effect, theta: Theta | None, lag_s: float, rate_hz: float) -> list[tuple[Effect, Theta]]:
-    """A low-pass with a lag: analog if it is another one than the fitted, digital, and of first order as smoothing."""
-    cutoff_hz = Design.of(other, np.array([1.0, BUTTERWORTH])[: len(other.parameters)]).lag_s / lag_s
-    start = [cutoff_hz, BUTTERWORTH][: len(other.parameters)]
-    if theta is not None and (other.name, other.constants) == (effect.name, effect.constants):
-        start = theta.tolist()
-    analog = [] if theta is not None and other.key == effect.key else [(other, np.array(start))]
-    at_rate = np.array([*start, rate_hz])
-    smoothing = [(exponential(other), at_rate)] if other.name == LOW_PASSES[0] and not other.constants else []
-    return [*analog, (digital(other), at_rate), *smoothing]
+    """A low-pass with a lag: analog if it is another one than the fitted, digital, and as smoothing."""
+    damping = [BUTTERWORTH][: len(other.parameters) - 1]
+    at_rate = [digital(other), *([] if other.constants else [exponential(other)])]
+    starts = [(of, np.array([_cutoff_hz(of, [*damping, rate_hz], lag_s), *damping, rate_hz])) for of in at_rate]
+    if theta is not None and other.key == effect.key:
+        return starts
+    return [(other, np.array([_cutoff_hz(other, damping, lag_s), *damping])), *starts]
+
+
+def _cutoff_hz(of: Effect, others: Sequence[float], lag_s: float) -> float:
+    """Cut-off frequency with which a low-pass has a lag; that of the analog one if a filter at a rate has less."""
+
+    def longer_s(log_hz: float) -> float:
+        return Design.of(of, np.array([np.exp(log_hz), *others])).lag_s - lag_s
+
+    analog_hz = Design.of(of, np.array([1.0, *others])).lag_s / lag_s
+    least, most = np.log(analog_hz) - 3.0, np.log(analog_hz) + 1.0
+    return float(np.exp(brentq(longer_s, least, most))) if longer_s(least) > 0.0 > longer_s(most) else analog_hz
 
 
 def _of_each_sensor(now: Fit, k: int, named: Sequence[Effect]) -> Chosen:
@@ -165,10 +267,6 @@ def _taken(found: Fit, k: int) -> float:
 
 def _folds(found: Fit, period_s: float) -> bool:
     """Whether a digital filter is slower than the samples, which it would give twice."""
-    slowest = (
-        value
-        for effect, theta in found.chosen
-        for p, value in zip(effect.parameters, theta, strict=True)
-        if p in (RATE, SMOOTHING)
-    )
-    return min(slowest, default=np.inf) * period_s < SLOWEST
+    designs = [Design.of(effect, theta) for effect, theta in found.chosen if effect.name in LOW_PASSES]
+    slowest_hz = min((min(one.rate_hz, one.smoothing_hz) for one in designs), default=np.inf)
+    return slowest_hz * period_s < SLOWEST

@@ -37,6 +37,7 @@ from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
 from imutool.sensor.effect import Effect
+from imutool.sensor.effects.low_pass import Design
 
 
 @dataclass(eq=False)
@@ -108,7 +109,8 @@ class Trial:
         found, most, (mine, theta) = dict[str, Fit](), self.settings.rivals, now.chosen[k]
         without = fit(self.logs, others := (*now.chosen[:k], *now.chosen[k + 1 :]), iterations=2, near=now)
         least, aic = self.settings.rival_share * (without.objective - now.objective), now.objective + 2 * len(theta)
-        for _, effect, start, promised in self.candidates.ranked(without, self.named, most)[:most]:
+        named = tuple(effect for effect in self.named if effect.lagless is None or not effect.constants)  # one order of a name
+        for _, effect, start, promised in self.candidates.ranked(without, named, most)[:most]:
             if effect.name != mine.name and effect.meets(mine) and promised > least:
                 trial = fit(self.logs, (*others, (effect, start)), near=without, give_up_above=without.objective - least)
                 if leaves_as_little(trial, effect.key, aic):
@@ -175,6 +177,8 @@ class Trial:
         effect, theta = whole.chosen[k]
         stds = (whole.stds() if scattered is None else scattered.std)[effect.key]
         std = np.array([self.onset_std.get((effect.key, j), float(s)) for j, s in enumerate(stds)])
+        if effect.lagless is not None:
+            std[0] = np.hypot(std[0], theta[0] * Design.of(effect, theta).digital_share)
         no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
         no_answer = no_answer or is_coloured_noise(effect, theta, whole)
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):

@@ -1,0 +1,82 @@
+"""Samples that a sensor took, without those that its driver repeats, on its own clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imutool.array_types import Bool, Float64
+from imutool.cleaning.stamp_line import batch_words, read_stamps, restamped
+from imutool.diagnosis.estimation.aligned_log import Pair
+from imutool.diagnosis.result import Estimate, Finding, HeldOut
+from imutool.recording import Recording
+from imutool.recording.columns import true_ranges
+
+SELDOM = 0.1  # of the samples of an axis that are equal to the one before: digits are finer than the noise
+MOSTLY_NEW = 0.3  # of the samples that repeat the one before: more is a topic that is faster than its sensor
+LEAST_NEW = 0.05  # of the samples with news of both sensors: two that take turns have none
+STUCK = 10  # samples in a row that a sensor stands still, and is not held
+JITTER = "timestamp_jitter"
+
+
+def new_samples(recording: Recording) -> Recording:
+    """Recording without readings that are held, where a topic is faster than its sensor.
+
+    Half of the samples of a gyro at half of the rate are late by a sample, and look like a low-pass.
+    """
+    held = np.zeros(len(recording.imu), bool)
+    for sensor in (recording.imu.gyro, recording.imu.accel):
+        equal = np.concatenate([np.zeros((1, 3), bool), np.diff(sensor, axis=0) == 0])[: len(sensor)]
+        again = np.asarray(equal.all(axis=1))
+        for start, end in true_ranges(again):
+            again[start:end] = end - start < STUCK
+        if again.any() and again.mean() >= MOSTLY_NEW and equal[~again].mean(axis=0).max() < SELDOM:
+            held |= again
+    if not held.any() or (~held).mean() < LEAST_NEW:
+        return recording
+    return replace(recording, imu=recording.imu.rows(~held))
+
+
+def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+    """Samples that repeat the one before on every axis.
+
+    The axes seldom read the same twice otherwise. A driver that missed a sample may send the last one again. Digits that are
+    coarser than the noise repeat by themselves.
+    """
+    equal = np.concatenate([np.zeros((1, 6), bool), np.diff(real, axis=0) == 0])[: len(real)]
+    again = equal.all(axis=1)
+    by_chance = equal[~again].mean(axis=0) if (~again).any() else np.ones(6)
+    return np.asarray(again & bool(by_chance.max() < SELDOM and again.mean() < MOSTLY_NEW))
+
+
+def on_own_clock(recording: Recording) -> tuple[Recording, float]:
+    """Recording on its sensor's clock if its stamps came in batches, and their deviation (s).
+
+    Most steps between stamps of a driver that reads batches are far shorter than the sensor's period.
+    """
+    t_ns = recording.imu.t_ns
+    if read_stamps(t_ns).batch <= 1.0:
+        return recording, 0.0
+    own_ns = restamped(t_ns)
+    return replace(recording, imu=replace(recording.imu, t_ns=own_ns)), float((t_ns - own_ns).std()) * 1e-9
+
+
+def batched(pairs: Sequence[Pair], others: Sequence[Finding]) -> list[Finding]:
+    """Finding of stamps that came in batches, if none of the others says that they jitter."""
+    late_s = max(pair.batched_s for pair in pairs)
+    if not late_s or any(finding.effect == JITTER for finding in others):
+        return []
+    count = sum(len(pair.stamp_s) for pair in pairs)
+    length = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs)
+    parameters = {"std": Estimate(late_s, late_s / np.sqrt(2.0 * count), "s")}
+    held_out = HeldOut(0.0, 0.0, "-", round(length, 1))
+    return [Finding(JITTER, "both", 0.0, 0.0, 0.0, parameters, "stamps come in batches, samples do not", held_out)]
+
+
+def batch_remark(recording: Recording) -> list[str]:
+    """Remark on stamps in batches."""
+    size = read_stamps(recording.imu.t_ns).batch
+    words = f"{recording.name}: {batch_words(size)}. The diagnosis is of samples on the sensor's clock, a line under the stamps"
+    return [words] if size > 1.0 else []
