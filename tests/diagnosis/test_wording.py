@@ -371,9 +371,9 @@ def test_a_clock_that_wanders_says_from_where_to_where() -> None:
 
 
 @pytest.mark.parametrize(("tau_s", "words"), [(1.5e-3, "it lags"), (-1.5e-3, "it is ahead of")])
-def test_a_late_gyro_is_late_against_the_accelerometer(tau_s: float, words: str) -> None:
+def test_a_late_gyro_is_late_against_the_motion_as_the_accelerometer_may_be_filtered(tau_s: float, words: str) -> None:
     late = finding("gyro_delay", {"tau": Estimate(tau_s, 1e-4, "s")}, "gyro")
-    assert named_sentence(diagnoses.ARM, late) == f"{words} the accelerometer by 1.50 ± 0.10 ms (gyro_delay)"
+    assert named_sentence(diagnoses.ARM, late) == f"{words} the motion by 1.50 ± 0.10 ms (gyro_delay)"
 
 
 def test_a_limit_that_is_never_reached_is_not_news() -> None:

@@ -39,7 +39,7 @@ def _clock_offset(w: Words) -> str:
 
 
 def _gyro_delay(w: Words) -> str:
-    return f"{w.it} {'is ahead of' if w.main.sign < 0 else 'lags'} the accelerometer by {w.main.size}"
+    return f"{w.it} {'is ahead of' if w.main.sign < 0 else 'lags'} the motion by {w.main.size}"
 
 
 def _delay(w: Words) -> str:
