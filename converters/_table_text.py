@@ -44,9 +44,9 @@ STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
 )
 
 
-def matrix_columns(name: str) -> list[str]:
-    """Columns of an array of matrices, row by row."""
-    return [f"{name}[{row}][{column}]" for row in range(3) for column in range(3)]
+def matrix_columns(named: str | list[str]) -> list[str]:
+    """Columns of an array of matrices, row by row; or nine columns as they are named."""
+    return [f"{named}[{row}][{column}]" for row in range(3) for column in range(3)] if isinstance(named, str) else named
 
 
 @dataclass

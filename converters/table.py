@@ -27,6 +27,7 @@ from ._table_folder import POSES_GROUP, TRUTH_GROUP, load_split, sequences_below
 from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
 from ._table_map import (
     IMU_TOPIC,
+    TRUE_ENTRIES,
     Entries,
     Proposal,
     TableMap,
@@ -84,9 +85,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     path = sequence.path
     columns = load_split(path, sequence.inside) if path.is_dir() else load(path, kind_of(head(path), path), sequence.inside)
     remarks, place = columns.remarks, mapping if isinstance(mapping, Path) else path
-    asked = path / sequence.inside
     given = {} if mapping is None else within_groups(read_map(mapping), columns)
-    tables = _mapped(columns, given, place) or _proposed(columns, asked, remarks, given)
+    tables = _mapped(columns, given, place) or _proposed(columns, path / sequence.inside, remarks, given)
     tables = [_counted(columns, table, place) for table in tables]
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
@@ -96,7 +96,8 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
         what = f"{file} gives no poses: no time with positions and a certain order of quaternions was found in it"
         remarks.losses.append(f"{what}; a map names its columns (truth_time, position, quaternion_wxyz)")
     if poses and not table.truth_file:
-        used |= {table.truth_time, *table.position, *table.quaternion_wxyz, *table.roll_pitch_yaw}
+        turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
+        used |= {table.truth_time, *table.position, *turns}
     scalars, constants = _further(columns, tables, used, place)
     log = MessageLog(
         sequence.name,
@@ -157,7 +158,8 @@ def _mapped(columns: Columns, given: Entries, place: Path) -> list[TableMap]:
     Raises:
         ConfigError: the map names no times, and an IMU's table shows none.
     """
-    if is_whole(given):
+    unnamed = {TRUTH_GROUP, POSES_GROUP} & columns.sources.keys() and not given.keys() & {"truth_file", *TRUE_ENTRIES}
+    if is_whole(given) and not unnamed:  # poses of another table that it does not name are found by the motion
         return [msgspec.convert(given, TableMap)]
     if not {"gyro_unit", "accel_unit"} <= given.keys() or given.keys() & {"gyro", "accel"}:
         return []
@@ -254,11 +256,7 @@ def _rotations(columns: Columns, table: TableMap, where: Path) -> Float64[np.nda
         return vectors_named(columns, table.quaternion_wxyz, 1.0, 0.0, where)
     if table.roll_pitch_yaw:
         return of_angles(vectors_named(columns, table.roll_pitch_yaw, ANGLE_SI[table.roll_pitch_yaw_unit], 0.0, where))
-    nine = matrix_columns(table.rotation_matrix) if isinstance(table.rotation_matrix, str) else table.rotation_matrix
-    if isinstance(table.rotation_matrix, str) and nine[0] not in columns.values:
-        arrays = [name.removesuffix(matrix_columns("")[0]) for name in columns.values if name.endswith(matrix_columns("")[0])]
-        expected = ", ".join(arrays) or "an array of 3 by 3 matrices, or nine columns"
-        raise ConfigError(f"no rotations {table.rotation_matrix!r}", where=where, expected=expected)
+    nine = matrix_columns(table.rotation_matrix)
     return of_matrices(vectors_named(columns, nine, 1.0, 0.0, where).reshape(-1, 3, 3), where)
 
 

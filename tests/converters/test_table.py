@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import table
+from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
 from imutool.sensor.made_up_flight import flight
 
@@ -349,6 +350,11 @@ def test_tables_that_a_number_pairs_are_a_recording_each_and_one_map_holds_for_a
     )
     done = convert(folder, tmp_path / "out/", "--map", tmp_path / "map.toml")
     assert done.returncode == 0, done.stderr
+    (tmp_path / "whole.toml").write_text('time = "ts"\ntime_unit = "s"\n' + (tmp_path / "map.toml").read_text())
+    done = convert(folder, tmp_path / "whole/", "--map", tmp_path / "whole.toml")
+    assert done.returncode == 0, done.stderr
+    with Log(tmp_path / "whole" / "imuRaw2.mcap") as log:
+        assert {*log.topics} == {"/imu0", "/ground_truth/pose"}
     recordings = [read(tmp_path / "out" / f"imuRaw{number}.mcap") for number in (1, 2, 3)]
     assert [len(each.imu) for each in recordings] == [5645, 4698, 3404]
     assert [len(each.truth.t_ns) for each in recordings] == [5561, 4601, 3433]
