@@ -13,7 +13,7 @@ from ._table_text import Columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
-EITHER_WAY = ", and as well the other way; the motion is about too few axes to tell"
+EITHER_WAY = ", and the other way, too: the motion has too few axes to tell"
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
 QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"

@@ -98,7 +98,7 @@ def _way_by_motion(
     """Which of two readings of a rotation turns as the gyro does, and whether motion shows it.
 
     A quaternion in the other order is the inverse rotation in other frames, as is the transpose of a matrix. Motion about one
-    or two axes fits both. Then the reading counts that turns about the gyro's own axes, and without one the first.
+    or two axes fits both. Then the reading that turns about the gyro's own axes counts, or else the first.
     """
     gyro, at_s, fits_both = _GyroTurns.of(columns, entries), _seconds(columns, clock), False
     for span_s in SPANS_S:

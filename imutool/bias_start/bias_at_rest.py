@@ -43,7 +43,7 @@ PIECE = 512  # samples, of which the search for a stop takes no more than it nee
 def auto(model: BiasModel, imu: Imu) -> InitialBias:
     """Bias from the first stop of the first minute and the training runs, then tracked.
 
-    Samples up to the end of that stop get what all of them show, later ones what earlier samples show.
+    Samples up to the end of that stop get the bias that all of them show. Later ones get that of the samples before them.
 
     Raises:
         DataError: an untrained model, and the log does not start at rest.

@@ -295,7 +295,7 @@ def test_numbered_quaternions_of_a_motion_about_one_axis_are_poses_in_the_gyros_
     log = read(tmp_path / "log.csv")
     (imu,), (poses,) = log.imus.values(), log.poses.values()
     assert np.abs(imu.gyro - gyro).max() < 1e-5, "the poses show that it counts degrees"
-    either_way = any("and as well the other way; the motion is about too few axes to tell" in n for n in log.remarks.notes)
+    either_way = any("and the other way, too: the motion has too few axes to tell" in n for n in log.remarks.notes)
     assert either_way == mounted
     right = np.abs((Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True) * yaw.inv()).as_rotvec()).max() < 1e-5
     assert right == (order == "wxyz" or not mounted)
