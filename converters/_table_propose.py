@@ -85,7 +85,10 @@ def _propose_sensor(
         for column in given[sensor]:
             column_named(columns, columns.unsigned(column), "mapping")
         proposal.entries[sensor] = given[sensor]
-        _propose_stated(proposal, sensor, units, names, columns)
+        if unit := given.get(f"{sensor}_unit", ""):
+            proposal.entries[f"{sensor}_unit"] = unit
+        else:
+            _propose_stated(proposal, sensor, units, names, columns)
         return
     whole = _with_gravity(found, columns) if sensor == "accel" else found
     if len(whole) < len(found):
@@ -160,7 +163,7 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {near[0]}")
             proposal.entries["accel_unit"] = near[0]
             return
-        if are_unsigned_counts(columns.side_by_side(proposal.entries[sensor])):
+        if are_unsigned_counts(columns.side_by_side(proposal.unsigned(sensor, columns))):
             near = []
             proposal.reasons.append("the accel holds whole numbers, none below zero: raw counts, with a zero of their own?")
             proposal.hints += [

@@ -350,6 +350,7 @@ def test_tables_that_a_number_pairs_are_a_recording_each_and_one_map_holds_for_a
     )
     done = convert(folder, tmp_path / "out/", "--map", tmp_path / "map.toml")
     assert done.returncode == 0, done.stderr
+    assert "gravity in mg" not in done.stderr, "the map states the unit"
     (tmp_path / "whole.toml").write_text('time = "ts"\ntime_unit = "s"\n' + (tmp_path / "map.toml").read_text())
     done = convert(folder, tmp_path / "whole/", "--map", tmp_path / "whole.toml")
     assert done.returncode == 0, done.stderr
