@@ -17,9 +17,10 @@ EITHER_WAY = ", and the other way, too: the motion has too few axes to tell"
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
 QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
+COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
 ANGLES = (
     (
-        r"(?!(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_)(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?",
+        rf"(?!{COMMANDED})(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?",
         ("roll", "pitch", "yaw"),
     ),
     (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
@@ -35,6 +36,11 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
 )
 NED = POSITIONS[2:]
 MATRIX = r"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
+OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
+    rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
+    r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
+    rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
+)
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
 
 RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
@@ -115,26 +121,24 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     found: Entries = {"accel_time": other[0]} if other is not None and other[1] == unit else {}
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
-        beside = time_beside(columns, column, time, unit)
-        if beside is None and len(values) == len(columns.values[time]):
-            beside = time, unit
+        in_rows = (time, unit) if len(values) == len(columns.values[time]) else None
+        beside = time_beside(columns, column, time, unit) or in_rows
         if beside is not None and not entries.keys() & TURNS:
             leaf = split_name(column.removeprefix(group_of(column)))[0]
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
             groups.setdefault((beside, is_true(column) or name != leaf), {})[name] = column
     poses = []
     for (clock, named_true), leaves in groups.items():
-        position = _position(leaves)
-        turns = _turns(columns, entries, leaves, clock, reasons) if position or named_true or clock[0] != time else {}
+        bodies = _bodies(leaves)
+        for body in (leaves, *bodies):
+            position = _position(body)
+            turns = _turns(columns, entries, body, clock, reasons) if position or named_true or clock[0] != time else {}
+            if turns:
+                break
         if turns:
             poses.append((not named_true, clock, turns, position))
-        elif clock[0] == time:
-            continue
-        elif array := next((c for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), ""):
-            reasons.append(f"{array[:-3]} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them")
-        elif three := next(iter(_angles(leaves)), []):
-            said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
-            reasons.append(f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them")
+        elif clock[0] != time or bodies:
+            reasons += _why_no_turns(columns, leaves, bodies)
     for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
         found["pose_kind"] = "estimate" if is_estimate else "truth"
@@ -182,10 +186,30 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
             way = "" if rows == nine else ", transposed"
             reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{way}{'' if is_shown else EITHER_WAY}")
             return {"rotation_matrix": rows}
-    found = next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in _angles(leaves))), {})
-    if found:
+    if found := next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in _angles(leaves))), {}):
         reasons.append(f"{', '.join(found['roll_pitch_yaw'])} turn as the gyro does, as roll, pitch and yaw")
     return found
+
+
+def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]]) -> list[str]:
+    """Reasons why the rotations of a group make no poses."""
+    array = next((c[:-3] for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), "")
+    named = [array] if array else next(filter(None, (_axes(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
+    if named:
+        return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
+    if three := next(iter(_angles(leaves)), []):
+        said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
+        return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
+    return []
+
+
+def _bodies(leaves: dict[str, str]) -> list[dict[str, str]]:
+    """Columns of each body that has a position and quaternions in its own name, without that name."""
+    bodies: dict[str, dict[str, str]] = {}
+    for leaf, column in leaves.items():
+        if match := next(filter(None, (re.fullmatch(form, leaf) for form in OWNED)), None):
+            bodies.setdefault(match["body"], {})[match["leaf"]] = column
+    return [body for body in bodies.values() if len(body) >= 7 and _position(body)]
 
 
 def _matrix(leaves: dict[str, str]) -> list[str]:
@@ -197,8 +221,7 @@ def _matrix(leaves: dict[str, str]) -> list[str]:
 
 def _position(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
     """Columns x, y, z of a position, or east, north, up, or north, east, down."""
-    found = (_axes(pattern, leaves, axes) for pattern, axes in forms)
-    return next(filter(None, found), [])
+    return next(filter(None, (_axes(pattern, leaves, axes) for pattern, axes in forms)), [])
 
 
 def _angles(leaves: dict[str, str]) -> list[list[str]]:
@@ -273,5 +296,5 @@ def shared_group(time: str, column: str) -> int:
 
 def _columns_of(entries: Entries) -> set[str]:
     """Columns that a map names."""
-    parts = [[value] if isinstance(value, str) else value for name, value in entries.items() if name in COLUMN_ENTRIES]
-    return {column for part in parts for column in part}
+    named = [value for name, value in entries.items() if name in COLUMN_ENTRIES]
+    return {column for value in named for column in ([value] if isinstance(value, str) else value)}

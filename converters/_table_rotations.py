@@ -19,7 +19,7 @@ from ._table_text import Columns
 from ._table_units import ANGLE_SI, GYRO_SI, TIME_NS
 
 SPAN_S, LONG_SPAN_S = 0.1, 0.3  # over which turns are compared; over the second, noise of the poses is a smaller part
-MOST_SPANS, LEAST_S = 5.0, 10.0  # multiple of a span that has a gap in it, and the least time to compare
+MOST_SPANS, LEAST_S = 5.0, 5.0  # multiple of a span that has a gap in it, and the least time to compare
 MOST_S = 300.0  # of a longer table, those that turn most
 SURE, CLEARLY = 0.9, 0.25  # correlation of turns that are the same; share of what the other order leaves that the right one may
 LIKELY, MOST_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns in one unit, as the next is a factor of 57 away
@@ -29,7 +29,8 @@ ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
 TURNS = {"quaternion_wxyz", "rotation_matrix", "roll_pitch_yaw"}  # entries of a map that name rotations
 MOST_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
 SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, often rounded to 0.1 degrees, or of poses that jump
-DELAYS_S = (*(sign * tenth / 10.0 for tenth in range(11) for sign in (1, -1)),)  # of a clock of the angles' own, none first
+DELAYS_S = (*(sign * tenth / 10.0 for tenth in range(11) for sign in (1, -1)),)  # of a clock of the poses' own, none first
+MOST_IN_ROWS_S = 0.2  # delay of poses in the rows of the IMU
 
 
 def of_matrices(matrices: Float64[np.ndarray, "n 3 3"], where: Path | None = None) -> Float64[np.ndarray, "n 4"]:
@@ -101,8 +102,8 @@ def _way_by_motion(
     or two axes fits both. Then the reading that turns about the gyro's own axes counts, or else the first.
     """
     gyro, at_s, fits_both = _GyroTurns.of(columns, entries), _seconds(columns, clock), False
-    for span_s in SPANS_S:
-        turns = [_turns_alike(gyro, way, at_s, span_s) for way in ways]
+    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
+        turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in ways]
         for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
             best = int(np.argmax(found))
             if found[best] > SURE and _is_clear(found[best], min(found)):
@@ -123,7 +124,7 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
     turns = {way: _rotations(columns, named) for way, named in ways.items()}
     gyro, at_s = _GyroTurns.of(columns, entries), _seconds(columns, clock)
     size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
-    for span_s, delay_s in product(SPANS_S, DELAYS_S if clock[0] != entries["time"] else (0.0,)):
+    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         found = {}
         for way, q_wxyz in turns.items():
             correlation, ratio, _ = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
@@ -134,6 +135,11 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
         if best > SURE and _is_clear(best, other_unit):
             return ways[unit, "-" if _is_clear(found[unit, "-"], found[unit, ""]) else ""]
     return {}
+
+
+def _delays(entries: Entries, clock: tuple[str, str]) -> list[float]:
+    """Delays between poses and gyro to try, the smallest first; less in rows of the IMU, which may be of another device."""
+    return [delay_s for delay_s in DELAYS_S if clock[0] != entries["time"] or abs(delay_s) <= MOST_IN_ROWS_S]
 
 
 def _is_clear(correlation: float, other: float) -> bool:

@@ -239,14 +239,14 @@ def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: 
         raise ConfigError(f"the truth has {len(t_ns)} times, {len(q_wxyz)} rotations and {len(p)} positions", where=where)
     if table.pose_world == "ned":
         p, q_wxyz = p[:, [1, 0, 2]] * [1.0, 1.0, -1.0], quaternion.multiply(quaternion.NED_FROM_ENU, q_wxyz)
-    known, notes = known_rotations(q_wxyz, POSES_TOPIC)
-    kept = in_order(t_ns[known], np.concatenate([p, q_wxyz], axis=1)[known], POSES_TOPIC)
+    topic = POSES_TOPIC if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
+    known, notes = known_rotations(q_wxyz, topic)
+    kept = in_order(t_ns[known], np.concatenate([p, q_wxyz], axis=1)[known], topic)
     remarks.notes.extend(notes + kept.notes)
     if not len(kept.t_ns):
         return {}
     if not table.position:
         remarks.notes.append("the poses have no positions: zeros stand for them, and nothing is compared with them")
-    topic = POSES_TOPIC if table.pose_kind == "truth" else f"/{table.pose_kind}/pose"
     return {topic: Poses(kept.t_ns, kept.values[:, :3], unit_quaternions(kept.values[:, 3:]))}
 
 

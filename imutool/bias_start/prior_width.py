@@ -10,7 +10,7 @@ import numpy as np
 
 from imutool.array_types import Bool, Float64
 from imutool.bias.model import COLUMNS, Vector6
-from imutool.cleaning.conventions import axis_names, signed_permutations
+from imutool.cleaning.likelihood import axis_names, signed_permutations
 from imutool.inertial import inertial_filter
 from imutool.inertial.inertial_filter import FilterSettings, State
 

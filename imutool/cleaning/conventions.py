@@ -10,18 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations, product
-from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, choose
+from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, Reading, choose, signed_permutations
 from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, read_right
 from imutool.cleaning.position_unit import POSITIONS, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
-from imutool.cleaning.truth import Truth, axis_of_gravity, force_in_world, turning
+from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, turning
 from imutool.cleaning.unit_evidence import RATES
 from imutool.geometry import quaternion
 from imutool.recording import GRAVITY_M_S2
@@ -31,33 +29,8 @@ SECOND_AXIS = 0.15  # of the rate about the main axis, that about the second at 
 WINDOW = 5  # steps of 0.1 s over which the gyro must carry gravity along
 MOST_WINDOWS = 600  # evenly taken from a longer log
 TURNING = 0.4  # of the turn of the liveliest tenth of the windows, that of a window that counts
+STRAIGHT_DEG = 15.0  # three deviations above a rotation between gyro and poses that leaves no other order of the axes
 FASTEST_RAD_S = 70.0  # 4000 degrees a second: faster, a reading is in another unit
-
-
-class Reading(NamedTuple):
-    """Signed permutation and unit of a sensor: true = factor * axes @ measured."""
-
-    axes: Float64[np.ndarray, "3 3"]
-    unit: str
-    certain: float  # standard errors of the likelihood ratio against the second best
-    misfit: float
-    misfit_as_is: float
-    sole: bool = True  # else the nearest to the log's axes of several that fit alike
-
-    @property
-    def names(self) -> str:
-        """Axis names, as `+x +z -y`."""
-        return axis_names(self.axes)
-
-    @property
-    def wrong(self) -> bool:
-        """Whether other axes than the log's fit, and clearly better."""
-        return not self.as_is and self.misfit < CLEARLY * self.misfit_as_is
-
-    @property
-    def as_is(self) -> bool:
-        """Whether the axes are those of the log."""
-        return bool((self.axes == np.eye(3)).all())
 
 
 @dataclass(frozen=True)
@@ -95,24 +68,10 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
     late_ns = 0 if delay is None else round(delay.seconds * 1e9)
     shifted = truth._replace(t_ns=truth.t_ns - late_ns)
     gyro, shifted, quaternions = _turns_against_poses(step, mean, motion.middle_ns, shifted)
+    if relative is None and gyro is not None and gyro.wrong and gyro.sole:
+        relative = _against_gravity(step, mean, gyro.axes)
     accel, up, unit, other = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
     return Conventions(truth.topic, gyro, accel, relative, up, delay, unit, quaternions or other)
-
-
-def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
-    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first."""
-    signed = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            P = np.zeros((3, 3))
-            P[range(3), order] = signs
-            signed.append(P)
-    return np.stack(signed)
-
-
-def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:
-    """Axis names of a signed permutation, as `+x +z -y`."""
-    return " ".join(f"{'+' if row[np.argmax(np.abs(row))] > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P)
 
 
 def _excited(rate: Float64[np.ndarray, "n 3"]) -> bool:
@@ -134,8 +93,12 @@ def _reading(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "
     return Reading(np.round(matrix / RATES[unit]), unit, choice.certain, *misfits)
 
 
-def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"]) -> Reading | None:
+def _against_gravity(
+    step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], proposal: Float64[np.ndarray, "3 3"] | None = None
+) -> Reading | None:
     """Reading of the gyro that carries gravity along: f(t) = R f(t + 0.5 s), up to the motion's own acceleration.
+
+    With a proposal for its axes it is the choice between that and those of the log.
 
     Where a vehicle's thrust is what the accelerometer reads, it does not turn in the body, and a zero rate explains it best.
     """
@@ -143,6 +106,8 @@ def _against_gravity(step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m
     if not len(rate):
         return None
     readings = _rate_readings(float(quantile(np.linalg.norm(rate, axis=2).ravel(), 0.9)))
+    if proposal is not None:
+        readings = [(unit, M) for unit, M in readings if any((RATES[unit] * P == M).all() for P in (np.eye(3), proposal))]
     if not readings:
         return None
     choice = choose(_carried(rate, first, last, readings), number)
@@ -237,7 +202,13 @@ def _gyro_against_poses(
         return None
     if choice.certain >= SURE and _excited(measured):
         return _reading(choice, readings)
-    return _nearest(choice, readings) if truth.kind == "truth" else None
+    if truth.kind != "truth":
+        return None
+    nearest = _nearest(choice, readings)
+    gyro = RATES[nearest.unit] * measured
+    turned = rotation_deg(best_rotation(gyro, true), gyro, true, float(last_s[-1] - first_s[0]))
+    small = turned is not None and np.linalg.norm(turned.deg) + 3.0 * turned.std_deg.max() < STRAIGHT_DEG
+    return nearest._replace(straight=bool(small))
 
 
 def _nearest(choice: Choice, readings: Sequence[tuple[str, Float64[np.ndarray, "3 3"]]]) -> Reading:
@@ -281,7 +252,7 @@ def _accel_against_poses(
     unit = position_unit(residuals, len(readings), blocks)
     a_w = POSITIONS[unit] * a_w
     choice = choose(np.stack([np.linalg.norm(residuals(1.0, row), axis=1) for row in range(len(readings))]), blocks)
-    straight = gyro is not None and gyro.sole and gyro.as_is
+    straight = gyro is not None and gyro.as_is and (gyro.sole or gyro.straight)
     left = np.zeros((0, 3)) if choice is None else residuals(1.0, choice.best)
     if straight and is_other_world(f, q_wb[use], a_w, left, blocks):
         return None, None, unit, OTHER_WORLD
@@ -295,6 +266,6 @@ def _accel_against_poses(
     one_axes = all((other == P).all() for other, _ in alike)
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
     named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if one_up else in_mean
-    if gyro is None or not gyro.sole:  # without turns about two axes a proposal has no evidence
+    if not straight and (gyro is None or not gyro.sole):  # without turns about two axes a proposal has no evidence
         return found if found is not None and found.as_is else None, named if named == "+z" else None, unit, ""
     return found, named, unit, ""

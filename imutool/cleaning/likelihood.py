@@ -1,4 +1,4 @@
-"""Choice among readings of the same data, by Student's likelihood.
+"""Readings of the axes of a sensor, and the choice among readings by Student's likelihood.
 
 The ratio of likelihoods is tested over blocks of time, as neighbours are not independent (Vuong, Likelihood ratio tests for
 model selection, Econometrica 57, 1989, eq. 5.6).
@@ -6,6 +6,7 @@ model selection, Econometrica 57, 1989, eq. 5.6).
 
 from __future__ import annotations
 
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -49,3 +50,46 @@ def choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"]) 
     z = np.where(error > 0, ahead.sum(axis=1) / np.maximum(error, 1e-300), 0.0)
     others = np.delete(z, best)
     return Choice(best, float(others.min()), misfit, z < SURE)
+
+
+class Reading(NamedTuple):
+    """Signed permutation and unit of a sensor: true = factor * axes @ measured."""
+
+    axes: Float64[np.ndarray, "3 3"]
+    unit: str
+    certain: float  # standard errors of the likelihood ratio against the second best
+    misfit: float
+    misfit_as_is: float
+    sole: bool = True  # else the nearest to the log's axes of several that fit alike
+    straight: bool = False  # whether a rotation by any angle is a small one, where the axes are not sole
+
+    @property
+    def names(self) -> str:
+        """Axis names, as `+x +z -y`."""
+        return axis_names(self.axes)
+
+    @property
+    def wrong(self) -> bool:
+        """Whether other axes than the log's fit, and clearly better."""
+        return not self.as_is and self.misfit < CLEARLY * self.misfit_as_is
+
+    @property
+    def as_is(self) -> bool:
+        """Whether the axes are those of the log."""
+        return bool((self.axes == np.eye(3)).all())
+
+
+def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
+    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first."""
+    signed = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            P = np.zeros((3, 3))
+            P[range(3), order] = signs
+            signed.append(P)
+    return np.stack(signed)
+
+
+def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:
+    """Axis names of a signed permutation, as `+x +z -y`."""
+    return " ".join(f"{'+' if row[np.argmax(np.abs(row))] > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P)

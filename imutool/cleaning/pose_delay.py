@@ -20,7 +20,8 @@ FINE_LAGS_S = FINE_S * np.arange(-12, 13)
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
-DELAY_PARTS, FEWEST_PARTS, FEWEST = 8, 4, 40  # parts whose own lags show how sure the delay is, and poses in each
+DELAY_PARTS, FEWEST_PARTS = 8, 4  # parts whose own lags show how sure the delay is
+SEARCHES = (LONGEST_DELAY_S, 40, DELAY_PARTS), (0.5, 20, FEWEST_PARTS)  # longest delay, poses in each part, most parts
 STEP_LEAST_S, STEP_STDS = 0.03, 8.0  # of a step of one clock, at least; and in deviations of the parts on each side
 
 
@@ -95,15 +96,22 @@ def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3
 
 
 def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> Delay | None:
-    """Delay of at most `LONGEST_DELAY_S`: turns over a second find it, and turns between neighbouring poses refine it."""
+    """Delay of at most `LONGEST_DELAY_S`, and of less in a short log."""
     period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
-    slow, fast = (_Turns.of(motion, truth, n, period_ns, bias) for n in (max(1, round(SLOW_S * 1e9 / period_ns)), 1))
-    count = min(DELAY_PARTS, min(len(slow.size) + FEWEST, len(fast.size)) // FEWEST)  # of the slow ones a log holds fewer
-    if count < FEWEST_PARTS:
-        return None
-    coarse = np.arange(-LONGEST_DELAY_S, LONGEST_DELAY_S + 1e-9, STEP_S)
+    apart = max(1, round(SLOW_S * 1e9 / period_ns)), 1
+    for longest_s, fewest, most_parts in SEARCHES:
+        slow, fast = (_Turns.of(motion, truth, n, period_ns, bias, longest_s) for n in apart)
+        count = min(most_parts, min(len(slow.size) + fewest, len(fast.size)) // fewest)  # of the slow ones a log holds fewer
+        if count >= FEWEST_PARTS:
+            return _found(slow, fast, longest_s, count, motion.middle_ns)
+    return None
+
+
+def _found(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns: int) -> Delay | None:
+    """Delay that turns over a second find and turns between neighbouring poses refine, in `count` parts."""
+    coarse = np.arange(-longest_s, longest_s + 1e-9, STEP_S)
     slowly = slow.correlations(coarse, count)
-    if count == DELAY_PARTS and (stepped := _stepped(slow, fast, coarse, slowly, motion.middle_ns)) is not None:
+    if count == DELAY_PARTS and (stepped := _stepped(slow, fast, coarse, slowly, start_ns)) is not None:
         return stepped
     whole = slowly[:, 0]
     at = int(np.argmax(whole))
@@ -159,12 +167,14 @@ class _Turns(NamedTuple):
     gyro: Float64[np.ndarray, "m 3"]
 
     @classmethod
-    def of(cls, motion: Motion, truth: Truth, apart: int, period_ns: int, bias: Float64[np.ndarray, "3"]) -> _Turns:
+    def of(
+        cls, motion: Motion, truth: Truth, apart: int, period_ns: int, bias: Float64[np.ndarray, "3"], longest_s: float
+    ) -> _Turns:
         """Turns between poses that are `apart` rows apart, as far as the gyro covers them at every delay."""
         first, last, rate = turning(truth, apart)
         step, mean = motion.table()
         use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)
-        inside = (first_s > LONGEST_DELAY_S + STEP_S * step[0]) & (last_s + LONGEST_DELAY_S < STEP_S * (step[-1] + 1))
+        inside = (first_s > longest_s + STEP_S * step[0]) & (last_s + longest_s < STEP_S * (step[-1] + 1))
         gyro = mean[:, :3] - bias
         return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], step, gyro)
 

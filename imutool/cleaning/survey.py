@@ -12,8 +12,8 @@ import numpy as np
 
 from imutool import registry
 from imutool.array_types import Bool, Float64
-from imutool.cleaning.conventions import axis_names
 from imutool.cleaning.finding import Finding, FindingReport, Verdict, score, verdict
+from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.rule import GROUP, CleaningSettings, Rule, TopicSummary
 from imutool.cleaning.rules.gaps import MISSING
 from imutool.cleaning.samples import Motion, Samples, blocks

@@ -16,7 +16,15 @@ from imutool.mcap_io.log import Log
 from imutool.recording import GRAVITY_M_S2, Poses, Recording, seconds
 
 FEWEST = 3  # poses that show an acceleration
+ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
 ALONG, GRAVITY_BAND = np.cos(np.radians(20.0)), 0.25  # of a mean force that is gravity along an axis
+
+
+class Turned(NamedTuple):
+    """Rotation vector from the body of the poses to the gyro."""
+
+    deg: Float64[np.ndarray, "3"]
+    std_deg: Float64[np.ndarray, "3"]
 
 
 class Truth(NamedTuple):
@@ -100,6 +108,29 @@ def axis_of_gravity(force_w: Float64[np.ndarray, "n 3"]) -> str | None:
     axis, size = int(np.argmax(np.abs(mean))), float(np.linalg.norm(mean))
     along = abs(mean[axis]) > ALONG * size and abs(size / GRAVITY_M_S2 - 1.0) < GRAVITY_BAND
     return f"{'+' if mean[axis] > 0.0 else '-'}{'xyz'[axis]}" if along else None
+
+
+def best_rotation(gyro: Float64[np.ndarray, "n 3"], omega: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Rotation R of gyro = R omega that fits best (Kabsch)."""
+    left, _, right = np.linalg.svd(gyro.T @ omega)
+    return np.asarray(left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right)
+
+
+def rotation_deg(
+    turn: Float64[np.ndarray, "3 3"], gyro: Float64[np.ndarray, "n 3"], omega: Float64[np.ndarray, "n 3"], length_s: float
+) -> Turned | None:
+    """Rotation with its deviations: an error about an axis moves the rates about the others.
+
+    Only rates that both share count: the poses of a robot on a floor turn about one axis, and say nothing of a turn about it.
+    """
+    shared = gyro.T @ (omega @ turn.T) * (length_s / ERRORS_LAST_S / len(gyro))  # symmetric, as R is the best
+    seen = np.trace(shared) * np.eye(3) - (shared + shared.T) / 2.0
+    least, _, most = np.linalg.eigvalsh(seen)
+    if least <= 1e-9 * most:  # turns about one axis alone, as of wheels
+        return None
+    variance = ((gyro - omega @ turn.T) ** 2).sum(axis=1).mean() / 3.0
+    std_deg = np.degrees(np.sqrt(variance * np.diag(np.linalg.inv(seen))))
+    return Turned(np.degrees(quaternion.log(quaternion.of_matrix(turn))[0]), std_deg)
 
 
 def force_in_world(truth: Truth) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 4"], Float64[np.ndarray, "m 3"]]:

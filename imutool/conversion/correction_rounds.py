@@ -15,7 +15,7 @@ import numpy as np
 from imutool import registry
 from imutool.array_types import Float64
 from imutool.cleaning import CleaningSettings, Survey, look
-from imutool.cleaning.conventions import axis_names
+from imutool.cleaning.likelihood import axis_names
 from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corrections
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import find_stamps

@@ -57,7 +57,8 @@ class Labels:
     def _check(self, topics: Collection[str], name: str) -> None:
         for topic, _ in self.kinds:
             if topic not in topics:
-                raise ConfigError(f"{topic!r} holds no poses in {name}", where="kinds", expected=", ".join(topics) or "(none)")
+                have = ", ".join(topics) or "a recording with poses, which this one lacks"
+                raise ConfigError(f"{topic!r} holds no poses in {name}", where="kinds", expected=have)
 
 
 def parse_kinds(texts: Sequence[str]) -> tuple[tuple[str, str], ...]:

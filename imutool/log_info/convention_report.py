@@ -9,7 +9,8 @@ import numpy as np
 
 from imutool.array_types import Int64
 from imutool.cleaning import CleaningSettings
-from imutool.cleaning.conventions import Conventions, Reading
+from imutool.cleaning.conventions import Conventions
+from imutool.cleaning.likelihood import Reading
 from imutool.cleaning.pose_delay import lateness
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules.axes import LATE_STDS, Axes
@@ -263,14 +264,12 @@ def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: I
     gap = (steps > limit) & (knots[1:] > start) & (knots[:-1] < end)
     after = np.searchsorted(knots, imu_ns, side="left")
     inside = (imu_ns >= knots[0]) & (imu_ns <= knots[-1])
-    known = inside & (
-        (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
-    )
+    known = (steps <= limit)[np.clip(after - 1, 0, len(steps) - 1)] | (knots[np.clip(after, 0, len(steps))] == imu_ns)
     return TruthInfo(
         topic,
         len(truth_ns),
         kind,
-        coverage=float(known.mean()),
+        coverage=float((inside & known).mean()),
         gaps=int(gap.sum()),
         longest_gap_s=float(steps[gap].max()) * 1e-9 if gap.any() else 0.0,
         starts_after_s=float(knots[0] - start) * 1e-9,

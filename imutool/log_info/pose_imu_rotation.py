@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Bool, Float64, Int64
-from imutool.cleaning.truth import Truth, read_truth, turning
+from imutool.cleaning.truth import Truth, Turned, best_rotation, read_truth, rotation_deg, turning
 from imutool.geometry import quaternion
 from imutool.inertial.strapdown import velocity_follows
 from imutool.mcap_io.codec import schemas
@@ -22,7 +22,6 @@ logger = logging.getLogger(__name__)
 LEAST_TURNS = 20  # between poses
 LEAST_RATE_RAD_S = 0.02  # rms of the gyro about its mean: less shows nothing
 LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
-ERRORS_LAST_S = 1.0  # errors of poses are alike for so long
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s; by the usual misfit; of the gyro's turn
 LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
@@ -30,13 +29,6 @@ UNSURE_SHARE, UNSURE_DEG = 0.1, (1.0, 3.0)  # of a rotation, within these: its s
 TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
 SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
-
-
-class Turned(NamedTuple):
-    """Rotation vector from the body of the poses to the gyro."""
-
-    deg: Float64[np.ndarray, "3"]
-    std_deg: Float64[np.ndarray, "3"]
 
 
 class Agreement(NamedTuple):
@@ -77,12 +69,13 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     motion = float(np.sqrt((gyro**2).sum(axis=1).mean()))
     if motion < LEAST_RATE_RAD_S:
         return None
-    left, _, right = np.linalg.svd(gyro.T @ omega)
-    turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    turn = best_rotation(gyro, omega)
     misfit = np.linalg.norm(gyro - omega @ turn.T, axis=1)
     rms = float(np.sqrt((misfit**2).mean()))
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
-    body = _turned(turn, gyro, omega, rms, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
+    body = rotation_deg(turn, gyro, omega, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
+    if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
+        body = None
     off_deg = np.degrees(misfit * (end - begin))
     clear = JUMP_SHARE * np.linalg.norm(gyro, axis=1) < misfit  # else a scale or a clock may be off
     jumps_deg = off_deg[clear & (off_deg > max(JUMP_DEG, JUMP_MEDIANS * median(off_deg)))]
@@ -172,27 +165,6 @@ def body_of(log: Log, topic: str, turn: Float64[np.ndarray, "3 3"]) -> Body:
             same = np.abs((poses.q_wb_wxyz[mine] * batch.q_wb_wxyz[theirs]).sum(axis=1)) > 1.0 - SAME_TURN
             (alike if len(same) and same.all() else other).add(batch.child_frame_id)
     return Body(turn, frozenset(alike - other))
-
-
-def _turned(
-    turn: Float64[np.ndarray, "3 3"],
-    gyro: Float64[np.ndarray, "n 3"],
-    omega: Float64[np.ndarray, "n 3"],
-    rms_rad_s: float,
-    length_s: float,
-) -> Turned | None:
-    """Rotation with its deviations, if these are small: an error about each axis moves the rates about the other two.
-
-    Only rates that both share count: the poses of a robot on a floor turn about one axis, and say nothing of a turn about it.
-    """
-    shared = gyro.T @ (omega @ turn.T) * (length_s / ERRORS_LAST_S / len(gyro))  # symmetric, as R is the best
-    seen = np.trace(shared) * np.eye(3) - (shared + shared.T) / 2.0
-    least, _, most = np.linalg.eigvalsh(seen)
-    if least <= 1e-9 * most:  # turns about one axis alone, as of wheels
-        return None
-    std_deg = np.degrees(np.sqrt(rms_rad_s**2 / 3.0 * np.diag(np.linalg.inv(seen))))
-    deg = np.degrees(quaternion.log(quaternion.of_matrix(turn))[0])
-    return Turned(deg, std_deg) if std_deg.max() < np.clip(UNSURE_SHARE * np.linalg.norm(deg), *UNSURE_DEG) else None
 
 
 def frames_of_copies(log: Log, topic: str) -> frozenset[str]:

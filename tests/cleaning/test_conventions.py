@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.imu_defects import batch_of
 
-from imutool.cleaning.conventions import Conventions, judge, signed_permutations
+from imutool.cleaning.conventions import Conventions, judge
+from imutool.cleaning.likelihood import signed_permutations
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, read_right
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.cleaning.rule import CleaningSettings, TopicSummary
@@ -222,6 +223,44 @@ def test_twenty_seconds_show_the_delay_of_poses_by_up_to_two(seed: int, late_s: 
     unrelated = of_poses("/truth", other)
     assert unrelated is not None
     assert judge(motion_of(imu), unrelated, 1.0).delay is None
+
+
+@pytest.mark.parametrize("late_s", [0.12, -0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_ten_seconds_show_the_delay_of_poses_by_up_to_half_a_second(seed: int, late_s: float) -> None:
+    imu, poses = turned(waves(10.0, (0.5, 0.4, 0.6), seed))
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    found = judge(motion_of(imu), truth._replace(t_ns=truth.t_ns + round(late_s * 1e9)), 1.0)
+    assert found.delay is not None
+    assert found.delay.seconds == pytest.approx(late_s, abs=0.05)
+    _, other = turned(waves(10.0, (0.5, 0.4, 0.6), 100 + seed))
+    unrelated = of_poses("/truth", other)
+    assert unrelated is not None
+    assert judge(motion_of(imu), unrelated, 1.0).delay is None
+
+
+def one_axis_after_another(each_s: float, rate_rad_s: float) -> np.ndarray:
+    """Angular rates of a yaw, then a pitch, then a roll, there and back twice."""
+    turn = rate_rad_s * np.sin(4 * np.pi * np.arange(round(each_s * RATE_HZ)) / (each_s * RATE_HZ))
+    return np.concatenate([np.outer(turn, axis) for axis in np.eye(3)[::-1]])
+
+
+@pytest.mark.parametrize("up", ["+z", "-x"])
+def test_turns_about_one_axis_after_another_show_the_world_of_straight_poses(up: str) -> None:
+    """In so few seconds no order of the axes is clearly the best, and yet the best rotation is a small one."""
+    omega = one_axis_after_another(5.0, 1.5)
+    imu, poses = turned(omega, 2.0 * waves(15.0, (1.0, 1.0, 1.0), 7), noise=0.01)
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    C = np.eye(3) if up == "+z" else TO_Z_UP[up].T
+    q_wxyz = (Rotation.from_matrix(C) * Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
+    found = judge(motion_of(imu), truth._replace(p_wb=1e3 * truth.p_wb @ C.T, q_wb_wxyz=q_wxyz), 1.0)
+    assert found.gyro is not None
+    assert not found.gyro.sole
+    assert found.up == up
+    mirrored = Imu(imu.t_ns, imu.gyro * [1.0, 1.0, -1.0], imu.accel)
+    assert judge(motion_of(mirrored), truth._replace(p_wb=1e3 * truth.p_wb @ C.T, q_wb_wxyz=q_wxyz), 1.0).up in (None, "+z")
 
 
 @pytest.mark.parametrize("hz", [1.85, 2.1, 2.3, 2.6])

@@ -137,6 +137,50 @@ def test_a_trajectory_of_another_name_is_an_estimate(tmp_path, name):
     np.testing.assert_allclose(log.poses["/estimate/pose"].p_wb, P_M, atol=1e-6)
 
 
+ROBOT = {
+    "words": ("ABBposition", "ABBquaternion", ["_0", "_1", "_2"], ["_0", "_1", "_2", "_3"]),
+    "letters": ("tool_", "tool_q", ["x", "y", "z"], ["w", "x", "y", "z"]),
+}
+
+
+def robot_table(path: Path, named: str, late_s: float = 0.0, count: int = COUNT, prefix: str = "") -> None:
+    """Poses of a robot in the rows of an IMU, in columns of its name; so many seconds late."""
+    place, turn, xyz, wxyz = ROBOT[named]
+    header = [
+        "time [s]",
+        *(f"{sensor}_{axis} ({unit})" for sensor, unit in (("gyro", "rad/s"), ("acc", "m/s^2")) for axis in "xyz"),
+    ]
+    header += [prefix + place + axis for axis in xyz] + [prefix + turn + axis for axis in wxyz]
+    at = np.clip(np.arange(count) - round(100 * late_s), 0, COUNT - 1)
+    q_wxyz = XYZW[at][:, [3, 0, 1, 2]]
+    path.write_text(",".join(header) + "\n" + rows(T_S[:count], GYRO[:count], ACCEL[:count], P_M[at], q_wxyz))
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.1, -0.2])
+@pytest.mark.parametrize("named", ROBOT)
+def test_columns_of_one_body_s_position_and_quaternion_are_its_poses(tmp_path, named, late_s):
+    robot_table(tmp_path / "log.csv", named, late_s)
+    (log,) = table.read(tmp_path / "log.csv")
+    at = np.clip(np.arange(COUNT) - round(100 * late_s), 0, COUNT - 1)
+    np.testing.assert_allclose(log.poses["/estimate/pose"].p_wb, P_M[at], atol=1e-6)
+    assert [note for note in log.remarks.notes if "/ground_truth/pose" in note] == []
+    alike = np.abs((log.poses["/estimate/pose"].q_wb_wxyz * XYZW[at][:, [3, 0, 1, 2]]).sum(axis=1))
+    np.testing.assert_allclose(alike, 1.0, atol=1e-7)
+
+
+def test_a_setpoint_of_a_robot_is_no_pose(tmp_path):
+    robot_table(tmp_path / "log.csv", "letters", prefix="desired_")
+    (log,) = table.read(tmp_path / "log.csv")
+    assert log.poses == {}
+
+
+def test_poses_in_rows_whose_order_too_few_seconds_show_are_said(tmp_path):
+    robot_table(tmp_path / "log.csv", "words", count=400)
+    (log,) = table.read(tmp_path / "log.csv")
+    assert log.poses == {}
+    assert any("ABBquaternion" in note and "quaternion_wxyz" in note for note in log.remarks.notes)
+
+
 def test_a_truth_that_gives_no_poses_is_a_loss(tmp_path):
     """KITTI's poses are twelve numbers a row, without a time."""
     (tmp_path / "imu.csv").write_text(imu_text())

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.cleaning.conventions import Conventions, Reading, axis_names
+from imutool.cleaning.conventions import Conventions
 from imutool.cleaning.finding import Finding
+from imutool.cleaning.likelihood import Reading, axis_names
 from imutool.cleaning.pose_delay import Delay, lateness
 from imutool.cleaning.rule import Rule, TopicSummary
 
