@@ -17,6 +17,7 @@ from imutool.bias import static
 from imutool.bias.model import GAP_S, BiasModel
 from imutool.bias.model_file import check_rate, find_model
 from imutool.bias_start.aided_path import aided_path, residual_prior
+from imutool.bias_start.bias_covariance import expected_drift
 from imutool.bias_start.correction import DebiasedImu, apply, apply_with_std
 from imutool.bias_start.fitness import judge
 from imutool.bias_start.initial_bias import InitialBias, model_samples
@@ -25,7 +26,7 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
-from imutool.inertial.strapdown import StartPose, along_truth, drift, gaps_crossed
+from imutool.inertial.strapdown import StartPose, along_truth, drift_windows, gaps_crossed, window_drift
 from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
@@ -36,6 +37,8 @@ logger = logging.getLogger(__name__)
 
 RAW = "raw"
 DRIFT_S = 5.0
+DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
+DEG = 180.0 / np.pi
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
 
@@ -104,7 +107,7 @@ def _evaluated(
         found, std = _corrected(recording.imu, model, start)
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
-        drifted = _drift(integrated, true, valid)
+        drifted = _drift(integrated, true, valid, model, start, recording.imu)
         if name == RAW and (gaps := gaps_crossed(integrated, GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
         estimates = {PURE: integrated}
@@ -133,14 +136,26 @@ def _evaluated(
     return results
 
 
-def _drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> dict[str, float | None]:
-    """Drift of windows that start from the truth: root mean squares, None if no window fits."""
-    found = drift(path, truth, valid, DRIFT_S)
-    if not len(found.orientation_rad):
-        return {"drift_orientation_deg": None, "drift_velocity_m_s": None, "drift_window_s": DRIFT_S}
-    rms = [float(np.sqrt(np.mean(errors**2))) for errors in (found.orientation_rad, found.velocity_m_s)]
-    velocity = rms[1] if truth.has_positions else None
-    return {"drift_orientation_deg": float(np.degrees(rms[0])), "drift_velocity_m_s": velocity, "drift_window_s": DRIFT_S}
+def _drift(
+    path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], model: BiasModel | None, start: InitialBias | None, imu: Imu
+) -> dict[str, float | None]:
+    """Root mean squares of the drift of windows that start from the truth, and of what the bias covariance expects.
+
+    None if no window fits.
+    """
+    windows = drift_windows(path, valid, DRIFT_S)
+    found = window_drift(path, truth, *windows.T)
+    squares = {"drift_orientation_deg": found.orientation_rad**2, "drift_velocity_m_s": found.velocity_m_s**2}
+    if model is not None and start is not None:
+        variances = expected_drift(model, start, imu, path, windows).diagonal(axis1=1, axis2=2)
+        squares["drift_orientation_std_deg"] = variances[:, :3].sum(axis=1)
+        squares["drift_velocity_std_m_s"] = variances[:, 3:].sum(axis=1)
+    out: dict[str, float | None] = {"drift_window_s": DRIFT_S}
+    for name in DRIFTS:
+        is_angle = name.endswith("deg")
+        known = name in squares and len(windows) > 0 and (is_angle or truth.has_positions)
+        out[name] = float(np.sqrt(squares[name].mean())) * (DEG if is_angle else 1.0) if known else None
+    return out
 
 
 def _over(imu: Imu, true: Poses) -> Imu:

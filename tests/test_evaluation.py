@@ -47,6 +47,7 @@ PUBLISHED = {
 PUBLISHED_DEG = 0.1
 EDGES_S = 0.02  # samples before the first true pose of the common stretch and after its last one are not scored
 EVO_TOLERANCE = 1e-6  # relative: evo reads stamps as floats and quaternions through other arithmetic
+DRIFTS = ("orientation_deg", "orientation_std_deg"), ("velocity_m_s", "velocity_std_m_s")
 FIELDS = {  # contracts.md, JSON of evaluate
     "log": str,
     "model": str,
@@ -80,6 +81,18 @@ def test_a_truth_of_orientations_alone_scores_the_orientation_alone(recording: R
         assert set(other["rpe_m"].values()) == {None}
     np.testing.assert_allclose(alone[1]["gyro_bias"], whole[1]["gyro_bias"], rtol=1e-9)
     assert alone[1]["accel_bias"] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("init", ["auto", "truth"])
+def test_the_drift_is_as_large_as_the_covariance_of_the_bias_lets_expect(init: str, tmp_path: Path) -> None:
+    shares = []
+    for seed in range(6):
+        write(flight(seed, duration_s=40.0, sensor_seed=seed), tmp_path / f"{seed}.mcap")
+        raw, found = evaluate(tmp_path / f"{seed}.mcap", models=["static"], init=init)
+        assert raw["drift_orientation_std_deg"] is None
+        shares.append([found[f"drift_{name}"] / found[f"drift_{std}"] for name, std in DRIFTS])
+    assert (np.sqrt(np.mean(np.square(shares), axis=0)) < 2.0).all()
+    assert (np.median(shares, axis=0) > 0.1).all()
 
 
 # ── real recordings ──────────────────────────────────────────────────────────────────────────────────────────────────

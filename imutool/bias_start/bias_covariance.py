@@ -23,10 +23,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64
+from imutool.array_types import Float64, Int64
 from imutool.bias.model import COLUMNS, BiasEstimate, BiasModel, Covariances
-from imutool.bias_start.initial_bias import InitialBias
-from imutool.units import Sensor
+from imutool.bias_start.initial_bias import InitialBias, model_samples
+from imutool.bias_start.stretches import measured
+from imutool.geometry import quaternion
+from imutool.inertial.preintegration import hat
+from imutool.recording import Imu, Poses, seconds
+from imutool.units import SENSORS, Sensor
 
 Roots = Mapping[Sensor, Float64[np.ndarray, "n 3 p"]]
 
@@ -89,3 +93,60 @@ class _RunningMean:
             out[sensor] = np.subtract(S, total, out=total)
         self._count += n
         return out
+
+
+def expected_drift(
+    model: BiasModel, start: InitialBias, imu: Imu, path: Poses, windows: Int64[np.ndarray, "m 2"]
+) -> Float64[np.ndarray, "m 6 6"]:
+    """Drift covariance of windows of a path: attitude (rad), then velocity (m/s), by the bias.
+
+    `imu` has the samples as recorded, and `path` is the integration of the debiased ones. Errors of a window's start do not
+    count, nor does the noise of the samples: vibration is no white noise, and the noise at rest is much less than the bias.
+    """
+    estimator, good = BiasEstimator(model, start), measured(imu.gyro, imu.accel)
+    t_ns, samples = imu.t_ns[good], model_samples(model, imu)
+    out, done = np.zeros((len(windows), 6, 6)), 0
+    for k, (first_ns, last_ns) in enumerate(path.t_ns[windows]):
+        a, b = np.searchsorted(t_ns, (first_ns, last_ns)).tolist()
+        estimator.parts(*(column[done:a] for column in samples))
+        _, rest, roots = estimator.parts(*(column[a:b] for column in samples))
+        done = b
+        if model.log_drift is not None:
+            rest = rest + model.log_drift.covariance(t_ns[a:b])
+        rows = np.searchsorted(path.t_ns, t_ns[a : b + 1])
+        q_wb, force = path.q_wb_wxyz[rows], imu.accel[good][a : b + 1]
+        by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb, quaternion.rotate(q_wb, force))[:-1]
+        constant, moving = by_bias.sum(axis=0), np.einsum("nij,njp->ip", by_bias, stacked(roots, b - a))
+        out[k] = constant @ rest.mean(axis=0) @ constant.T + moving @ moving.T
+    return out
+
+
+def drift_by_bias(
+    t_s: Float64[np.ndarray, " n"], q_wb_wxyz: Float64[np.ndarray, "n 4"], force_w: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 6 6"]:
+    """Drift Jacobian: attitude and velocity at the end of a window by the bias of each sample.
+
+    The errors are xi of the attitude, R_hat = Exp(xi) R, and delta v, both in the world frame; with the specific force f_w::
+
+        d xi/dt = -R zeta_g        d delta_v/dt = -[f_w]x xi - R zeta_a
+
+    for an error zeta of the bias (Barrau and Bonnabel, TAC 2017, as in `imutool.inertial.inertial_filter`).
+    """
+    dt = np.diff(t_s)[:, None]
+    gained = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (force_w[1:] + force_w[:-1]) * dt, axis=0)])
+    weight = 0.5 * (np.append(dt, 0.0) + np.insert(dt, 0, 0.0))
+    out = np.zeros((len(t_s), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = -quaternion.matrix(q_wb_wxyz) * weight[:, None, None]
+    out[:, 3:, :3] = -hat(gained[-1] - gained) @ out[:, :3, :3]
+    return out
+
+
+def stacked(roots: Roots, n: int) -> Float64[np.ndarray, "n 6 q"]:
+    """Roots of both sensors, whose unknowns are independent."""
+    parts = {sensor: roots.get(sensor, np.zeros((n, 3, 0))) for sensor in SENSORS}
+    out = np.zeros((n, 6, sum(part.shape[2] for part in parts.values())))
+    first = 0
+    for sensor, part in parts.items():
+        out[:, COLUMNS[sensor], first : first + part.shape[2]] = part
+        first += part.shape[2]
+    return out

@@ -245,7 +245,8 @@ def training_source(model: BiasModel) -> str:
 
 def accuracy(std: Vector6) -> str:
     """Standard deviation of the least accurate gyro axis in words."""
-    return f"±{std[:3].max():.1g} rad/s"
+    minute = np.format_float_positional(np.degrees(60.0 * std[:3].max()), precision=2, fractional=False, trim="-")
+    return f"±{std[:3].max():.1g} rad/s ({minute}° a minute)"
 
 
 def relative_samples(imu: Imu) -> Samples:

@@ -51,6 +51,8 @@ class Score(Section, frozen=True, kw_only=True):
     rpe_m: dict[str, float | None]
     drift_orientation_deg: float | None
     drift_velocity_m_s: float | None
+    drift_orientation_std_deg: float | UnsetType | None = UNSET
+    drift_velocity_std_m_s: float | UnsetType | None = UNSET
     drift_window_s: float
     gyro_bias: list[float]
     accel_bias: list[float]

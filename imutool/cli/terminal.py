@@ -197,25 +197,21 @@ def epoch_line(epoch: Epoch) -> tuple[int, int, str]:
 
 
 def figures(results: Sequence[dict[str, Any]], *, aligned: bool = False) -> None:
-    """Print evaluation results as tables: over the whole path, and by distances that it reaches.
+    """Print evaluation results as tables: of the whole path, of windows, and by distances.
 
     With `aligned` also the attitude after an alignment of the positions.
     """
-
-    def number(value: float | None) -> str:
-        return MISSING if value is None else format(value, ".2f")
-
-    distances = list(results[0]["roe_deg"])
-    columns = {"aoe_deg": "AOE\n°", "aoe_aligned_deg": "aligned\n°", "ape_m": "APE\nm", "ape_aligned_m": "aligned\nm"}
-    columns["velocity_rmse_m_s"] = "velocity\nm/s"
-    names = [name for name in columns if aligned or name != "aoe_aligned_deg"]
-    whole = [("log", "model", *(columns[name] for name in names))]
-    roe = [("log", "model", *(f"ROE °\n{d} m" for d in distances))]
-    rpe = [("log", "model", *(f"RPE m\n{d} m" for d in distances))]
-    for result in results:
-        whole.append((result["log"], result["model"], *(number(result[name]) for name in names)))
-        roe.append((result["log"], result["model"], *(number(result["roe_deg"][d]) for d in distances)))
-        rpe.append((result["log"], result["model"], *(number(result["rpe_m"][d]) for d in distances)))
-    for rows in (whole, roe, rpe):
-        if any(entry != MISSING for row in rows[1:] for entry in row[2:]):  # a path without positions has no distances
-            table(rows, keys=2)
+    window = f"{results[0]['drift_window_s']:g} s"
+    whole = {"AOE\n°": "aoe_deg", "aligned\n°": "aoe_aligned_deg", "APE\nm": "ape_m", "aligned\nm": "ape_aligned_m"}
+    whole["velocity\nm/s"] = "velocity_rmse_m_s"
+    drift = {f"{window}\n°": "drift_orientation_deg", "expected\n°": "drift_orientation_std_deg"}
+    drift |= {f"{window}\nm/s": "drift_velocity_m_s", "expected\nm/s": "drift_velocity_std_m_s"}
+    named = [{title: name for title, name in whole.items() if aligned or name != "aoe_aligned_deg"}, drift]
+    shown = [[(title, [each.get(name) for each in results]) for title, name in columns.items()] for columns in named]
+    for title, by in (("ROE °", "roe_deg"), ("RPE m", "rpe_m")):
+        shown.append([(f"{title}\n{metres} m", [each[by][metres] for each in results]) for metres in results[0][by]])
+    for columns in shown:
+        if any(value is not None for _, values in columns for value in values):  # a path without positions has no distances
+            values = zip(*([MISSING if x is None else f"{x:.2f}" for x in column] for _, column in columns), strict=True)
+            rows = [(each["log"], each["model"], *row) for each, row in zip(results, values, strict=True)]
+            table([("log", "model", *(title for title, _ in columns)), *rows], keys=2)

@@ -175,13 +175,16 @@ def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last
 
 
 def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Drift:
-    """Drift at the end of consecutive windows of the trajectories that `along_truth` gives.
-
-    Each window starts from the truth. It counts if both ends have truth and the IMU has no gap in between. Empty if none does.
+    """Drift at the end of windows that start from the truth, of what `along_truth` gives.
 
     Raises:
         DataError: as `window_drift`.
     """
+    return window_drift(path, truth, *drift_windows(path, valid, window_s).T)
+
+
+def drift_windows(path: Poses, valid: Bool[np.ndarray, " n"], window_s: float) -> Int64[np.ndarray, "m 2"]:
+    """First and last rows of consecutive windows, with truth at both ends and no gap within."""
     t = seconds(path.t_ns, int(path.t_ns[0]))
     dt = np.diff(t)
     gaps = np.concatenate([[0], np.cumsum(dt > GAP_FACTOR * np.median(dt))])
@@ -196,8 +199,7 @@ def drift(path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], window_s: fl
         if valid[last] and gaps[last] == gaps[first]:
             pairs.append((first, last))
         first = last
-    rows = np.array(pairs, np.int64).reshape(-1, 2)
-    return window_drift(path, truth, rows[:, 0], rows[:, 1])
+    return np.array(pairs, np.int64).reshape(-1, 2)
 
 
 def with_velocity(poses: Poses) -> Poses:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from imutool.bias import hybrid, static
-from imutool.bias_start.bias_covariance import BiasEstimator
+from imutool.bias_start.bias_covariance import BiasEstimator, expected_drift
 from imutool.bias_start.bias_tracking import BiasTrajectory
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.bias_start.prior_width import BiasPrior
+from imutool.recording import Imu, Poses
 
 RATE_HZ, SIZE = 200.0, 8000
 SCALE_STD, G_STD = 2e-3, 1e-4  # of a share, and of rad/s per m/s²
@@ -103,3 +104,18 @@ def test_static_is_as_sure_in_motion_as_a_sensor_nobody_calibrated(turning: Samp
     np.testing.assert_allclose(added[:, :3], static.CALIBRATION_STD * np.abs(gyro[:, :1]) * np.ones(3), atol=1e-9)
     np.testing.assert_allclose(added[: SIZE // 2, 3:], 0.0, atol=1e-9)
     np.testing.assert_allclose(added[SIZE // 2 :, 3:], static.CALIBRATION_STD * 9.81 * np.sqrt(2.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("lost", [0, 7])
+def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: int) -> None:
+    """Attitude by s t, velocity by s t and, where gravity is tilted, by g s t^2 / 2; samples may be no measurement."""
+    count, length_s = 2001, 5.0
+    accel = np.tile([0.0, 0.0, 9.81], (count, 1))
+    accel[100 : 100 + lost] = 0.0
+    imu = Imu(np.arange(count) * 5_000_000, np.zeros((count, 3)), accel)
+    still = Poses(imu.t_ns, np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), np.zeros((count, 3)))
+    windows = np.array([[200, 1200], [1200, 2000]]) if lost else np.array([[0, 1000], [1000, 2000]])
+    found = expected_drift(static.Model(), WAYS["held"], imu, still, windows).diagonal(axis1=1, axis2=2)[0]
+    tilted = (9.81 * STD[:3] * length_s**2 / 2) ** 2 * [1.0, 1.0, 0.0]
+    np.testing.assert_allclose(found[:3], (STD[:3] * length_s) ** 2, rtol=3e-3)
+    np.testing.assert_allclose(found[3:], (STD[3:] * length_s) ** 2 + tilted, rtol=3e-3)

@@ -194,7 +194,7 @@ def test_twelve_seconds_of_truth_show_the_bias(biased: Recording) -> None:
     start = from_truth(sees_everything(), biased)
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
     np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 12.0, rtol=1e-6)  # less truth than the model's figure is of
-    assert start.how == "truth over 12.0 s, ±1e-06 rad/s"
+    assert start.how == "truth over 12.0 s, ±1e-06 rad/s (0.0043° a minute)"
 
 
 @pytest.mark.parametrize("late_s", [0.02, -0.025])
@@ -304,7 +304,7 @@ def test_a_truth_whose_world_leans_is_believed_beside_itself_and_not_beside_grav
 def test_a_shorter_truth_can_be_asked_for(biased: Recording) -> None:
     start = find_initial_bias("truth:4", sees_everything(), biased)
     assert (np.abs(start.rest - np.concatenate([GYRO_BIAS, ACCEL_BIAS])) < TRUTH).all()
-    assert start.how == "truth over 4.0 s, ±4e-06 rad/s"
+    assert start.how == "truth over 4.0 s, ±4e-06 rad/s (0.013° a minute)"
     np.testing.assert_allclose(start.std, 1e-6 * TRUTH_S / 4.0, rtol=1e-6)
     for word in ("truth:0", "truth:nan", "truth:five"):
         with pytest.raises(ConfigError, match="truth:SECONDS"):
@@ -371,7 +371,8 @@ def test_auto_is_the_stop_the_log_begins_with_and_says_how_sure() -> None:
     imu, _ = resting()
     start = auto(trained(prior_std=0.05), imu)
     np.testing.assert_allclose(start.rest[:3], GYRO_BIAS, atol=5e-4)
-    assert start.how == "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s, then gravity in motion and every stop"
+    found = "4.0 s at rest from 0.0 s on, prior of 6 runs, ±0.0002 rad/s (0.61° a minute)"
+    assert start.how == f"{found}, then gravity in motion and every stop"
     assert (start.hold_s, start.follows, start.track) == (pytest.approx(4.0, abs=0.01), start.follows, None)
     assert start.follows is not None
     assert (start.follows.std[:3] == 0.05).all(), "from what was known before that stop"
@@ -556,7 +557,7 @@ def test_each_word_finds_its_way(biased: Recording) -> None:
     assert how["1,2,3,4,5,6"] == "given"
     assert find_initial_bias("truth", trained, biased).how.startswith("truth over 12.0 s, weighed against the training runs, ±")
     assert find_initial_bias("auto", trained, moving).how.startswith(
-        "prior of the training runs, ±0.05 rad/s, then gravity in motion"
+        "prior of the training runs, ±0.05 rad/s (170° a minute), then gravity in motion"
     )
     with pytest.raises(DataError, match="does not start at rest"):
         find_initial_bias("stationary", trained, moving)

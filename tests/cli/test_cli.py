@@ -304,10 +304,11 @@ def test_nothing_is_folded_where_nobody_looks_at_a_terminal(
 
 def test_a_table_without_a_figure_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     names = ("aoe_deg", "aoe_aligned_deg", "ape_m", "ape_aligned_m", "velocity_rmse_m_s")
-    turned = dict.fromkeys(names) | {"log": "flight", "model": "raw", "aoe_deg": 2.5}
+    turned = dict.fromkeys(names) | {"log": "flight", "model": "raw", "aoe_deg": 2.5, "drift_window_s": 5.0}
     terminal.figures([turned | {"roe_deg": {"5": None}, "rpe_m": {"5": None}}])
     assert "2.50" in (shown := capsys.readouterr().out)
     assert "ROE" not in shown
+    assert "expected" not in shown
     terminal.figures([turned | {"roe_deg": {"5": 0.25}, "rpe_m": {"5": None}}])
     assert "ROE" in (shown := capsys.readouterr().out)
     assert "RPE" not in shown

@@ -5,7 +5,7 @@ frame (m/s for the velocity). For an error zeta of the bias (measured minus zeta
 
     d xi/dt = -R zeta_g        d delta_v/dt = -[f_w]x xi - R zeta_a        f_w = R accel, the specific force in the world
 
-(Barrau and Bonnabel, TAC 2017, as in `imutool.inertial.inertial_filter`). The covariance is the sum of four parts: bias, as a
+(`imutool.bias_start.bias_covariance.drift_by_bias`). The covariance is the sum of four parts: bias, as a
 constant and as roots S in time; white noise of the samples; the pose at the start; the pose at the end.
 """
 
@@ -16,15 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Bool, Float64
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import BiasModel
 from imutool.bias.temperature_drift import with_drift, without_drift
-from imutool.bias_start.bias_covariance import BiasEstimator, Roots
+from imutool.bias_start.bias_covariance import BiasEstimator, drift_by_bias, stacked
 from imutool.bias_start.initial_bias import InitialBias
 from imutool.geometry import quaternion
 from imutool.inertial.preintegration import EYE, hat
 from imutool.inertial.strapdown import GRAVITY_W, with_velocity
 from imutool.recording import Imu, Poses, seconds
-from imutool.units import SENSORS
 
 Vector6 = Float64[np.ndarray, "6"]
 LEAST_TRUSTED = 0.5  # share of a window's samples with truth
@@ -110,14 +109,11 @@ def _integrated(motion: Motion, rows: slice) -> _Integrated:
     dt = np.diff(t)[:, None]
     steps = quaternion.exp(0.5 * (u[1:, :3] + u[:-1, :3]) * dt)
     q_hat = quaternion.multiply(q[:1], np.concatenate([[[1.0, 0.0, 0.0, 0.0]], quaternion.running_product(steps)]))
-    R, force = quaternion.matrix(q_hat), quaternion.rotate(q_hat, u[:, 3:])
+    force = quaternion.rotate(q_hat, u[:, 3:])
     gained = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (force[1:] + force[:-1]) * dt, axis=0)])
     v_hat = v[0] + gained[-1] + np.array(GRAVITY_W) * (t[-1] - t[0])
     xi = quaternion.log(quaternion.multiply(q_hat[-1:], quaternion.inverse(q[-1:])))[0]
-    weight = 0.5 * (np.append(dt, 0.0) + np.insert(dt, 0, 0.0))
-    by_bias, by_pose = np.zeros((len(t), 6, 6)), np.eye(6)
-    by_bias[:, :3, :3] = by_bias[:, 3:, 3:] = -R * weight[:, None, None]
-    by_bias[:, 3:, :3] = -hat(gained[-1] - gained) @ by_bias[:, :3, :3]
+    by_bias, by_pose = drift_by_bias(t, q_hat, force), np.eye(6)
     by_pose[3:, :3] = -hat(gained[-1])
     return _Integrated(np.concatenate([xi, v_hat - v[-1]]), by_bias, by_pose)
 
@@ -173,7 +169,7 @@ class Judged:
         self.bias, rest, self.roots = BiasEstimator(model, start).parts(t_s, steady.gyro, steady.accel)
         self.bias, rest = with_drift(model, imu.t_ns, self.bias, rest)
         self.motion = Motion(t_s, u - self.bias, quaternion.unit(poses.q_wb_wxyz), poses.v_w, trusted)
-        self.stated = BiasCovariance(rest, _stacked(self.roots, len(t_s)))
+        self.stated = BiasCovariance(rest, stacked(self.roots, len(t_s)))
         self._noise = np.where(model.noise_std > 0, model.noise_std, start.noise)
         self._pose_std = pose_errors(self.motion, self._noise) if pose_std is None else pose_std
 
@@ -181,14 +177,3 @@ class Judged:
         """Errors of integration over windows one after another, and their covariance; none where the poses are unknown."""
         windows = self.motion.windows(window_s, from_s) if np.isfinite(self._pose_std).all() else []
         return grown(self.motion, windows, self.stated, self._noise, self._pose_std)
-
-
-def _stacked(roots: Roots, n: int) -> Float64[np.ndarray, "n 6 p"]:
-    """Roots of both sensors, whose unknowns are independent."""
-    parts = {sensor: roots.get(sensor, np.zeros((n, 3, 0))) for sensor in SENSORS}
-    out = np.zeros((n, 6, sum(part.shape[2] for part in parts.values())))
-    first = 0
-    for sensor, part in parts.items():
-        out[:, COLUMNS[sensor], first : first + part.shape[2]] = part
-        first += part.shape[2]
-    return out
