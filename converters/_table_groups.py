@@ -8,12 +8,11 @@ from dataclasses import replace
 
 from ._table_map import IMU_TOPIC, Entries, Proposal
 from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
-from ._table_rotations import TURNS, angles_by_motion, matrix_by_motion, order_by_motion
+from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
-EITHER_WAY = ", and the other way, too: the motion has too few axes to tell"
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
 QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
@@ -174,10 +173,9 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
     arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
     q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
     if not q and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
-        q, is_shown = order_by_motion(columns, entries, four, clock)
+        q, order = order_by_motion(columns, entries, four, clock)
         if q:
-            order = "wxyz" if q == four else "xyzw"
-            reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}{'' if is_shown else EITHER_WAY}")
+            reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}")
     if q:
         return {"quaternion_wxyz": q}
     if nine := _matrix(leaves):

@@ -25,7 +25,10 @@ SURE, CLEARLY = 0.9, 0.25  # correlation of turns that are the same; share of wh
 LIKELY, MOST_OFF = 0.6, 1.35  # correlation with poses that jump; ratio of turns in one unit, as the next is a factor of 57 away
 ORTHOGONAL = 0.02  # what two printed decimals leave of R R^T = 1
 NOT_UNIT, MOST_NOT_UNIT = 0.01, 0.1  # error of a quaternion's length, and the share of them that may have it
-ORDERS = (0, 1, 2, 3), (3, 0, 1, 2)  # of w, x, y, z in an array: wxyz or xyzw
+ORDERS, ORDER_NAMES = ((0, 1, 2, 3), (3, 0, 1, 2)), ("wxyz", "xyzw")  # of w, x, y, z in an array
+UP = np.cos(np.radians(25.0))  # of the mean force in a world whose z axis points up
+INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion
+EITHER_WAY = ", and the other way, too: the motion has too few axes to tell"
 TURNS = {"quaternion_wxyz", "rotation_matrix", "roll_pitch_yaw"}  # entries of a map that name rotations
 MOST_RAD = 2.0 * np.pi + 1e-3  # beyond which angles are degrees
 SPANS_S = SPAN_S, LONG_SPAN_S, 1.0  # over which angles are compared, often rounded to 0.1 degrees, or of poses that jump
@@ -78,11 +81,48 @@ def known_rotations(q_wxyz: Float64[np.ndarray, "n 4"], topic: str) -> tuple[Boo
     return ~missing & ~off, notes
 
 
-def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
-    """Columns w, x, y, z of an array that turns as the gyro, and whether it shows the order."""
+def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock: tuple[str, str]) -> tuple[list[str], str]:
+    """Columns w, x, y, z (some with a minus) that turn as the gyro, and their order in words.
+
+    The inverse of the other order turns alike, in other frames. It counts where gravity is up in its world alone, or where
+    gravity leaves it open and it alone turns about the gyro's own axes.
+    """
     values = columns.side_by_side(array)
-    best, is_shown = _way_by_motion(columns, entries, [values[:, order] for order in ORDERS], clock)
-    return ([] if best is None else [array[axis] for axis in ORDERS[best]]), is_shown
+    ways = [values[:, order] for order in ORDERS]
+    best, is_shown = _way_by_motion(columns, entries, ways, clock)
+    if best is None:
+        return [], ""
+    gyro, at_s, other = _GyroTurns.of(columns, entries), _seconds(columns, clock), 1 - best
+    pair = ways[best], ways[other] * INVERSE
+    for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
+        own, inverse = turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in pair]
+        if min(own.correlation, inverse.correlation) > SURE:
+            up = [_is_up(columns, entries, way, at_s - delay_s, turn.turn) for way, turn in zip(pair, turns, strict=True)]
+            is_own = inverse.same_axes > SURE and _is_clear(inverse.same_axes, own.same_axes)
+            if up[1] > up[0] or (up[1] == up[0] and is_own):
+                w, *xyz = (array[axis] for axis in ORDERS[other])
+                return [w, *(f"-{column}" for column in xyz)], f"{ORDER_NAMES[other]}, from the world to the body"
+            break
+    return [array[axis] for axis in ORDERS[best]], ORDER_NAMES[best] + ("" if is_shown else EITHER_WAY)
+
+
+def _is_up(
+    columns: Columns,
+    entries: Entries,
+    q_wxyz: Float64[np.ndarray, "n 4"],
+    at_s: Float64[np.ndarray, " n"],
+    turn: Float64[np.ndarray, "3 3"],
+) -> bool:
+    """Whether the mean specific force points up in the world of poses, whose body is turned against the IMU."""
+    force = columns.side_by_side(entries["accel"])
+    t_s = _seconds(columns, (str(entries["time"]), str(entries["time_unit"])))
+    if len(t_s) != len(force):
+        return False
+    known = np.isfinite(t_s) & np.isfinite(force).all(axis=1)
+    at_poses = np.stack([np.interp(at_s, t_s[known], axis) for axis in force[known].T], axis=1)
+    unit = np.abs(np.linalg.norm(q_wxyz, axis=1) - 1.0) < NOT_UNIT
+    mean = quaternion.rotate(q_wxyz[unit], at_poses[unit] @ turn.T).mean(axis=0)
+    return bool(mean[2] > UP * np.linalg.norm(mean))
 
 
 def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
@@ -127,9 +167,9 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         found = {}
         for way, q_wxyz in turns.items():
-            correlation, ratio, _ = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
-            is_alike = not size or 1.0 / MOST_OFF < correlation * ratio / size < MOST_OFF
-            found[way] = correlation if is_alike else 0.0
+            turn = _turns_alike(gyro, q_wxyz, at_s - delay_s, span_s)
+            is_alike = not size or 1.0 / MOST_OFF < turn.slope / size < MOST_OFF
+            found[way] = turn.correlation if is_alike else 0.0
         unit, yaw = max(found, key=lambda way: found[way])
         best, other_unit = found[unit, yaw], max((r for (u, _), r in found.items() if u != unit), default=0.0)
         if best > SURE and _is_clear(best, other_unit):
@@ -164,10 +204,9 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     q_wxyz, gyro = _rotations(columns, entries), _GyroTurns.of(columns, entries)
     at_s = _seconds(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
     for span_s in (SPAN_S, LONG_SPAN_S):
-        correlation, ratio, _ = _turns_alike(gyro, q_wxyz, at_s, span_s)
-        slope = correlation * ratio  # of the poses' turns by the gyro's: noise of the poses does not bias it
-        near = [unit for unit, size in GYRO_SI.items() if 1.0 / MOST_OFF < slope / size < MOST_OFF]
-        if correlation > LIKELY and near:
+        turn = _turns_alike(gyro, q_wxyz, at_s, span_s)
+        near = [unit for unit, size in GYRO_SI.items() if 1.0 / MOST_OFF < turn.slope / size < MOST_OFF]
+        if turn.correlation > LIKELY and near:
             return near[0]
     return ""
 
@@ -212,8 +251,9 @@ class _Alike(NamedTuple):
     """Turns of poses beside the gyro's."""
 
     correlation: float  # under the best rotation between poses and gyro
-    ratio: float  # of the sizes, poses by gyro
+    slope: float  # of the poses' turns by the gyro's, which noise of the poses does not bias
     same_axes: float  # correlation without a rotation
+    turn: Float64[np.ndarray, "3 3"]  # that rotation, from the gyro to the body of the poses
 
 
 def _turns_alike(
@@ -221,7 +261,7 @@ def _turns_alike(
 ) -> _Alike:
     """How far the poses turn as the gyro does; a correlation of zero where they share too little time."""
     if not len(gyro.t_s):
-        return _Alike(0.0, 0.0, 0.0)
+        return _Alike(0.0, 0.0, 0.0, np.eye(3))
     inside = (at_s >= gyro.t_s[0]) & (at_s <= gyro.t_s[-1])
     at, q = at_s[inside], q_wxyz[inside]
     size = np.sqrt((q**2).sum(axis=1))
@@ -232,17 +272,17 @@ def _turns_alike(
     spans = np.diff(at)
     kept = (spans > 0.0) & (spans < MOST_SPANS * span_s)
     if spans[kept].sum() < LEAST_S:
-        return _Alike(0.0, 0.0, 0.0)
+        return _Alike(0.0, 0.0, 0.0, np.eye(3))
     turned = quaternion.log(quaternion.multiply(quaternion.inverse(q[:-1]), q[1:]))[kept]
     measured = np.diff(np.stack([np.interp(at, gyro.t_s, angle) for angle in gyro.angles.T], axis=1), axis=0)[kept]
     turned, measured = turned - turned.mean(axis=0), measured - measured.mean(axis=0)
     product = turned.T @ measured
-    singular = np.linalg.svd(product, compute_uv=False)
-    together = singular[0] + singular[1] + np.sign(np.linalg.det(product)) * singular[2]
+    left, singular, right = np.linalg.svd(product)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(product))])
     power = (turned**2).sum(), (measured**2).sum()
     size = max(np.sqrt(power[0] * power[1]), 1e-30)
-    ratio = np.sqrt(power[0] / max(power[1], 1e-30))
-    return _Alike(float(together / size), float(ratio), float(np.trace(product) / size))
+    correlation, ratio = singular @ signs / size, np.sqrt(power[0] / max(power[1], 1e-30))
+    return _Alike(float(correlation), float(correlation * ratio), float(np.trace(product) / size), left * signs @ right)
 
 
 def _seconds(columns: Columns, clock: tuple[str, str]) -> Float64[np.ndarray, " n"]:

@@ -143,8 +143,13 @@ ROBOT = {
 }
 
 
-def robot_table(path: Path, named: str, late_s: float = 0.0, count: int = COUNT, prefix: str = "") -> None:
-    """Poses of a robot in the rows of an IMU, in columns of its name; so many seconds late."""
+def robot_table(
+    path: Path, named: str, late_s: float = 0.0, count: int = COUNT, prefix: str = "", *, inverse: bool = False, mount: str = ""
+) -> None:
+    """Poses of a robot in the rows of an IMU, in columns of its name; so many seconds late.
+
+    With `inverse` quaternions take the world to the body, and with `mount` the IMU is turned by 90 degrees about that axis.
+    """
     place, turn, xyz, wxyz = ROBOT[named]
     header = [
         "time [s]",
@@ -152,8 +157,10 @@ def robot_table(path: Path, named: str, late_s: float = 0.0, count: int = COUNT,
     ]
     header += [prefix + place + axis for axis in xyz] + [prefix + turn + axis for axis in wxyz]
     at = np.clip(np.arange(count) - round(100 * late_s), 0, COUNT - 1)
-    q_wxyz = XYZW[at][:, [3, 0, 1, 2]]
-    path.write_text(",".join(header) + "\n" + rows(T_S[:count], GYRO[:count], ACCEL[:count], P_M[at], q_wxyz))
+    q_wxyz = XYZW[at][:, [3, 0, 1, 2]] * (np.array([1, -1, -1, -1]) if inverse else 1)
+    R = Rotation.from_euler(mount or "z", 90.0 if mount else 0.0, degrees=True)
+    sensors = (R.apply(column)[:count] for column in (GYRO, ACCEL))
+    path.write_text(",".join(header) + "\n" + rows(T_S[:count], *sensors, P_M[at], q_wxyz))
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1, -0.2])
@@ -166,6 +173,17 @@ def test_columns_of_one_body_s_position_and_quaternion_are_its_poses(tmp_path, n
     assert [note for note in log.remarks.notes if "/ground_truth/pose" in note] == []
     alike = np.abs((log.poses["/estimate/pose"].q_wb_wxyz * XYZW[at][:, [3, 0, 1, 2]]).sum(axis=1))
     np.testing.assert_allclose(alike, 1.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("mount", ["", "x", "y", "z"])
+@pytest.mark.parametrize("inverse", [False, True])
+def test_quaternions_from_the_world_to_the_body_keep_the_world_of_their_positions(tmp_path, inverse, mount):
+    """Their inverse turns as those in the other order do, but in other frames; gravity shows which it is."""
+    robot_table(tmp_path / "log.csv", "words", inverse=inverse, mount=mount)
+    (log,) = table.read(tmp_path / "log.csv")
+    poses = log.poses["/estimate/pose"]
+    np.testing.assert_allclose(np.abs((poses.q_wb_wxyz * XYZW[:, [3, 0, 1, 2]]).sum(axis=1)), 1.0, atol=1e-7)
+    assert any("from the world to the body" in note for note in log.remarks.notes) == inverse
 
 
 def test_a_setpoint_of_a_robot_is_no_pose(tmp_path):
