@@ -93,7 +93,7 @@ class Pool:
         rates = [pool.rate_hz for pool in pools]
         if max(rates) / min(rates) - 1 > MAX_RATE_SPREAD:
             listed = ", ".join(f"{pool.names[0]} {pool.rate_hz:.1f}" for pool in pools)
-            wanted, fix = "logs of one sensor at one rate", "Train a model for each rate"
+            wanted, fix = "logs of one sensor at one rate", "Train a model for each rate, or restamp logs whose stamps jitter"
             raise DataError(f"training logs at different rates ({listed} Hz)", expected=wanted, fix=fix)
         columns = {name: torch.cat([getattr(pool, name) for pool in pools]) for name in ("t", *SAMPLED, *FLAGS, "floors")}
         log = torch.cat([pool.log + i for i, pool in enumerate(pools)])

@@ -14,7 +14,7 @@ from imutool.cleaning.likelihood import signed_permutations
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, read_right
 from imutool.cleaning.position_unit import POSITIONS
 from imutool.cleaning.rule import CleaningSettings, TopicSummary
-from imutool.cleaning.rules.axes import TO_Z_UP, Axes
+from imutool.cleaning.rules.axes import LATE_S, TO_Z_UP, Axes
 from imutool.cleaning.samples import Motion, Samples
 from imutool.cleaning.survey import Survey, examine
 from imutool.cleaning.truth import Truth, of_poses
@@ -330,6 +330,17 @@ def looked(imu: Imu, truth: Truth | None, *, fix: bool) -> Survey:
     return examine(
         lambda: [batch_of(imu)], truth, CleaningSettings(only=("axes", "units"), fix=fix), where="made", topic="/imu0"
     )
+
+
+def test_a_delay_just_below_what_is_warned_of_is_corrected() -> None:
+    """Commands judge other samples of a log than `fix` does: what they refuse must not be just beside what it leaves."""
+    imu, poses = turned(waves(60.0, (0.5, 0.4, 0.6)))
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    late = truth._replace(t_ns=truth.t_ns + round(0.75 * LATE_S * 1e9))
+    told, fixed = (looked(imu, late, fix=fix) for fix in (False, True))
+    assert told.pose_delay_ns == 0
+    assert fixed.pose_delay_ns == pytest.approx(0.75 * LATE_S * 1e9, abs=6e6)
 
 
 def test_fix_leads_back_to_the_sensors_that_flew(flown: tuple[Imu, Truth]) -> None:

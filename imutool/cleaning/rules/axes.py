@@ -19,6 +19,7 @@ from imutool.cleaning.rule import Rule, TopicSummary
 
 DISTRUST = "the axes of {} contradict {}"
 LATE_S, LATE_STDS = 0.03, 5.0  # a delay of the poses from which on it is a warning
+FIXED = 0.8  # of that, the delay from which on `fix` corrects it: what a later command warns of must not be left
 TO_Z_UP = {  # rotations of the world after which z is up
     "-z": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),  # NED to ENU
     "+y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -83,7 +84,7 @@ def _clock(delay: Delay, topic: str, whole: TopicSummary) -> Iterator[Finding]:
             f" by the gyro the poses are {lateness(before)} before it, and {lateness(after)} after it"
         )
         yield Finding("axes", "warning", what, 1, values={"steps": topic}, confidence=0.9)
-    elif abs(delay.seconds) > max(LATE_S, LATE_STDS * delay.std_s):
+    elif abs(delay.seconds) > (FIXED if whole.settings.fix else 1.0) * max(LATE_S, LATE_STDS * delay.std_s):
         whole.pose_delay_ns = round(delay.seconds * 1e9)
         size = f"{lateness(delay.seconds)} (standard deviation {1e3 * delay.std_s:.0f} ms)"
         what = f"the stamps of the poses {topic} are {size} by the gyro"
