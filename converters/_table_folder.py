@@ -24,9 +24,10 @@ from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
 from ._table_files import NO_NUMBERS, kind_of, load, npy_shape, read_npy
-from ._table_groups import TRUE_GROUPS, has_poses, known_layout
+from ._table_groups import TRUE_GROUPS, has_poses
 from ._table_headerless import name_headerless
-from ._table_map import IMU_GROUP
+from ._table_layouts import known_layout
+from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_mocap import is_mocap
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name, text_head
@@ -63,7 +64,6 @@ ENDINGS = (
     ".xls",
 )
 logger = logging.getLogger(__name__)
-TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"
 
 
 def sequences_below(source: Path) -> list[Sequence]:

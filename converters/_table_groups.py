@@ -1,4 +1,4 @@
-"""Arrays of known data sets, and groups of arrays with times of their own."""
+"""Groups of arrays with times of their own: IMUs, poses, further sensors."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ._table_map import IMU_TOPIC, Entries, Proposal
+import numpy as np
+
+from ._table_map import IMU_TOPIC, Entries, column_named
 from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
-from ._table_text import Columns
-from ._table_times import goes_on
+from ._table_text import Columns, matrix_columns
+from ._table_times import goes_on, units_of_time
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
@@ -34,50 +36,13 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"p_?(?P<axis>[ned])", "ned"),
 )
 NED = POSITIONS[2:]
-MATRIX = r"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
+MATRIX = r"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r)_?(?P<axis>[0-3][0-3]|\d)"  # Mat[1][1], Rot[8]
 OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
     r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
 )
 TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
-
-RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
-    "time": "synced/time",
-    "time_unit": "s",
-    "gyro": [f"synced/gyro_uncalib[{axis}]" for axis in range(3)],
-    "gyro_unit": "rad/s",
-    "accel": [f"synced/acce[{axis}]" for axis in range(3)],
-    "accel_unit": "m/s^2",
-}
-RONIN_POSES: Entries = {  # by the visual-inertial estimate of a second phone
-    "position": [f"pose/tango_pos[{axis}]" for axis in range(3)],
-    "quaternion_wxyz": [f"pose/tango_ori[{axis}]" for axis in range(4)],
-    "pose_kind": "estimate",
-}
-BLACKBIRD: Entries = {  # HDF5 of Blackbird as github.com/uzh-rpg/learned_inertial_model_odometry prepares it
-    "time": "ts",
-    "time_unit": "s",
-    "gyro": [f"gyro_raw[{axis}]" for axis in range(3)],
-    "gyro_unit": "rad/s",
-    "accel": [f"accel_raw[{axis}]" for axis in range(3)],
-    "accel_unit": "m/s^2",
-}
-BLACKBIRD_POSES: Entries = {  # by motion capture: x y z qx qy qz qw
-    "position": [f"traj_target[{axis}]" for axis in range(3)],
-    "quaternion_wxyz": [f"traj_target[{axis}]" for axis in (6, 3, 4, 5)],
-    "pose_kind": "truth",
-}
-COLUMN_ENTRIES = "time", "gyro", "accel", "position", "quaternion_wxyz"
-LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set, its IMU, and its poses if there
-    ("its arrays are those of RoNIN", RONIN, RONIN_POSES),
-    (
-        "its arrays are those of RoNIN, with rates that Android has corrected",
-        {**RONIN, "gyro": [f"synced/gyro[{axis}]" for axis in range(3)]},
-        RONIN_POSES,
-    ),
-    ("its arrays are those of Blackbird for learned inertial odometry", {**BLACKBIRD, **BLACKBIRD_POSES}, {}),
-]
 
 
 def imus_apart(columns: Columns) -> dict[str, Columns]:
@@ -97,15 +62,6 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
         values = {c: v for c, v in columns.values.items() if c not in taken}
         apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
     return apart
-
-
-def known_layout(columns: Columns) -> Proposal | None:
-    """Map of the first data set whose arrays are there."""
-    for reason, imu, poses in LAYOUTS:
-        if _columns_of(imu) <= columns.values.keys():
-            known = poses if _columns_of(poses) <= columns.values.keys() else {}
-            return Proposal({**imu, **known}, [], [reason])
-    return None
 
 
 def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
@@ -161,10 +117,27 @@ def turned(columns: Columns, entries: Entries) -> Entries:
     return entries | (found | {"truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
 
 
+def pose_clock(columns: Columns, entries: Entries) -> Entries:
+    """Entries of the time of rotations named without one: that beside them, or the IMU's.
+
+    Raises:
+        ConfigError: a named column does not exist.
+    """
+    named = [each for name in TURNS if (each := entries.get(name))]
+    if not named or entries.get("truth_time") or entries.get("truth_file"):
+        return {}
+    names = [columns.unsigned(column) for column in matrix_columns(named[0])]
+    for column in names:
+        column_named(columns, column, "mapping")
+    own = str(entries["time"]), str(entries["time_unit"])
+    time, unit = time_beside(columns, names[0], *own) or own
+    return {"truth_time": time, "truth_time_unit": unit}
+
+
 def has_poses(columns: Columns) -> bool:
-    """Whether a table has positions and quaternions or angles, in whatever order."""
+    """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
     leaves = {split_name(column)[0]: column for column in columns.values}
-    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123") or _angles(leaves)
+    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123") or _matrix(leaves) or _angles(leaves)
     return bool(turns and _position(leaves))
 
 
@@ -172,13 +145,14 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
     """Entries of the rotations of a group: quaternions, or angles that turn as the gyro does."""
     arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
     q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
-    if not q and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
+    nine = _matrix(leaves)
+    if not q and not nine and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
         q, order = order_by_motion(columns, entries, four, clock)
         if q:
             reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}")
     if q:
         return {"quaternion_wxyz": q}
-    if nine := _matrix(leaves):
+    if nine:
         rows, is_shown = matrix_by_motion(columns, entries, nine, clock)
         if rows:
             way = "" if rows == nine else ", transposed"
@@ -195,6 +169,8 @@ def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[st
     named = [array] if array else next(filter(None, (_axes(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
+    if nine := _matrix(leaves):
+        return [f"the matrices {nine[0]}, ... do not turn as the gyro does; `rotation_matrix` of a map makes poses of them"]
     if three := next(iter(_angles(leaves)), []):
         said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
         return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
@@ -211,10 +187,10 @@ def _bodies(leaves: dict[str, str]) -> list[dict[str, str]]:
 
 
 def _matrix(leaves: dict[str, str]) -> list[str]:
-    """Columns of a matrix, row by row, whose indices count from 0 or from 1."""
-    found = {re.sub(r"_(?=[0-3]$)", "", leaf): column for leaf, column in leaves.items()}
-    names = ([f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1))
-    return next(filter(None, (_axes(MATRIX, found, axes) for axes in names)), [])
+    """Columns of a matrix, row by row, whose indices or numbers count from 0 or from 1."""
+    found = {re.sub(r"_(?=\d$)", "", leaf): column for leaf, column in leaves.items()}
+    indices = ([f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1))
+    return next(filter(None, (_axes(MATRIX, found, axes) for axes in (*indices, "012345678", "123456789"))), [])
 
 
 def _position(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
@@ -247,7 +223,7 @@ def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[li
 def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[str, str] | None:
     """Time in the group of a column or in one around it, if that is not the IMU's, and its unit.
 
-    A unit that is not stated is the one in which it covers the IMU's time best.
+    A unit that is not stated is the one in which it covers the IMU's time best, or on another clock the only plausible one.
     """
     if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
         return None  # a dot in the name of a plain table's column makes no group
@@ -268,7 +244,9 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
         start, end = columns.values[other][[0, -1]].astype(float) * size
         overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
     best = max(overlap, key=lambda each: overlap[each])
-    return (other, best) if overlap[best] > LEAST_OVERLAP else None
+    values = columns.values[other].astype(float)
+    likely = [best] if overlap[best] > LEAST_OVERLAP else units_of_time(float(values[0]), float(np.median(np.diff(values))))
+    return (other, likely[0]) if len(likely) == 1 else None
 
 
 def is_time(column: str) -> bool:
@@ -290,9 +268,3 @@ def shared_group(time: str, column: str) -> int:
     """Depth of a time's group, if a column is in it; -1 otherwise."""
     around, own = ([part for part in re.split(r"[/.]", group_of(each)) if part] for each in (time, column))
     return len(around) if own[: len(around)] == around else -1
-
-
-def _columns_of(entries: Entries) -> set[str]:
-    """Columns that a map names."""
-    named = [value for name, value in entries.items() if name in COLUMN_ENTRIES]
-    return {column for value in named for column in ([value] if isinstance(value, str) else value)}

@@ -144,9 +144,10 @@ def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
 
 
 def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
-    """What separates most rows into fields of which `least` are numbers; None for white space."""
-    counts = {mark: sum(_is_row(row, mark, least) for row in rows[:LOOKED_AT]) for mark in (";", "\t", ",", None)}
-    return max(counts, key=lambda mark: counts[mark])  # of equals the first
+    """What separates most rows into equally many fields of which `least` are numbers; None for white space."""
+    looked, marks = rows[:LOOKED_AT], (";", "\t", ",", None)
+    widths = {mark: Counter(len(row.split(mark)) for row in looked if _is_row(row, mark, least)) for mark in marks}
+    return max(marks, key=lambda mark: max(widths[mark].values(), default=0))  # of equals the first
 
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:
@@ -272,8 +273,7 @@ def _below_groups(groups: list[str], names: list[str], between: str) -> tuple[li
 
 
 def _repeats(texts: list[str]) -> bool:
-    named = list(filter(None, texts))
-    return len(set(named)) < len(named)
+    return len({*texts} - {""}) < len(texts) - texts.count("")
 
 
 def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:

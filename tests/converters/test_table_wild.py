@@ -340,3 +340,12 @@ def test_tables_of_a_folder_may_name_their_sensor_in_each_row(tmp_path):
 def test_long_lines_are_no_rows_that_name_their_numbers(text):
     """The search for labels costs the square of their length: it would take hours."""
     assert as_table(text) == ("", 0)
+
+
+def test_numbers_in_a_header_between_tabs_are_no_fields(tmp_path):
+    """Blanks split `Distance 1` into a word and a number, and the header into a row of numbers."""
+    names = [*NAMES, *(f"Distance {n}" for n in range(1, 9))]
+    path = write_csv(tmp_path / "imu.csv", names, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T, *([T_S] * 8)], mark="\t")
+    log = read(path)
+    assert "/Distance_8" in log.scalars
+    assert log.remarks.losses == []
