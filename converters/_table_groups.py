@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
 from ._table_map import IMU_TOPIC, Entries, column_named
-from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
+from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns, matrix_columns
 from ._table_times import goes_on, units_of_time
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
+Axes = dict[str, str]  # columns by x, y, z
+MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
-QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
-QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
+FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
+ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
+QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
+QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-3])"
 COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
 ANGLES = (
     (
@@ -28,7 +33,7 @@ ANGLES = (
 )
 GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
 HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
-POSITION = r"((t|p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
+POSITION = r"((t|p|pos|position|translation|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
@@ -36,24 +41,26 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"p_?(?P<axis>[ned])", "ned"),
 )
 NED = POSITIONS[2:]
-MATRIX = r"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r)_?(?P<axis>[0-3][0-3]|\d)"  # Mat[1][1], Rot[8]
+MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
 OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
     r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
 )
-TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
+TRUE_GROUPS = (
+    r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
+)
 
 
 def imus_apart(columns: Columns) -> dict[str, Columns]:
     """Columns without those of other IMUs, by topic; empty unless several pair by name."""
-    spelled = {column: split_name(column)[0] for column in columns.values if not is_true(column)}
-    names = {column: name for column, name in spelled.items() if not re.search(ESTIMATED, name)}
-    gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
-    if len(gyros) < 2 or gyros.keys() != accels.keys():
-        return {}
-    of = {owner: {*gyros[owner].values(), *accels[owner].values()} for owner in gyros}
-    groups = {owner: group_of(gyros[owner]["x"]) for owner in gyros}
+    names = {column: split_name(column)[0] for column in measured(columns)}
+    names = {column: name for column, name in names.items() if not re.search(ESTIMATED, name)}
+    spaced = {column: spaced_name(column) for column in names}
+    gyros, accels = (triples(sensor, names, spaced) for sensor in ("gyro", "accel"))
+    paired = _paired(gyros, accels) if len(gyros) > 1 else {}
+    of = {owner: {*gyros[owner].values(), *chain(*(accel.values() for accel in each))} for owner, each in paired.items()}
+    groups = {owner: group_of(gyros[owner]["x"]) for owner in of}
     apart = {}
     for owner, own in of.items():
         others = {group for group in groups.values() if group and group != groups[owner]}
@@ -62,6 +69,17 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
         values = {c: v for c, v in columns.values.items() if c not in taken}
         apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
     return apart
+
+
+def _paired(gyros: Mapping[str, Axes], accels: Mapping[str, Axes]) -> dict[str, list[Axes]]:
+    """Accelerations of each gyro's owner: `leg` has `leg_wide_range`; empty unless every one has some."""
+    of: dict[str, list[Axes]] = {owner: [] for owner in gyros}
+    for name, accel in accels.items():
+        near = [owner for owner in gyros if name == owner or name.startswith(f"{owner}_")]
+        if not near:
+            return {}
+        of[max(near, key=len)].append(accel)
+    return of if all(of.values()) else {}
 
 
 def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
@@ -92,7 +110,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
                 break
         if turns:
             poses.append((not named_true, clock, turns, position))
-        elif clock[0] != time or bodies:
+        elif clock[0] != time or named_true or bodies:
             reasons += _why_no_turns(columns, leaves, bodies)
     for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
@@ -252,6 +270,13 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
 def is_time(column: str) -> bool:
     """Whether a column is named as a time."""
     return re.fullmatch(TIME_WORDS, split_name(column.removeprefix(group_of(column)))[0]) is not None
+
+
+def measured(columns: Columns) -> list[str]:
+    """Columns that may be a sensor's: no true poses, and no parameters, which are shorter."""
+    longest = max(map(len, columns.values.values()), default=0)
+    long = [c for c, values in columns.values.items() if len(values) > MOST_CONSTANTS or longest <= MOST_CONSTANTS]
+    return [column for column in long if not is_true(column)]
 
 
 def is_true(column: str) -> bool:

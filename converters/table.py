@@ -24,7 +24,7 @@ from . import Sequence
 from ._source import head, name
 from ._table_files import kind_of, load, read_text
 from ._table_folder import load_split, sequences_below
-from ._table_groups import group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
+from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
 from ._table_layouts import known_layout
 from ._table_map import (
     IMU_TOPIC,
@@ -55,7 +55,6 @@ GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 MOST_LOSSES = 8  # in a refusal
 POSES_TOPIC = "/ground_truth/pose"
-MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
 def sequences(source: Path) -> list[Sequence]:

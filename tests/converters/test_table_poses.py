@@ -141,6 +141,17 @@ def test_nine_numbered_columns_are_matrices_in_the_order_in_which_they_turn(tmp_
     np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-8)
 
 
+@pytest.mark.parametrize("rotation", ["R_wb", "C_nb", "q_wb", "q_wb_wxyz"])
+def test_rotations_and_positions_may_name_their_frames(tmp_path, rotation):
+    values = MATRICES if rotation[0] in "RC" else TURN.as_quat(scalar_first=rotation.endswith("wxyz"))
+    np.savez(tmp_path / "run.npz", t=T_S, gyro=GYRO, accel=ACCEL, p_wb=P_M, **{rotation: values})
+    log = read(tmp_path / "run.npz")
+    poses = log.poses["/estimate/pose"]
+    np.testing.assert_allclose(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)
+    np.testing.assert_allclose(poses.p_wb, P_M)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+
+
 def test_a_map_that_names_rotations_alone_takes_the_time_beside_them(tmp_path):
     names = [f"u{n}" for n in range(4)]
     (tmp_path / "gt.csv").write_text("time,x,y,z," + ",".join(names) + "\n" + rows(T_S[::2], P_M[::2], XYZW[::2]))

@@ -349,3 +349,41 @@ def test_numbers_in_a_header_between_tabs_are_no_fields(tmp_path):
     log = read(path)
     assert "/Distance_8" in log.scalars
     assert log.remarks.losses == []
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accels"),
+    [
+        ("{}.Gyroscope {} [deg/s]", ["{}.Wide Range Accelerometer {} [m/s^2]"]),
+        ("{}_gyr_{} [deg/s]", ["{}_lin_acc_{} [m/s^2]", "{}_acc_{} [m/s^2]"]),
+        ("{}_AngVel_{} [deg/s]", ["{}_LinAcc_{} [m/s^2]"]),
+    ],
+)
+def test_accelerations_with_further_words_are_of_the_imu_whose_name_theirs_begin_with(tmp_path, gyro, accels):
+    owners, forms = ("leg", "leg_left"), (gyro, *accels)
+    names = ["t [s]", *(form.format(owner, axis) for owner in owners for form in forms for axis in "xyz")]
+    force = np.array([0.0, 0.0, 9.8]) + np.random.default_rng(3).normal(size=(400, 3))
+    of = {
+        owner: [factor * force, *([0.1 * force] * (len(accels) - 1)), force + factor] for factor, owner in enumerate(owners, 1)
+    }
+    path = write_csv(
+        tmp_path / "gait.csv", names, [np.arange(400) / 100.0, *(v for o in owners for part in of[o] for v in part.T)]
+    )
+    log = table.read_sequence(table.sequences(path)[0])
+    assert {*log.imus} == {"/leg/imu", "/leg_left/imu"}
+    for owner in owners:
+        np.testing.assert_allclose(log.imus[f"/{owner}/imu"].gyro, np.deg2rad(of[owner][0]))
+        np.testing.assert_allclose(log.imus[f"/{owner}/imu"].accel, of[owner][-1])
+
+
+def test_parameters_of_a_sensor_are_no_sensor_and_a_time_of_other_length_is_named(tmp_path):
+    force = np.array([0.0, 0.0, 9.8]) + np.random.default_rng(3).normal(size=(400, 3))
+    arrays = {"gyro": 0.1 * force, "accel": force, "C_gyro": np.eye(3), "C_accel": np.eye(3)}
+    np.savez(tmp_path / "run.npz", t=np.arange(400) / 100.0, **arrays)
+    (sequence,) = table.sequences(tmp_path / "run.npz")
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].accel, force)
+    assert "C_gyro[0]" in log.metadata["imutool/constants"]
+    np.savez(tmp_path / "run.npz", t=np.arange(399) / 100.0, **arrays)
+    with pytest.raises(ConfigError, match="'t' rises and has 399 rows, and the gyro 400"):
+        table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
