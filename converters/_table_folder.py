@@ -227,15 +227,14 @@ def _load(path: Path) -> Columns:
 
 def _groups(tables: list[Path]) -> dict[Path, str]:
     """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or IMUs and poses; else none."""
-    sensors = sensors_among(_stem(path) for path in tables)
-    if {*sensors.values()} == {*SENSORS}:
-        return {path: sensors[_stem(path)] for path in tables if _stem(path) in sensors}
-    if several := pairs_among(_stem(path) for path in tables):
-        return {path: several[_stem(path)] for path in tables if _stem(path) in several}
-    seen = {path: _look(path) for path in tables}
+    sensors, seen = sensors_among(map(_stem, tables)), {path: _look(path) for path in tables}
+    groups = sensors if {*sensors.values()} == {*SENSORS} else pairs_among(map(_stem, tables))
+    of_sensors = {path: groups[_stem(path)] for path in tables if _stem(path) in groups}
     captured = [path for path in tables if seen[path].is_mocap]
     words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1
     true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
+    if of_sensors:
+        return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
     shown = [path for path in tables if seen[path].is_imu and path not in true]
     imus = [path for path in tables if re.fullmatch(IMU, words[path]) and path not in true] or shown
     poses = true or [path for path in tables if seen[path].has_poses and path not in shown]

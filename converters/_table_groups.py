@@ -7,18 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
-import numpy as np
-
 from ._table_map import IMU_TOPIC, Entries, column_named
 from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns, matrix_columns
-from ._table_times import goes_on, units_of_time
+from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
 Axes = dict[str, str]  # columns by x, y, z
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
+MOST_LONGER = 10.0  # is a span of time than another in the same unit
 FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
 ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
 QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
@@ -95,7 +94,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
         in_rows = (time, unit) if len(values) == len(columns.values[time]) else None
-        beside = time_beside(columns, column, time, unit) or in_rows
+        beside = time_beside(columns, column, time, unit, apart=True) or in_rows
         if beside is not None and not entries.keys() & TURNS:
             leaf = split_name(column.removeprefix(group_of(column)))[0]
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
@@ -148,7 +147,7 @@ def pose_clock(columns: Columns, entries: Entries) -> Entries:
     for column in names:
         column_named(columns, column, "mapping")
     own = str(entries["time"]), str(entries["time_unit"])
-    time, unit = time_beside(columns, names[0], *own) or own
+    time, unit = time_beside(columns, names[0], *own, apart=True) or own
     return {"truth_time": time, "truth_time_unit": unit}
 
 
@@ -238,10 +237,11 @@ def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[li
     return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
 
 
-def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[str, str] | None:
+def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: bool = False) -> tuple[str, str] | None:
     """Time in the group of a column or in one around it, if that is not the IMU's, and its unit.
 
-    A unit that is not stated is the one in which it covers the IMU's time best, or on another clock the only plausible one.
+    A unit that is not stated is the one in which it covers the IMU's time best; of a clock `apart` from the IMU's the one in
+    which it lasts about as long.
     """
     if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
         return None  # a dot in the name of a plain table's column makes no group
@@ -257,14 +257,15 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     if stated in TIME_NS:
         return other, stated
     first, last = columns.values[time][[0, -1]].astype(float) * TIME_NS[unit]
-    overlap = {}
+    overlap, longer = {}, {}
     for each, size in USUAL_TIME_NS.items():
         start, end = columns.values[other][[0, -1]].astype(float) * size
         overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
-    best = max(overlap, key=lambda each: overlap[each])
-    values = columns.values[other].astype(float)
-    likely = [best] if overlap[best] > LEAST_OVERLAP else units_of_time(float(values[0]), float(np.median(np.diff(values))))
-    return (other, likely[0]) if len(likely) == 1 else None
+        longer[each] = max((end - start) / (last - first), (last - first) / (end - start))
+    best, alike = max(overlap, key=lambda each: overlap[each]), min(longer, key=lambda each: longer[each])
+    if overlap[best] > LEAST_OVERLAP:
+        return other, best
+    return (other, alike) if apart and longer[alike] < MOST_LONGER else None
 
 
 def is_time(column: str) -> bool:

@@ -282,7 +282,7 @@ def _further(
         else:
             left.append(column)
     if left:
-        said = f"columns of another length than the IMU's, without a time in their group, are left out: {', '.join(left[:20])}"
+        said = f"columns of another length than the IMU's, without a time on its clock, are left out: {', '.join(left[:20])}"
         columns.remarks.losses.append(said)
     if len(clocks) > MOST_SCALARS:
         said = f"the table has {len(clocks)} further columns: {len(clocks) - MOST_SCALARS} of them are left out"

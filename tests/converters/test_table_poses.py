@@ -128,6 +128,40 @@ def test_a_truth_that_begins_at_zero_keeps_its_clock_beside_an_imu_of_this_centu
     np.testing.assert_allclose(log.poses["/ground_truth/pose"].t_ns, 1e9 * (T_S[::step] + 0.1), atol=1e3)
 
 
+def sensor_tables(folder: Path, names: tuple[str, str], epoch_s: int = 0) -> None:
+    """A table of the gyroscope and one of the accelerometer."""
+    for name, unit, values in zip(names, ("rad/s", "m/s^2"), (GYRO, ACCEL), strict=True):
+        lines = rows(values).splitlines()
+        at_ns = (epoch_s * 10**9 + n * 10_000_000 for n in range(COUNT))
+        text = "".join(f"{t},{line}\n" for t, line in zip(at_ns, lines, strict=True))
+        (folder / f"{name}.csv").write_text(f"time_ns,x [{unit}],y [{unit}],z [{unit}]\n" + text)
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_export_of_a_motion_capture_beside_tables_of_a_sensor_each_is_their_truth(tmp_path, name):
+    sensor_tables(tmp_path, ("gyroscope_3", "accelerometer_1"), EPOCH_S)
+    (tmp_path / name).write_text(EXPORTS[name])
+    log = read(tmp_path)
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    assert log.poses["/ground_truth/pose"].t_ns[-1] < 1e12  # on its own clock, for `--fix`
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, rtol=1e-8)
+
+
+def test_files_that_are_numbered_in_turn_are_the_imus_whose_names_they_share(tmp_path):
+    sensor_tables(tmp_path, ("gyroscope_3", "accelerometer_1"), EPOCH_S)
+    sensor_tables(tmp_path, ("second_gyroscope_21", "second_accelerometer_20"), EPOCH_S)
+    sensor_tables(tmp_path, ("gyroscope_uncalibrated_4", "accelerometer_uncalibrated_2"), EPOCH_S)
+    slow = np.arange(20) * 9_000 + 802_485_584  # ms since a boot: at a plausible rate they would be us
+    (tmp_path / "location_8.csv").write_text("time,lat,lon,height\n" + "".join(f"{t},1.5,2.5,{t % 7}\n" for t in slow))
+    (tmp_path / "sensors.csv").write_text("number,type,version,delay\n1,2,3,4\n2,3,4,5\n")
+    log = read(tmp_path)
+    assert {*log.imus} == {"/imu/imu", "/second/imu"}
+    assert not [topic for topic in log.scalars if "location" in topic]
+    assert any(
+        "without a time on its clock, are left out: " in loss and "location_8/lat" in loss for loss in log.remarks.losses
+    )
+
+
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("rows_first", [True, False])
 @pytest.mark.parametrize("late_s", [0.0, 0.7])

@@ -131,6 +131,8 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"Gyroscope {a} (deg/sec)" for a in "XYZ"], [f"Accelerometer {a} (m/s/s)" for a in "XYZ"]),
         ([f"gyro{a} (deg.s^-1)" for a in "XYZ"], [f"accel{a} (m.s^-2)" for a in "XYZ"]),  # SBG
         ([f"{a}Rate (deg/s)" for a in "xyz"], [f"{a}Accel (m/s2)" for a in "xyz"]),  # Aceinna
+        ([f"gyro_raw_{a} [deg/s]" for a in "xyz"], [f"acc_raw_{a}" for a in "xyz"]),
+        ([f"ang_vel_uncal_{a}[deg/s]" for a in "xyz"], [f"acc_uncal_{a}[m/s^2]" for a in "xyz"]),
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
@@ -387,3 +389,17 @@ def test_parameters_of_a_sensor_are_no_sensor_and_a_time_of_other_length_is_name
     np.savez(tmp_path / "run.npz", t=np.arange(399) / 100.0, **arrays)
     with pytest.raises(ConfigError, match="'t' rises and has 399 rows, and the gyro 400"):
         table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
+
+
+def test_readings_in_several_states_are_asked_unless_one_has_none(tmp_path):
+    """Raw and calibrated readings of one sensor, `acc_x_raw` and `acc_x_cal`, are two triples."""
+    forces = {"": 9.8 * ACCEL_G, "_raw": 9.8 * ACCEL_G + 0.2, "_cal": 9.8 * ACCEL_G - 0.1}
+    for states in (("", "_raw"), ("_raw", "_cal")):
+        names = ["t", *(f"acc_{a}{state}" for state in states for a in "xyz"), *(f"g{a}" for a in "xyz")]
+        columns = [T_S, *(axis for state in states for axis in forces[state].T), *(COUNTS * 0.07).round(2).T]
+        path = write_csv(tmp_path / "imu.csv", names, columns)
+        if "" in states:
+            np.testing.assert_allclose(read(path).imus["/imu0"].accel, forces[""])
+        else:
+            with pytest.raises(ConfigError, match="2 triples of columns look like the accel: acc_x_raw/y/z, acc_x_cal/y/z"):
+                read(path)
