@@ -99,6 +99,14 @@ def unit_named(text: str) -> str:
     return next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, text.strip("[]").lower())), "")
 
 
+def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
+    """Factor and unit that a column or its unit states, `(0.1 deg/s)`; else 1 and no unit."""
+    inside = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?(?:[eE]-?\d+)?)\s*[*·x]?\s*(\D.*)", inside[1] if inside else beside)
+    unit = unit_named(match[2].strip()) if match else ""
+    return (float(match[1]), unit) if match and unit else (1.0, "")
+
+
 def spaced_name(column: str) -> str:
     """Name of a column with underscores between its words: UncompGyro_0, xAccel, SENSgyro."""
     return split_name(

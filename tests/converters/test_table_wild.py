@@ -403,3 +403,15 @@ def test_readings_in_several_states_are_asked_unless_one_has_none(tmp_path):
         else:
             with pytest.raises(ConfigError, match="2 triples of columns look like the accel: acc_x_raw/y/z, acc_x_cal/y/z"):
                 read(path)
+
+
+def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path):
+    names = ["time (ms)", *(f"gyroscope {a} (0.1 deg/s)" for a in "xyz"), *(f"accelerometer {a} (1e-3 g)" for a in "xyz")]
+    path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *(1e3 * ACCEL_G).T])
+    log = read(path)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(COUNTS * 0.1))
+    np.testing.assert_allclose(log.imus["/imu0"].accel, 9.80665 * ACCEL_G)
+    assert any("gyroscope x (0.1 deg/s) by 0.1 to deg/s" in note for note in log.remarks.notes)
+    names = [name.replace("0.1 deg/s", "deg/s").replace("1e-3 g", "16 g") for name in names]
+    path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *ACCEL_G.T])
+    np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G)
