@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -46,6 +46,8 @@ OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
 )
+INDICES = [[f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1)]
+NUMBERS = "012345678", "123456789"
 TRUE_GROUPS = (
     r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
 )
@@ -171,7 +173,7 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
         return {"quaternion_wxyz": q}
     if nine:
         rows, is_shown = matrix_by_motion(columns, entries, nine, clock)
-        if rows:
+        if rows and (is_shown or nine != _matrix(leaves, NUMBERS)):  # the order of numbers is no convention
             way = "" if rows == nine else ", transposed"
             reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{way}{'' if is_shown else EITHER_WAY}")
             return {"rotation_matrix": rows}
@@ -187,7 +189,8 @@ def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[st
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
     if nine := _matrix(leaves):
-        return [f"the matrices {nine[0]}, ... do not turn as the gyro does; `rotation_matrix` of a map makes poses of them"]
+        said = "do not turn as the gyro does, or so do their transposes"
+        return [f"the matrices {nine[0]}, ... {said}; `rotation_matrix` of a map, row by row, makes poses of them"]
     if three := next(iter(_angles(leaves)), []):
         said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
         return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
@@ -203,11 +206,10 @@ def _bodies(leaves: dict[str, str]) -> list[dict[str, str]]:
     return [body for body in bodies.values() if len(body) >= 7 and _position(body)]
 
 
-def _matrix(leaves: dict[str, str]) -> list[str]:
+def _matrix(leaves: dict[str, str], forms: Iterable[Sequence[str]] = (*INDICES, *NUMBERS)) -> list[str]:
     """Columns of a matrix, row by row, whose indices or numbers count from 0 or from 1."""
     found = {re.sub(r"_(?=\d$)", "", leaf): column for leaf, column in leaves.items()}
-    indices = ([f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1))
-    return next(filter(None, (_axes(MATRIX, found, axes) for axes in (*indices, "012345678", "123456789"))), [])
+    return next(filter(None, (_axes(MATRIX, found, axes) for axes in forms)), [])
 
 
 def _position(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:

@@ -128,6 +128,20 @@ def test_a_truth_that_begins_at_zero_keeps_its_clock_beside_an_imu_of_this_centu
     np.testing.assert_allclose(log.poses["/ground_truth/pose"].t_ns, 1e9 * (T_S[::step] + 0.1), atol=1e3)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.7])
+def test_numbered_matrices_of_a_motion_about_one_axis_are_asked(tmp_path, late_s):
+    """They turn as the gyro does row by row and column by column."""
+    yaw = Rotation.from_euler("z", 3.0 * ANGLES[:, :1])
+    gyro = np.vstack([(yaw[:-1].inv() * yaw[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    header = "Time,Position X,Position Y,Position Z," + ",".join(f"Rotation[{n}]" for n in range(9)) + "\n"
+    tilted = Rotation.from_euler("x", 1.2) * yaw * Rotation.from_euler("y", 0.5)  # the body is turned against the gyro
+    (tmp_path / "gt.csv").write_text(header + rows(T_S + late_s, P_M, tilted.as_matrix().reshape(-1, 9)))
+    (tmp_path / "imu.csv").write_text(IMU_HEADER + rows(1e9 * T_S, gyro, 0.0 * gyro + [0.0, 0.0, 9.8]))
+    log = read(tmp_path)
+    assert log.poses == {}
+    assert any("or so do their transposes; `rotation_matrix` of a map" in note for note in log.remarks.notes)
+
+
 def sensor_tables(folder: Path, names: tuple[str, str], epoch_s: int = 0) -> None:
     """A table of the gyroscope and one of the accelerometer."""
     for name, unit, values in zip(names, ("rad/s", "m/s^2"), (GYRO, ACCEL), strict=True):
