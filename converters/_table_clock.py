@@ -8,7 +8,7 @@ import numpy as np
 
 from ._table_groups import shared_group
 from ._table_map import Entries, Proposal, column_named
-from ._table_names import TIME_WORDS, XSENS_TIME, spaced_name, unit_named
+from ._table_names import TIME_WORDS, XSENS_TIME, name_and_unit, spaced_name, unit_named
 from ._table_text import Columns
 from ._table_times import (
     MOST_SKIPPED,
@@ -47,6 +47,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         return
     spelled = {c: (name or unit, spaced_name(c)) for c, (name, unit) in names.items()}
     found = [c for c, each in spelled.items() if any(re.fullmatch(rf"(.*_)?{TIME_WORDS}", name) for name in each)]
+    others = [c for c in found if length not in (None, len(columns.values[c])) and rises(columns.values[c])]
     found = [c for c in found if length in (None, len(columns.values[c]))]
     still, found = [c for c in found if not goes_on(columns.values[c])], [c for c in found if goes_on(columns.values[c])]
     if gyro:
@@ -66,6 +67,7 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         why = "alone rises in a unit of time" if len(clocks) == 1 else "is the first column and rises"
         proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
     if not found:
+        proposal.reasons += [f"{c!r} rises and has {len(columns.values[c])} rows, and the gyro {length}" for c in others]
         for column in still:
             values = columns.values[column]
             counts = f"{len(np.unique(values))} different values in {len(values)} rows"
@@ -91,12 +93,13 @@ def _table_of(column: str) -> str:
 
 def _propose_time_unit(proposal: Proposal, column: str, names: dict[str, tuple[str, str]], columns: Columns) -> None:
     """Unit of the time, as stated or by a plausible rate that no other time contradicts."""
-    if (unit := unit_named(columns.units.get(column, "")) or names[column][1]) in TIME_NS:  # a calendar's is not the header's
+    name, unit_in_name = name_and_unit(column, "")
+    if (unit := unit_named(columns.units.get(column, "")) or unit_in_name) in TIME_NS:  # a calendar's is not the header's
         proposal.entries["time_unit"] = unit
         return
     values = columns.values[column].astype(float)
     step = float(np.nanmedian(np.diff(values)))
-    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", names[column][0]):
+    if re.fullmatch(rf"(.*_)?{XSENS_TIME}", name):
         counts = "100us" if step * TIME_NS["100us"] <= 1e9 / PLAUSIBLE_HZ[0] else "us"
         proposal.entries["time_unit"] = counts
         proposal.reasons.append(f"{column!r} counts {counts.replace('00us', '00 us')}, as an Xsens sensor does")

@@ -16,9 +16,10 @@ from ._archive import refusing
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat
+from ._table_merged import join_stamps, sort_by_clock
 from ._table_mocap import is_mocap, read_mocap
 from ._table_packed import opener, read_bytes, text_head
-from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow
+from ._table_programs import GYROFLOW, of_vectornav, scale_gyroflow, scale_stated
 from ._table_sensors import read_rows
 from ._table_sheets import load_sheets
 from ._table_text import WIDEST, Columns, is_text_table, read_csv, text_of
@@ -69,8 +70,10 @@ def load(path: Path, kind: str, sheet: str = "") -> Columns:
             load_sheets(path, columns, read_text, sheet)
         else:
             LOADERS[kind](path, columns)
-    columns.join_stamps()
+    scale_stated(columns)
+    join_stamps(columns)
     join_gps_weeks(columns)
+    sort_by_clock(columns)
     if not columns.values:
         why = "".join(f"; {loss}" for loss in columns.remarks.losses[:1])
         raise DataError(f"{NO_NUMBERS}{why}", where=path, expected="a time, three rates and three accelerations")

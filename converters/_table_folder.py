@@ -8,36 +8,30 @@ among them, is a table too if it has the name of a sensor (`gyro/t` and `gyro/va
 
 from __future__ import annotations
 
-import logging
 import re
 from contextlib import suppress
-from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from imutool.errors import ConfigError, DataError
+from imutool.errors import DataError
 
 from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
-from ._table_files import NO_NUMBERS, kind_of, load, npy_shape, read_npy
-from ._table_groups import TRUE_GROUPS, has_poses, known_layout
-from ._table_headerless import name_headerless
-from ._table_map import IMU_GROUP
-from ._table_mocap import is_mocap
+from ._table_files import kind_of, load, npy_shape, read_npy
+from ._table_groups import TRUE_GROUPS
+from ._table_look import look
+from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
-from ._table_packed import read_bytes, table_name, text_head
-from ._table_propose import propose
+from ._table_packed import read_bytes, table_name
 from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, sensors_among
-from ._table_text import Columns, is_text_table, read_csv, text_of
+from ._table_text import LOOKED_AT, MOSTLY, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
 
 MOST_TABLES = 40  # of one recording
-MOST_LOOKED = 64 << 20  # bytes of a table that is no text
 MOST_LARGER = 1.2  # ratio of the sizes of files of IMUs that were recorded together
 DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
@@ -62,8 +56,6 @@ ENDINGS = (
     ".xlsx",
     ".xls",
 )
-logger = logging.getLogger(__name__)
-TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"
 
 
 def sequences_below(source: Path) -> list[Sequence]:
@@ -114,10 +106,11 @@ def load_split(folder: Path, recording: str = "") -> Columns:
 
 
 def _tables(folder: Path) -> list[Path]:
-    """Tables of a folder; narrow ones only beside a clock, which is none of them."""
+    """Tables of a folder; narrow ones are a series of readings, or beside a clock, which is none of them."""
     files = _files(folder)
     clocks = [path for path in files if _is_clock(path)]
-    tables = [path for path in files if path not in clocks and (kind_of(head(path), path) or (clocks and _is_narrow(path)))]
+    narrow = {path for path in files if _is_narrow(path) and (clocks or _is_series(path))}
+    tables = [path for path in files if path not in clocks and (kind_of(head(path), path) or path in narrow)]
     return [*tables, *_sensor_folders(folder)]
 
 
@@ -155,7 +148,7 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     for shared, paths in alike.items():
         first = _stem(paths[0])
         name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
-        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if _look(path).is_imu}
+        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if look(path).is_imu}
     return found
 
 
@@ -169,6 +162,12 @@ def _is_narrow(path: Path) -> bool:
     """Whether a text has rows of numbers, too few for a time and a vector."""
     start = head(path)
     return not kind_of(start, path) and is_text_table(start, 1)
+
+
+def _is_series(path: Path) -> bool:
+    """Whether nearly every line of a narrow text has two numbers or more, as a time and a pressure."""
+    lines = [line for line in text_of(head(path)).splitlines() if line.strip()][1:LOOKED_AT]  # below a header
+    return bool(lines) and sum(is_text_table(line.encode(), 2) for line in lines) > MOSTLY * len(lines)
 
 
 def _is_clock(path: Path) -> bool:
@@ -227,18 +226,19 @@ def _load(path: Path) -> Columns:
 
 def _groups(tables: list[Path]) -> dict[Path, str]:
     """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or IMUs and poses; else none."""
-    sensors = sensors_among(_stem(path) for path in tables)
-    if {*sensors.values()} == {*SENSORS}:
-        return {path: sensors[_stem(path)] for path in tables if _stem(path) in sensors}
-    if several := pairs_among(_stem(path) for path in tables):
-        return {path: several[_stem(path)] for path in tables if _stem(path) in several}
-    seen = {path: _look(path) for path in tables}
+    sensors, seen = sensors_among(map(_stem, tables)), {path: look(path) for path in tables}
+    groups = sensors if {*sensors.values()} == {*SENSORS} else pairs_among(map(_stem, tables))
+    of_sensors = {path: groups[_stem(path)] for path in tables if _stem(path) in groups}
     captured = [path for path in tables if seen[path].is_mocap]
     words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1
     true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
+    if of_sensors:
+        return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
     shown = [path for path in tables if seen[path].is_imu and path not in true]
     imus = [path for path in tables if re.fullmatch(IMU, words[path]) and path not in true] or shown
     poses = true or [path for path in tables if seen[path].has_poses and path not in shown]
+    if not poses and len(imus) == len(shown) == 1 and any(seen[path].has_time for path in tables if path not in shown):
+        return {shown[0]: IMU_GROUP}
     if len(poses) != 1 or poses[0] in imus:
         return {}
     beside = {poses[0]: TRUTH_GROUP if true else POSES_GROUP}
@@ -256,43 +256,3 @@ def _of_one_size(paths: list[Path]) -> bool:
 
 def _stem(path: Path) -> str:
     return Path(table_name(path)).stem
-
-
-def _start(path: Path) -> str:
-    """First whole lines of a table of text; none of any other."""
-    if kind_of(head(path), path) != "csv":
-        return ""
-    return text_of(text_head(path) or head(path)).rpartition("\n")[0]
-
-
-class _Seen(NamedTuple):
-    """What the columns of a table show."""
-
-    is_imu: bool
-    has_poses: bool
-    is_mocap: bool
-
-
-def _look(path: Path) -> _Seen:
-    """What the first rows of a text show, or another table of up to `MOST_LOOKED` bytes; kept until the file changes."""
-    status = path.stat()
-    return _looked(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=4096)
-def _looked(path: Path, mtime_ns: int, size: int) -> _Seen:  # the key notices a changed file
-    columns, start, kind = Columns(), _start(path), kind_of(head(path), path)
-    if start:
-        read_csv(start, columns, path)
-        name_headerless(columns)
-    elif kind not in ("csv", "") and size <= MOST_LOOKED:
-        try:
-            columns = load(path, kind)
-        except (DataError, ConfigError) as error:
-            if not error.what.startswith(NO_NUMBERS):  # of a file of settings, say
-                logger.warning("left out: %s", error)
-    if not columns.values:
-        return _Seen(False, False, is_mocap(start))
-    name_columns(columns, "")
-    entries = (known_layout(columns) or propose(columns)).entries
-    return _Seen(entries.keys() >= {"gyro", "accel"}, has_poses(columns), is_mocap(start))

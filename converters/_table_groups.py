@@ -1,21 +1,27 @@
-"""Arrays of known data sets, and groups of arrays with times of their own."""
+"""Groups of arrays with times of their own: IMUs, poses, further sensors."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 
-from ._table_map import IMU_TOPIC, Entries, Proposal
-from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, split_name, triples
+from ._table_map import IMU_TOPIC, Entries, column_named
+from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
-from ._table_text import Columns
+from ._table_text import Columns, matrix_columns
 from ._table_times import goes_on
 from ._table_units import POSITION_SI, TIME_NS, USUAL_TIME_NS
 
+Axes = dict[str, str]  # columns by x, y, z
+MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
-QUATERNION = r"(q|quat|quaternion|orientation|rotation|attitude|ori|rot|q_rs)_?(?P<axis>[wxyz])"
-QUATERNION_ARRAY = r"(.*_)?(q|quat|quaternion|orientation|rotation|attitude|ori|rot)_?(?P<axis>[0-3])"
+MOST_LONGER = 10.0  # is a span of time than another in the same unit
+FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
+ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
+QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
+QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-3])"
 COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
 ANGLES = (
     (
@@ -26,7 +32,7 @@ ANGLES = (
 )
 GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
 HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
-POSITION = r"((t|p|pos|position|translation|trans|p_rs_r)_?)?(?P<axis>[xyz012])"
+POSITION = r"((t|p|pos|position|translation|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
@@ -34,61 +40,28 @@ POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (r"p_?(?P<axis>[ned])", "ned"),
 )
 NED = POSITIONS[2:]
-MATRIX = r"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r)_?(?P<axis>[0-3][0-3])"  # Mat[1][1]
+MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
 OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
     r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
     rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
 )
-TRUE_GROUPS = r"(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)\d*"
-
-RONIN: Entries = {  # HDF5 of the RoNIN data set; what Android has not corrected itself shows the bias
-    "time": "synced/time",
-    "time_unit": "s",
-    "gyro": [f"synced/gyro_uncalib[{axis}]" for axis in range(3)],
-    "gyro_unit": "rad/s",
-    "accel": [f"synced/acce[{axis}]" for axis in range(3)],
-    "accel_unit": "m/s^2",
-}
-RONIN_POSES: Entries = {  # by the visual-inertial estimate of a second phone
-    "position": [f"pose/tango_pos[{axis}]" for axis in range(3)],
-    "quaternion_wxyz": [f"pose/tango_ori[{axis}]" for axis in range(4)],
-    "pose_kind": "estimate",
-}
-BLACKBIRD: Entries = {  # HDF5 of Blackbird as github.com/uzh-rpg/learned_inertial_model_odometry prepares it
-    "time": "ts",
-    "time_unit": "s",
-    "gyro": [f"gyro_raw[{axis}]" for axis in range(3)],
-    "gyro_unit": "rad/s",
-    "accel": [f"accel_raw[{axis}]" for axis in range(3)],
-    "accel_unit": "m/s^2",
-}
-BLACKBIRD_POSES: Entries = {  # by motion capture: x y z qx qy qz qw
-    "position": [f"traj_target[{axis}]" for axis in range(3)],
-    "quaternion_wxyz": [f"traj_target[{axis}]" for axis in (6, 3, 4, 5)],
-    "pose_kind": "truth",
-}
-COLUMN_ENTRIES = "time", "gyro", "accel", "position", "quaternion_wxyz"
-LAYOUTS: list[tuple[str, Entries, Entries]] = [  # what is said of the data set, its IMU, and its poses if there
-    ("its arrays are those of RoNIN", RONIN, RONIN_POSES),
-    (
-        "its arrays are those of RoNIN, with rates that Android has corrected",
-        {**RONIN, "gyro": [f"synced/gyro[{axis}]" for axis in range(3)]},
-        RONIN_POSES,
-    ),
-    ("its arrays are those of Blackbird for learned inertial odometry", {**BLACKBIRD, **BLACKBIRD_POSES}, {}),
-]
+INDICES = [[f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1)]
+NUMBERS = "012345678", "123456789"
+TRUE_GROUPS = (
+    r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
+)
 
 
 def imus_apart(columns: Columns) -> dict[str, Columns]:
     """Columns without those of other IMUs, by topic; empty unless several pair by name."""
-    spelled = {column: split_name(column)[0] for column in columns.values if not is_true(column)}
-    names = {column: name for column, name in spelled.items() if not re.search(ESTIMATED, name)}
-    gyros, accels = (triples(sensor, names) for sensor in ("gyro", "accel"))
-    if len(gyros) < 2 or gyros.keys() != accels.keys():
-        return {}
-    of = {owner: {*gyros[owner].values(), *accels[owner].values()} for owner in gyros}
-    groups = {owner: group_of(gyros[owner]["x"]) for owner in gyros}
+    names = {column: split_name(column)[0] for column in measured(columns)}
+    names = {column: name for column, name in names.items() if not re.search(ESTIMATED, name)}
+    spaced = {column: spaced_name(column) for column in names}
+    gyros, accels = (triples(sensor, names, spaced) for sensor in ("gyro", "accel"))
+    paired = _paired(gyros, accels) if len(gyros) > 1 else {}
+    of = {owner: {*gyros[owner].values(), *chain(*(accel.values() for accel in each))} for owner, each in paired.items()}
+    groups = {owner: group_of(gyros[owner]["x"]) for owner in of}
     apart = {}
     for owner, own in of.items():
         others = {group for group in groups.values() if group and group != groups[owner]}
@@ -99,13 +72,15 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
     return apart
 
 
-def known_layout(columns: Columns) -> Proposal | None:
-    """Map of the first data set whose arrays are there."""
-    for reason, imu, poses in LAYOUTS:
-        if _columns_of(imu) <= columns.values.keys():
-            known = poses if _columns_of(poses) <= columns.values.keys() else {}
-            return Proposal({**imu, **known}, [], [reason])
-    return None
+def _paired(gyros: Mapping[str, Axes], accels: Mapping[str, Axes]) -> dict[str, list[Axes]]:
+    """Accelerations of each gyro's owner: `leg` has `leg_wide_range`; empty unless every one has some."""
+    of: dict[str, list[Axes]] = {owner: [] for owner in gyros}
+    for name, accel in accels.items():
+        near = [owner for owner in gyros if name == owner or name.startswith(f"{owner}_")]
+        if not near:
+            return {}
+        of[max(near, key=len)].append(accel)
+    return of if all(of.values()) else {}
 
 
 def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Entries:
@@ -121,7 +96,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     groups: dict[tuple[tuple[str, str], bool], dict[str, str]] = {}
     for column, values in columns.values.items():
         in_rows = (time, unit) if len(values) == len(columns.values[time]) else None
-        beside = time_beside(columns, column, time, unit) or in_rows
+        beside = time_beside(columns, column, time, unit, apart=True) or in_rows
         if beside is not None and not entries.keys() & TURNS:
             leaf = split_name(column.removeprefix(group_of(column)))[0]
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
@@ -136,7 +111,7 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
                 break
         if turns:
             poses.append((not named_true, clock, turns, position))
-        elif clock[0] != time or bodies:
+        elif clock[0] != time or named_true or bodies:
             reasons += _why_no_turns(columns, leaves, bodies)
     for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
@@ -161,10 +136,27 @@ def turned(columns: Columns, entries: Entries) -> Entries:
     return entries | (found | {"truth_time": clock[0], "truth_time_unit": clock[1]} if found else {})
 
 
+def pose_clock(columns: Columns, entries: Entries) -> Entries:
+    """Entries of the time of rotations named without one: that beside them, or the IMU's.
+
+    Raises:
+        ConfigError: a named column does not exist.
+    """
+    named = [each for name in TURNS if (each := entries.get(name))]
+    if not named or entries.get("truth_time") or entries.get("truth_file"):
+        return {}
+    names = [columns.unsigned(column) for column in matrix_columns(named[0])]
+    for column in names:
+        column_named(columns, column, "mapping")
+    own = str(entries["time"]), str(entries["time_unit"])
+    time, unit = time_beside(columns, names[0], *own, apart=True) or own
+    return {"truth_time": time, "truth_time_unit": unit}
+
+
 def has_poses(columns: Columns) -> bool:
-    """Whether a table has positions and quaternions or angles, in whatever order."""
+    """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
     leaves = {split_name(column)[0]: column for column in columns.values}
-    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123") or _angles(leaves)
+    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123") or _matrix(leaves) or _angles(leaves)
     return bool(turns and _position(leaves))
 
 
@@ -172,15 +164,16 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
     """Entries of the rotations of a group: quaternions, or angles that turn as the gyro does."""
     arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
     q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
-    if not q and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
+    nine = _matrix(leaves)
+    if not q and not nine and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
         q, order = order_by_motion(columns, entries, four, clock)
         if q:
             reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}")
     if q:
         return {"quaternion_wxyz": q}
-    if nine := _matrix(leaves):
+    if nine:
         rows, is_shown = matrix_by_motion(columns, entries, nine, clock)
-        if rows:
+        if rows and (is_shown or nine != _matrix(leaves, NUMBERS)):  # the order of numbers is no convention
             way = "" if rows == nine else ", transposed"
             reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{way}{'' if is_shown else EITHER_WAY}")
             return {"rotation_matrix": rows}
@@ -195,6 +188,9 @@ def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[st
     named = [array] if array else next(filter(None, (_axes(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
+    if nine := _matrix(leaves):
+        said = "do not turn as the gyro does, or so do their transposes"
+        return [f"the matrices {nine[0]}, ... {said}; `rotation_matrix` of a map, row by row, makes poses of them"]
     if three := next(iter(_angles(leaves)), []):
         said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
         return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
@@ -210,11 +206,10 @@ def _bodies(leaves: dict[str, str]) -> list[dict[str, str]]:
     return [body for body in bodies.values() if len(body) >= 7 and _position(body)]
 
 
-def _matrix(leaves: dict[str, str]) -> list[str]:
-    """Columns of a matrix, row by row, whose indices count from 0 or from 1."""
-    found = {re.sub(r"_(?=[0-3]$)", "", leaf): column for leaf, column in leaves.items()}
-    names = ([f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1))
-    return next(filter(None, (_axes(MATRIX, found, axes) for axes in names)), [])
+def _matrix(leaves: dict[str, str], forms: Iterable[Sequence[str]] = (*INDICES, *NUMBERS)) -> list[str]:
+    """Columns of a matrix, row by row, whose indices or numbers count from 0 or from 1."""
+    found = {re.sub(r"_(?=\d$)", "", leaf): column for leaf, column in leaves.items()}
+    return next(filter(None, (_axes(MATRIX, found, axes) for axes in forms)), [])
 
 
 def _position(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
@@ -244,10 +239,11 @@ def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[li
     return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
 
 
-def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[str, str] | None:
+def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: bool = False) -> tuple[str, str] | None:
     """Time in the group of a column or in one around it, if that is not the IMU's, and its unit.
 
-    A unit that is not stated is the one in which it covers the IMU's time best.
+    A unit that is not stated is the one in which it covers the IMU's time best; of a clock `apart` from the IMU's the one in
+    which it lasts about as long.
     """
     if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
         return None  # a dot in the name of a plain table's column makes no group
@@ -263,17 +259,27 @@ def time_beside(columns: Columns, column: str, time: str, unit: str) -> tuple[st
     if stated in TIME_NS:
         return other, stated
     first, last = columns.values[time][[0, -1]].astype(float) * TIME_NS[unit]
-    overlap = {}
+    overlap, longer = {}, {}
     for each, size in USUAL_TIME_NS.items():
         start, end = columns.values[other][[0, -1]].astype(float) * size
         overlap[each] = (min(end, last) - max(start, first)) / (max(end, last) - min(start, first))
-    best = max(overlap, key=lambda each: overlap[each])
-    return (other, best) if overlap[best] > LEAST_OVERLAP else None
+        longer[each] = max((end - start) / (last - first), (last - first) / (end - start))
+    best, alike = max(overlap, key=lambda each: overlap[each]), min(longer, key=lambda each: longer[each])
+    if overlap[best] > LEAST_OVERLAP:
+        return other, best
+    return (other, alike) if apart and longer[alike] < MOST_LONGER else None
 
 
 def is_time(column: str) -> bool:
     """Whether a column is named as a time."""
     return re.fullmatch(TIME_WORDS, split_name(column.removeprefix(group_of(column)))[0]) is not None
+
+
+def measured(columns: Columns) -> list[str]:
+    """Columns that may be a sensor's: no true poses, and no parameters, which are shorter."""
+    longest = max(map(len, columns.values.values()), default=0)
+    long = [c for c, values in columns.values.items() if len(values) > MOST_CONSTANTS or longest <= MOST_CONSTANTS]
+    return [column for column in long if not is_true(column)]
 
 
 def is_true(column: str) -> bool:
@@ -290,9 +296,3 @@ def shared_group(time: str, column: str) -> int:
     """Depth of a time's group, if a column is in it; -1 otherwise."""
     around, own = ([part for part in re.split(r"[/.]", group_of(each)) if part] for each in (time, column))
     return len(around) if own[: len(around)] == around else -1
-
-
-def _columns_of(entries: Entries) -> set[str]:
-    """Columns that a map names."""
-    named = [value for name, value in entries.items() if name in COLUMN_ENTRIES]
-    return {column for value in named for column in ([value] if isinstance(value, str) else value)}

@@ -20,6 +20,7 @@ from imutool.errors import ConfigError, DataError, did_you_mean
 from imutool.recording.message_log import KINDS
 
 from ._table_text import Columns
+from ._table_times import COUNTED
 from ._table_units import TIME_NS, UNITS_OF
 
 IMU_TOPIC = "/imu0"
@@ -34,6 +35,7 @@ LISTS = {  # entries that name several columns
 TRUE_ENTRIES = {"truth_time", "position", "quaternion_wxyz", "roll_pitch_yaw", "rotation_matrix"}  # columns of the poses
 CLOCKS = "time", "accel_time", "truth_time", "counter"
 IMU_GROUP = "imu"  # in front of the columns of an IMU beside another table
+TRUTH_GROUP, POSES_GROUP = "ground_truth", "poses"  # of that other table
 OF_COUNTS = {"gyro_scale", "gyro_offset", "accel_scale", "accel_offset"}
 NO_UNIT = "the names of the columns state no unit of the {} that imutool knows, and its values show none"
 
@@ -133,7 +135,9 @@ def _within_group(name: str, columns: Columns, of_imu: bool) -> str:
     plain = columns.unsigned(name)
     names = {*columns.values, *(column.removesuffix("[0][0]") for column in columns.values)}
     among = [] if plain in names else [each for each in names if each.endswith(f"/{plain}")]
-    own = [each for each in among if each.startswith(f"{IMU_GROUP}/") == of_imu] or among
+    groups = (IMU_GROUP,) if of_imu else (TRUTH_GROUP, POSES_GROUP)
+    own = [each for each in among if each.startswith(tuple(f"{group}/" for group in groups))]
+    own = own or [each for each in among if of_imu or not each.startswith(f"{IMU_GROUP}/")] or among
     return name.replace(plain, own[0]) if len(own) == 1 else name
 
 
@@ -231,7 +235,8 @@ def column_named(columns: Columns, wanted: str, where: Path | str) -> np.ndarray
         ConfigError: there is none of this name.
     """
     if wanted not in columns.values:
-        raise ConfigError(f"no column {wanted!r}", where=where, expected=f"one of {', '.join(columns.values)}")
+        named = ", ".join(column for column in columns.values if not column.startswith(COUNTED))
+        raise ConfigError(f"no column {wanted!r}", where=where, expected=f"one of {named}")
     return columns.values[wanted]
 
 

@@ -36,12 +36,13 @@ CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration
 WHOLE_WORDS = "gyr|acc|time"  # that begin behind capitals
 DIGITS = str.maketrans("012", "xyz")
 WORDS = {
-    "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|wb|g|angular_?velocity|ang_?vel|(rotation_?)?rate"
-    r"|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
-    "accel": r"accel(eration|erometer)?|acc[el]?|ac|a|fb|g_?force|gf|linear_?acceleration|specific_?force|sp_?force"
-    r"|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
+    "gyro": r"gyro(scope)?|gyro_?rotation|gyroskop|gyr|gyros|gy|omega|w|(?<![pqrvc]_)wb|g|angular_?velocity|ang_?vel"
+    r"|(rotation_?)?rate|rate_of_rotation|w_rs_s|dreh(rate|geschwindigkeit)|giro(scopio|scopo)?|vel(ocidad)?_?ang(ular)?|gyro_?adc|gyro_rad",
+    "accel": r"accel(eration|erometer)?|acc[el]?|ac|(?<![pr]_[a-z]{2}_)a|fb|g_?force|gf|linear_?acceleration|specific_?force"
+    r"|sp_?force|(linear)?beschleunigung|a_rs_s|acel(eracion|erometro)?|accelerazione|acc_?smooth|accelerometer_m_s2",
 }
-STATE = r"(_(raw|adc|counts?|(un)?cal(ibrated)?))?"  # of the numbers in a column
+STATES = r"_(raw|adc|counts?|(un)?cal(ib)?(rated)?)"  # of the numbers in a column
+STATE = rf"(?P<state>({STATES})?)"
 PLACES = (  # of several IMUs on a body
     r"((left|right|upper|lower|l|r)_?)*(left|right|head|neck|chest|back|torso|trunk|sternum|pelvis|waist|hip|arm|forearm|wrist"
     r"|hand|finger|leg|thigh|shank|knee|ankle|foot|shoe)"
@@ -54,6 +55,7 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<axis>roll|pitch|yaw)_?(?=[a-z]{{3}})(?P<sensor>(WORDS)){STATE}",
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<axis>[xyz])_?(?P<place>\d|{PLACES}){STATE}",  # ax1, acc_x_1, acc_x_chest
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
+    rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
 )
 SYMBOLS = {"gyro": r"(?P<sensor>)(?P<axis>[pqr])", "accel": r"(?P<sensor>f)_?(?P<axis>[xyz])"}  # of an aircraft; specific force
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
@@ -71,16 +73,19 @@ def triples(sensor: str, *names: dict[str, str]) -> dict[str, dict[str, str]]:
 
 
 def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[str, str]]:
-    groups: dict[str, dict[str, str]] = {}
+    groups: dict[tuple[str, str], dict[str, str]] = {}
     axes = TURNS if sensor == "gyro" else AXES
     for column, name in names.items():
         if match := re.fullmatch(form.replace("WORDS", WORDS[sensor]), name):
             found = match.groupdict()
             owner = f"{re.sub(r'^(?=[0-9])', 'imu', found['place'])}_" if "place" in found else found.get("of", "")
-            groups.setdefault(owner + found["sensor"], {})[axes.get(found["axis"], found["axis"])] = column
-    whole = {name: group for name, group in groups.items() if set(group) == set("xyz")}
-    owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name in whole]
-    return dict(zip(owners if len({*owners}) == len(whole) else whole, whole.values(), strict=True))
+            group = groups.setdefault((owner + found["sensor"], found.get("state", "")), {})
+            group[axes.get(found["axis"], found["axis"])] = column
+    whole = {key: group for key, group in groups.items() if set(group) == set("xyz")}
+    whole = {(name, state): group for (name, state), group in whole.items() if not state or (name, "") not in whole}
+    owners = [re.sub(rf"(^|_)({WORDS[sensor]})$", "", name) for name, _ in whole]
+    named = owners if len({*owners}) == len(whole) else [name + state for name, state in whole]
+    return dict(zip(named, whole.values(), strict=True))
 
 
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:
@@ -92,6 +97,14 @@ def name_and_unit(column: str, beside: str) -> tuple[str, str]:
 def unit_named(text: str) -> str:
     """Unit that a text is; empty for other texts."""
     return next((unit for unit, pattern in UNITS.items() if re.fullmatch(pattern, text.strip("[]").lower())), "")
+
+
+def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
+    """Factor and unit that a column or its unit states, `(0.1 deg/s)`; else 1 and no unit."""
+    inside = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?(?:[eE]-?\d+)?)\s*[*·x]?\s*(\D.*)", inside[1] if inside else beside)
+    unit = unit_named(match[2].strip()) if match else ""
+    return (float(match[1]), unit) if match and unit else (1.0, "")
 
 
 def spaced_name(column: str) -> str:

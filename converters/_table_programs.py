@@ -1,4 +1,4 @@
-"""Texts of programs that state their columns elsewhere than in a header.
+"""Columns that a program states elsewhere than in a header, and multiples of units in one.
 
 A VectorNav sensor writes sentences whose name says what is in them (`$VNIMU,...*66`), by its user manual. A log of Gyroflow
 (.gcsv) holds raw numbers, with their scales above the table: of time in s, gyro in rad/s, accel in g.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 
+from ._table_names import unit_with_factor
 from ._table_text import Columns
 
 MAG = ["mag_x", "mag_y", "mag_z"]
@@ -33,6 +34,19 @@ def of_vectornav(text: str, columns: Columns) -> str:
     if len(rows) < len(lines):
         columns.remarks.losses.append(f"{len(lines) - len(rows)} lines of other sentences are left out")
     return "\n".join([",".join(SENTENCES[match[1]]), *rows]) + "\n"
+
+
+def scale_stated(columns: Columns) -> None:
+    """Multiply columns whose header states a multiple of a unit: `gyro x (0.1 deg/s)`."""
+    scaled = []
+    for column, values in columns.values.items():
+        factor, unit = unit_with_factor(column, columns.units.get(column, ""))
+        if unit and 0.0 < factor < 1.0:  # a larger one may be a range: `acc_x (16 g)`
+            columns.values[column], columns.units[column] = values.astype(float) * factor, unit
+            columns.texts.pop(column, None)
+            scaled.append(f"{column} by {factor:g} to {unit}")
+    if scaled:
+        columns.remarks.notes.append(f"multiplied as the header states: {', '.join(scaled)}")
 
 
 def scale_gyroflow(columns: Columns) -> None:

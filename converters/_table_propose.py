@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ._table_clock import propose_time
-from ._table_groups import is_true
+from ._table_groups import measured
 from ._table_headerless import in_an_array, perhaps
 from ._table_map import IN_WHOLE, NO_UNIT, Entries, Proposal, column_named
 from ._table_motion import doubt_gravity, unit_by_motion
@@ -45,7 +45,7 @@ def propose(columns: Columns, given: Entries = NOTHING) -> Proposal:
         ConfigError: a stated column does not exist.
     """
     proposal = Proposal({}, [], [])
-    names = {column: name_and_unit(column, columns.units.get(column, "")) for column in columns.values if not is_true(column)}
+    names = {column: name_and_unit(column, columns.units.get(column, "")) for column in measured(columns)}
     sensors = {sensor: _triples(sensor, names, columns) for sensor in ("gyro", "accel")}
     if not any(sensors.values()) and (array := in_an_array(columns)):
         proposal.reasons.append(f"{', '.join(array['accel'])} show gravity and count as the accel")

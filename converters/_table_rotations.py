@@ -148,7 +148,7 @@ def _way_by_motion(
             best = int(np.argmax(found))
             if found[best] > SURE and _is_clear(found[best], min(found)):
                 return best, True
-        fits_both = fits_both or min(turn.correlation for turn in turns) > SURE
+        fits_both = fits_both or (not delay_s and min(turn.correlation for turn in turns) > SURE)
     return (0 if fits_both else None), False
 
 

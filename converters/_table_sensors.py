@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -55,11 +55,19 @@ def sensors_among(names: Iterable[str]) -> dict[str, str]:
 def pairs_among(names: Iterable[str]) -> dict[str, str]:
     """Groups (`imu0/gyro`) of the names of several IMUs; of one IMU none.
 
-    The two names of an IMU differ by the sensor alone: `gyro-0`, `accel-0`.
+    The two names of an IMU differ by the sensor alone: `gyro-0`, `accel-0`; or also by a number that each name has for itself.
     """
+    names = [*names]
+    numbered = {name: match[0] for name in names if (match := re.search(r"\d+$", name))}
+    is_running = len({*numbered.values()}) == len(numbered)
+    return _pairs({n: n for n in names}) or _pairs({n.removesuffix(end): n for n, end in numbered.items() if is_running})
+
+
+def _pairs(names: Mapping[str, str]) -> dict[str, str]:
+    """Groups of names, by their spellings."""
     found: dict[str, dict[str, str]] = {}
-    for name in names:
-        words = re.findall(rf"{WORD}|\d+", name)
+    for spelled, name in names.items():
+        words = re.findall(rf"{WORD}|\d+", spelled)
         sensors = [s for s, pattern in SENSORS.items() if any(re.fullmatch(pattern, word.lower()) for word in words)]
         rest = [word.lower() for word in words if not re.fullmatch("|".join(SENSORS.values()), word.lower())]
         if len(sensors) == 1 and not any(re.fullmatch(f"{OTHERS}|{UNCORRECTED}", word) for word in rest):

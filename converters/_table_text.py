@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +26,12 @@ from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_numb
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
-LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
 LEAST_NUMBERS = 4  # in a row: a time and a vector
 MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table
 COMMENTS = "#", "%", "//"
 UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
-SECONDS = re.compile(r"(.*?)(secs?|seconds?|(unix|utc|posix)[ _]?time)", re.IGNORECASE)
-BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and its unit in ns
-    re.compile(r"n(ano)?s(ec(ond)?s?)?", re.IGNORECASE): 1,
-    re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
-}
 STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
@@ -102,24 +95,6 @@ class Columns:
         self.remarks.notes.extend(f"{label}: {note}" for note in other.remarks.notes)
         self.remarks.losses.extend(f"{label}: {loss}" for loss in other.remarks.losses)
 
-    def join_stamps(self) -> None:
-        """Make one column of a stamp that has its seconds and the rest of a second in two, as ROS' header.stamp has."""
-        for seconds in [column for column in self.values if SECONDS.fullmatch(column)]:
-            stem = SECONDS.fullmatch(seconds)[1]  # type: ignore[index]  # it matched
-            ends = product((c for c in self.values if c.startswith(stem)), BELOW_SECONDS.items())
-            rest, size = next(((c, size) for c, (name, size) in ends if name.fullmatch(c[len(stem) :])), ("", 1))
-            name, pair = f"{stem.rstrip('._/ ') or 'stamp'} [ns]", [self.values.get(c) for c in (seconds, rest)]
-            if name in self.values or not all(part is not None and part.dtype.kind in "iu" for part in pair):
-                continue
-            sec, below = (np.asarray(part).astype(np.int64) for part in pair)
-            if (
-                len(sec) == len(below)
-                and 0 <= sec.min() <= sec.max() < LAST_S
-                and 0 <= below.min() <= below.max() < 10**9 // size
-            ):
-                del self.values[seconds], self.values[rest]
-                self.values[name], self.units[name] = sec * 10**9 + below * size, "ns"
-
 
 def text_of(raw: bytes) -> str:
     """Text in UTF-8 or UTF-16, else in the code page of Western Windows, which Excel writes."""
@@ -144,9 +119,10 @@ def is_text_table(head: bytes, least: int = LEAST_NUMBERS) -> bool:
 
 
 def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
-    """What separates most rows into fields of which `least` are numbers; None for white space."""
-    counts = {mark: sum(_is_row(row, mark, least) for row in rows[:LOOKED_AT]) for mark in (";", "\t", ",", None)}
-    return max(counts, key=lambda mark: counts[mark])  # of equals the first
+    """What separates most rows into equally many fields of which `least` are numbers; None for white space."""
+    looked, marks = rows[:LOOKED_AT], (";", "\t", ",", None)
+    widths = {mark: Counter(len(row.split(mark)) for row in looked if _is_row(row, mark, least)) for mark in marks}
+    return max(marks, key=lambda mark: max(widths[mark].values(), default=0))  # of equals the first
 
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:
@@ -272,8 +248,7 @@ def _below_groups(groups: list[str], names: list[str], between: str) -> tuple[li
 
 
 def _repeats(texts: list[str]) -> bool:
-    named = list(filter(None, texts))
-    return len(set(named)) < len(named)
+    return len({*texts} - {""}) < len(texts) - texts.count("")
 
 
 def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:

@@ -151,6 +151,9 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     imu, notes = joined(gyro_ns, gyro, accel_ns, accel, IMU_TOPIC)
     remarks.notes.extend(notes)
     scalars: dict[str, Scalars] = {}
+    if others := [path for table, path in tables.items() if re.fullmatch(rf"({'|'.join(GYRO)})\d+", table)]:
+        said = f"{', '.join(others)} of further gyroscopes or recordings become numbers and no IMU"
+        remarks.notes.append(f"{said}: give each a folder of its own, with its accelerometer")
     for table, path in tables.items():
         if table not in (gyro_table, *used):
             scalars |= _others(files, path, clock, where, remarks)

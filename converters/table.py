@@ -23,11 +23,14 @@ from imutool.recording.message_log import MessageLog, Remarks
 from . import Sequence
 from ._source import head, name
 from ._table_files import kind_of, load, read_text
-from ._table_folder import POSES_GROUP, TRUTH_GROUP, load_split, sequences_below
-from ._table_groups import group_entries, imus_apart, known_layout, shared_group, time_beside, turned
+from ._table_folder import load_split, sequences_below
+from ._table_groups import MOST_CONSTANTS, group_entries, imus_apart, pose_clock, shared_group, time_beside, turned
+from ._table_layouts import known_layout
 from ._table_map import (
     IMU_TOPIC,
+    POSES_GROUP,
     TRUE_ENTRIES,
+    TRUTH_GROUP,
     Entries,
     Proposal,
     TableMap,
@@ -52,7 +55,6 @@ GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 MOST_LOSSES = 8  # in a refusal
 POSES_TOPIC = "/ground_truth/pose"
-MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 
 
 def sequences(source: Path) -> list[Sequence]:
@@ -87,14 +89,14 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     remarks, place = columns.remarks, mapping if isinstance(mapping, Path) else path
     given = {} if mapping is None else within_groups(read_map(mapping), columns)
     tables = _mapped(columns, given, place) or _proposed(columns, path / sequence.inside, remarks, given)
-    tables = [_counted(columns, table, place) for table in tables]
+    tables = [_clocked(columns, table, place) for table in tables]
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c.removeprefix("-") for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
     if not poses and path.is_dir() and (file := columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)):
-        what = f"{file} gives no poses: no time with positions and a certain order of quaternions was found in it"
-        remarks.losses.append(f"{what}; a map names its columns (truth_time, position, quaternion_wxyz)")
+        said = f"{file} gives no poses: no time with positions and rotations of a certain order was found in it"
+        remarks.losses.append(f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)")
     if poses and not table.truth_file:
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
         used |= {table.truth_time, *table.position, *turns}
@@ -144,9 +146,8 @@ def _proposed(columns: Columns, path: Path, remarks: Remarks, given: Entries) ->
                 f"{proposal.toml([*apart], own_times=own_times)}",
             )
         named = {key: ", ".join(map(str, np.atleast_1d(value))) for key, value in proposal.entries.items()}
-        counted = {key for key, value in named.items() if value.startswith(COUNTED)}
-        shown = {key: value for key, value in named.items() if key.removesuffix("_unit") not in counted}
-        said = "columns: " + "; ".join(f"{key} = {value}" for key, value in shown.items())
+        shown = [key for key in named if not named.get(key.removesuffix("_unit"), "").startswith(COUNTED)]
+        said = "columns: " + "; ".join(f"{key} = {named[key]}" for key in shown)
         remarks.notes.extend(f"{topic}: {note}" if apart else note for note in (said, *proposal.reasons))
         maps.append(msgspec.convert({"topic": topic, **proposal.entries, "rate_hz": proposal.rate_hz}, TableMap))
     return maps
@@ -179,7 +180,8 @@ def _proposal(columns: Columns, given: Entries) -> Proposal:
     if {"time", "time_unit", "gyro", "accel"} <= proposal.entries.keys():
         beside = group_entries(columns, proposal.entries, proposal.reasons)
         proposal.entries |= {name: beside[name] for name in beside if name == "accel_time" or not given.keys() & TURNS}
-        tries = {"poses": proposal.entries, "orientations": turned(columns, proposal.entries)}
+        proposal.entries |= pose_clock(columns, proposal.entries)
+        tries = {"poses": {} if "truth_file" in given else proposal.entries, "orientations": turned(columns, proposal.entries)}
         units = (
             {kind: unit_by_poses(columns, entries) for kind, entries in tries.items()} if "gyro_unit" in proposal.open else {}
         )
@@ -190,13 +192,13 @@ def _proposal(columns: Columns, given: Entries) -> Proposal:
     return proposal
 
 
-def _counted(columns: Columns, table: TableMap, place: Path) -> TableMap:
-    """The map with a column of counted times, where it has a rate in place of a time."""
-    if not table.rate_hz:
-        return table
-    length = len(column_named(columns, table.gyro[0].removeprefix("-"), place))
-    time = count_times(columns, table.rate_hz, length, table.counter)
-    return msgspec.structs.replace(table, time=time, time_unit="s")
+def _clocked(columns: Columns, table: TableMap, place: Path) -> TableMap:
+    """The map with a column of counted times, where it has a rate in place of a time, and with the time of its poses."""
+    if table.rate_hz:
+        length = len(column_named(columns, table.gyro[0].removeprefix("-"), place))
+        time = count_times(columns, table.rate_hz, length, table.counter)
+        table = msgspec.structs.replace(table, time=time, time_unit="s")
+    return msgspec.structs.replace(table, **pose_clock(columns, msgspec.structs.asdict(table)))
 
 
 def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
@@ -280,7 +282,7 @@ def _further(
         else:
             left.append(column)
     if left:
-        said = f"columns of another length than the IMU's, without a time in their group, are left out: {', '.join(left[:20])}"
+        said = f"columns of another length than the IMU's, without a time on its clock, are left out: {', '.join(left[:20])}"
         columns.remarks.losses.append(said)
     if len(clocks) > MOST_SCALARS:
         said = f"the table has {len(clocks)} further columns: {len(clocks) - MOST_SCALARS} of them are left out"

@@ -41,7 +41,6 @@ class Conventions:
         gyro, accel: against the poses, in the frame of their body.
         relative: the gyro against gravity as the accelerometer reads it.
         up: axis of the poses' world that points up, as `+z`.
-        delay: of the poses.
         unit: of the poses' positions, metres unless the motion shows another.
         quaternions: what is wrong with those of the poses (`pose_quaternions`); then all else is of the poses without this.
     """
@@ -51,7 +50,7 @@ class Conventions:
     accel: Reading | None = None
     relative: Reading | None = None
     up: str | None = None
-    delay: Delay | None = None
+    delay: Delay | None = None  # of the poses
     unit: str = "m"
     quaternions: str = ""
 
@@ -66,12 +65,14 @@ def judge(motion: Motion, truth: Truth | None, accel_factor: float) -> Conventio
         return Conventions(relative=relative)
     delay = pose_delay(motion, truth)
     late_ns = 0 if delay is None else round(delay.seconds * 1e9)
-    shifted = truth._replace(t_ns=truth.t_ns - late_ns)
-    gyro, shifted, quaternions = _turns_against_poses(step, mean, motion.middle_ns, shifted)
-    if relative is None and gyro is not None and gyro.wrong and gyro.sole:
-        relative = _against_gravity(step, mean, gyro.axes)
-    accel, up, unit, other = _accel_against_poses(step, mean[:, 3:] * accel_factor, motion.middle_ns, shifted, gyro, relative)
-    return Conventions(truth.topic, gyro, accel, relative, up, delay, unit, quaternions or other)
+    shifted, force, found = truth._replace(t_ns=truth.t_ns - late_ns), mean[:, 3:] * accel_factor, []
+    for gyro, poses, what in _turns_against_poses(step, mean, motion.middle_ns, shifted):
+        carried = relative
+        if relative is None and gyro is not None and gyro.wrong and gyro.sole:
+            carried = _against_gravity(step, mean, gyro.axes)
+        accel, up, unit, other = _accel_against_poses(step, force, motion.middle_ns, poses, gyro, carried)
+        found.append(Conventions(truth.topic, gyro, accel, carried, up, delay, unit, what or other))
+    return max(found, key=lambda each: (each.up == "+z", each.accel is not None))  # of equals the first
 
 
 def _excited(rate: Float64[np.ndarray, "n 3"]) -> bool:
@@ -163,22 +164,23 @@ def _carried(
 
 def _turns_against_poses(
     step: Int64[np.ndarray, " m"], mean: Float64[np.ndarray, "m 6"], start_ns: int, truth: Truth
-) -> tuple[Reading | None, Truth, str]:
-    """Reading of the gyro against the poses, the poses, and what is wrong with their quaternions.
+) -> Sequence[tuple[Reading | None, Truth, str]]:
+    """Readings of the gyro against the poses, the poses, and what is wrong with their quaternions; the least turn first.
 
-    Misread ones leave no gyro or other axes, and otherwise fit it clearly better, turned at most; the least turn counts.
+    Misread ones leave no gyro or other axes, and otherwise fit it clearly better, turned at most. Several fit alike, up to a
+    turn of the world.
     """
     gyro = _gyro_against_poses(step, mean, start_ns, truth)
     if gyro is not None and not gyro.wrong:
-        return gyro, truth, ""
-    fitting = []
+        return [(gyro, truth, "")]
+    fitting: list[tuple[Reading, Truth, str]] = []
     for what in MISREAD:
         other = truth._replace(q_wb_wxyz=read_right(what, truth.q_wb_wxyz))
         found = _gyro_against_poses(step, mean, start_ns, other)
         if found is not None and found.sole and (gyro is None or found.misfit < CLEARLY * gyro.misfit):
             fitting.append((found, other, what))
-    turns = (each for each in fitting if np.linalg.det(each[0].axes) > 0.0)
-    return max(turns, key=lambda each: float(np.trace(each[0].axes)), default=(gyro, truth, ""))
+    fitting.sort(key=lambda each: -float(np.trace(each[0].axes)))
+    return [each for each in fitting if np.linalg.det(each[0].axes) > 0.0] or [(gyro, truth, "")]
 
 
 def _gyro_against_poses(
@@ -262,10 +264,9 @@ def _accel_against_poses(
     P, up = readings[choice.best]
     as_is = float(np.sqrt(median(np.sum((a_w + GRAVITY_M_S2 * ups[0] - quaternion.rotate(q_wb[use], f)) ** 2, axis=1))))
     alike = [readings[row] for row in np.flatnonzero(choice.alike).tolist()]
-    one_up = all((up == other).all() for _, other in alike)
     one_axes = all((other == P).all() for other, _ in alike)
     found = Reading(P, "m/s^2", choice.certain, float(choice.misfit[choice.best]), as_is) if one_axes else None
-    named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if one_up else in_mean
+    named = axis_of_gravity(GRAVITY_M_S2 * up[None]) if all((up == other).all() for _, other in alike) else in_mean
     if not straight and (gyro is None or not gyro.sole):  # without turns about two axes a proposal has no evidence
         return found if found is not None and found.as_is else None, named if named == "+z" else None, unit, ""
     return found, named, unit, ""

@@ -120,6 +120,26 @@ def test_misread_quaternions_of_a_body_that_is_turned_against_the_gyro_are_named
     assert np.median(np.abs(measured - rate)) < 0.2 * np.median(np.abs(rate))
 
 
+@pytest.mark.parametrize("up", ["+z", "+y"])
+@pytest.mark.parametrize("what", MISREAD)
+@pytest.mark.parametrize("number", [row for row, P in enumerate(PERMUTATIONS) if np.linalg.det(P) > 0][3::6])
+def test_of_readings_of_quaternions_that_are_alike_the_positions_show_the_right_one(
+    what: str, number: int, up: str, flown: tuple[Imu, Truth]
+) -> None:
+    """Inverse ones of a turned body passed for w in the place of z: the positions were turned to another world."""
+    imu, truth = flown
+    world = Rotation.from_matrix(np.eye(3) if up == "+z" else [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    q_wxyz = (world * Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True)).as_quat(scalar_first=True)
+    rows, signs = MISREAD[what]
+    misread = np.empty_like(q_wxyz)
+    misread[:, rows] = q_wxyz * signs
+    planted = Imu(imu.t_ns, imu.gyro @ PERMUTATIONS[number], imu.accel @ PERMUTATIONS[number])
+    found = judge(motion_of(planted), truth._replace(q_wb_wxyz=misread, p_wb=world.apply(truth.p_wb)), 1.0)
+    assert (found.quaternions, found.up) == (what, up)
+    assert found.gyro is not None
+    np.testing.assert_array_equal(found.gyro.axes, PERMUTATIONS[number])
+
+
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
 @pytest.mark.parametrize("step_s", [0.06, 0.5, -0.2])
 def test_a_step_of_one_clock_is_no_delay(share: float, step_s: float, flown: tuple[Imu, Truth]) -> None:

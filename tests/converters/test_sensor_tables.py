@@ -164,5 +164,7 @@ def test_oxts_of_kitti_gives_the_imu_and_an_estimate(convert, imutool, tmp_path)
 
 def test_a_second_recording_beside_the_first_does_not_take_its_place(convert, tmp_path):
     files = PHONES["phyphox"] | {"Gyroscope_2.csv": phyphox(2.0 * GYRO, "rad/s")}
-    assert convert(pack(tmp_path / "two.zip", files), tmp_path / "out.mcap").returncode == 0
+    done = convert(pack(tmp_path / "two.zip", files), tmp_path / "out.mcap")
+    assert done.returncode == 0
+    assert "Gyroscope_2.csv of further gyroscopes or recordings become numbers and no IMU" in done.stderr
     assert np.array_equal(read(tmp_path / "out.mcap").imu.gyro, GYRO)

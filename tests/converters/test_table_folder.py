@@ -321,3 +321,26 @@ def test_a_damaged_table_in_a_folder_is_told_and_a_file_of_settings_is_not(tmp_p
     assert sequence.path.name == "walk.csv"
     (told,) = caplog.messages
     assert re.match(r"left out: .*run\.npz: cannot be read", told)
+
+
+@pytest.mark.parametrize("imu", ["one table", "a table each", "beside poses"])
+def test_further_tables_of_a_recording_arrive_also_where_they_are_narrow(tmp_path, imu):
+    names = [f"gyro_{a} [rad/s]" for a in "xyz"], [f"acc_{a} [m/s^2]" for a in "xyz"]
+    if imu == "a table each":
+        for file, columns, values in zip(("Gyro", "Accel"), names, (GYRO, ACCEL), strict=True):
+            (tmp_path / f"{file}.csv").write_text(",".join(["time [s]", *columns]) + "\n" + rows(T_S, values))
+    else:
+        (tmp_path / "log.csv").write_text(",".join(["time [s]", *names[0], *names[1]]) + "\n" + rows(T_S, GYRO, ACCEL))
+    if imu == "beside poses":
+        quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (COUNT, 1))
+        (tmp_path / "gt.csv").write_text("time [s],x [m],y [m],z [m],qw,qx,qy,qz\n" + rows(T_S, 0.0 * GYRO, quaternions))
+    (tmp_path / "Barometer.csv").write_text("time [s],pressure\n" + rows(T_S[::5], T_S[::5] + 1013.0))
+    (tmp_path / "Depth.csv").write_text("time [s],depth,temperature,voltage\n" + rows(T_S, T_S, T_S, T_S))
+    (tmp_path / "README.txt").write_text("Sensor 1\n2 walks\nof 3 4 people\n")
+    (sequence,) = table.sequences(tmp_path)
+    log = table.read_sequence(sequence)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    np.testing.assert_allclose(log.scalars["/Barometer_pressure"].values[:, 0], T_S[::5] + 1013.0, rtol=1e-6)
+    assert len(log.scalars["/Depth_depth"].t_ns) == COUNT
+    assert [*log.poses] == (["/ground_truth/pose"] if imu == "beside poses" else [])
+    assert log.remarks.losses == []

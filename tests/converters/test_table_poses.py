@@ -15,7 +15,7 @@ import zstandard
 from scipy.spatial.transform import Rotation
 
 from imutool.converters import table
-from imutool.errors import DataError
+from imutool.errors import ConfigError, DataError
 from imutool.recording.message_log import MessageLog
 
 COUNT = 1500
@@ -114,6 +114,117 @@ def test_the_imu_keeps_its_own_clock_beside_a_truth_of_as_many_rows(tmp_path):
     log = read(tmp_path)
     assert log.imus["/imu0"].t_ns[0] == EPOCH_S * 10**9
     assert log.poses["/ground_truth/pose"].t_ns[0] == (EPOCH_S + 3) * 10**9
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 50.0])  # at the first it has as many rows as the IMU
+@pytest.mark.parametrize("size", [1.0, 1e3])  # s or ms
+def test_a_truth_that_begins_at_zero_keeps_its_clock_beside_an_imu_of_this_century(tmp_path, rate_hz, size):
+    (tmp_path / "imu.csv").write_text(imu_text(EPOCH_S))
+    step = round(100.0 / rate_hz)
+    true = rows(size * (T_S[::step] + 0.1), P_M[::step], XYZW[::step])
+    (tmp_path / "gt.csv").write_text("time,px,py,pz,qx,qy,qz,qw\n" + true)
+    log = read(tmp_path)
+    assert log.imus["/imu0"].t_ns[0] == EPOCH_S * 10**9
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].t_ns, 1e9 * (T_S[::step] + 0.1), atol=1e3)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.7])
+def test_numbered_matrices_of_a_motion_about_one_axis_are_asked(tmp_path, late_s):
+    """They turn as the gyro does row by row and column by column."""
+    yaw = Rotation.from_euler("z", 3.0 * ANGLES[:, :1])
+    gyro = np.vstack([(yaw[:-1].inv() * yaw[1:]).as_rotvec() * 100.0, np.zeros(3)])
+    header = "Time,Position X,Position Y,Position Z," + ",".join(f"Rotation[{n}]" for n in range(9)) + "\n"
+    tilted = Rotation.from_euler("x", 1.2) * yaw * Rotation.from_euler("y", 0.5)  # the body is turned against the gyro
+    (tmp_path / "gt.csv").write_text(header + rows(T_S + late_s, P_M, tilted.as_matrix().reshape(-1, 9)))
+    (tmp_path / "imu.csv").write_text(IMU_HEADER + rows(1e9 * T_S, gyro, 0.0 * gyro + [0.0, 0.0, 9.8]))
+    log = read(tmp_path)
+    assert log.poses == {}
+    assert any("or so do their transposes; `rotation_matrix` of a map" in note for note in log.remarks.notes)
+
+
+def sensor_tables(folder: Path, names: tuple[str, str], epoch_s: int = 0) -> None:
+    """A table of the gyroscope and one of the accelerometer."""
+    for name, unit, values in zip(names, ("rad/s", "m/s^2"), (GYRO, ACCEL), strict=True):
+        lines = rows(values).splitlines()
+        at_ns = (epoch_s * 10**9 + n * 10_000_000 for n in range(COUNT))
+        text = "".join(f"{t},{line}\n" for t, line in zip(at_ns, lines, strict=True))
+        (folder / f"{name}.csv").write_text(f"time_ns,x [{unit}],y [{unit}],z [{unit}]\n" + text)
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_an_export_of_a_motion_capture_beside_tables_of_a_sensor_each_is_their_truth(tmp_path, name):
+    sensor_tables(tmp_path, ("gyroscope_3", "accelerometer_1"), EPOCH_S)
+    (tmp_path / name).write_text(EXPORTS[name])
+    log = read(tmp_path)
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    assert log.poses["/ground_truth/pose"].t_ns[-1] < 1e12  # on its own clock, for `--fix`
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, rtol=1e-8)
+
+
+def test_files_that_are_numbered_in_turn_are_the_imus_whose_names_they_share(tmp_path):
+    sensor_tables(tmp_path, ("gyroscope_3", "accelerometer_1"), EPOCH_S)
+    sensor_tables(tmp_path, ("second_gyroscope_21", "second_accelerometer_20"), EPOCH_S)
+    sensor_tables(tmp_path, ("gyroscope_uncalibrated_4", "accelerometer_uncalibrated_2"), EPOCH_S)
+    slow = np.arange(20) * 9_000 + 802_485_584  # ms since a boot: at a plausible rate they would be us
+    (tmp_path / "location_8.csv").write_text("time,lat,lon,height\n" + "".join(f"{t},1.5,2.5,{t % 7}\n" for t in slow))
+    (tmp_path / "sensors.csv").write_text("number,type,version,delay\n1,2,3,4\n2,3,4,5\n")
+    log = read(tmp_path)
+    assert {*log.imus} == {"/imu/imu", "/second/imu"}
+    assert not [topic for topic in log.scalars if "location" in topic]
+    assert any(
+        "without a time on its clock, are left out: " in loss and "location_8/lat" in loss for loss in log.remarks.losses
+    )
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("rows_first", [True, False])
+@pytest.mark.parametrize("late_s", [0.0, 0.7])
+def test_nine_numbered_columns_are_matrices_in_the_order_in_which_they_turn(tmp_path, first, rows_first, late_s):
+    nine = (MATRICES if rows_first else MATRICES.transpose(0, 2, 1)).reshape(-1, 9)
+    header = "Time,Position X,Position Y,Position Z," + ",".join(f"Rotation[{n + first}]" for n in range(9)) + "\n"
+    (tmp_path / "gt.csv").write_text(header + rows(T_S + late_s, P_M, nine))
+    (tmp_path / "imu.csv").write_text(imu_text())
+    poses = read(tmp_path).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)
+    np.testing.assert_allclose(poses.p_wb, P_M, atol=1e-8)
+
+
+@pytest.mark.parametrize("rotation", ["R_wb", "C_nb", "q_wb", "q_wb_wxyz"])
+def test_rotations_and_positions_may_name_their_frames(tmp_path, rotation):
+    values = MATRICES if rotation[0] in "RC" else TURN.as_quat(scalar_first=rotation.endswith("wxyz"))
+    np.savez(tmp_path / "run.npz", t=T_S, gyro=GYRO, accel=ACCEL, p_wb=P_M, **{rotation: values})
+    log = read(tmp_path / "run.npz")
+    poses = log.poses["/estimate/pose"]
+    np.testing.assert_allclose(Rotation.from_quat(poses.q_wb_wxyz, scalar_first=True).as_matrix(), MATRICES, atol=1e-6)
+    np.testing.assert_allclose(poses.p_wb, P_M)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+
+
+def test_a_map_that_names_rotations_alone_takes_the_time_beside_them(tmp_path):
+    names = [f"u{n}" for n in range(4)]
+    (tmp_path / "gt.csv").write_text("time,x,y,z," + ",".join(names) + "\n" + rows(T_S[::2], P_M[::2], XYZW[::2]))
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / "uwb.csv").write_text("time,x,y,z\n" + rows(T_S[::5], P_M[::5]))
+    (sequence,) = table.sequences(tmp_path)
+    stated = {"quaternion_wxyz": [names[3], *names[:3]], "position": ["x", "y", "z"]}  # those of the truth
+    poses = table.read_sequence(sequence, mapping=stated).poses["/ground_truth/pose"]
+    np.testing.assert_allclose(poses.t_ns, 1e9 * T_S[::2], atol=1.0)
+    np.testing.assert_allclose(poses.p_wb, P_M[::2], atol=1e-8)
+
+
+def test_a_map_may_name_rotations_where_the_unit_of_the_gyro_is_open(tmp_path):
+    bumpy = np.random.default_rng(1).normal(size=ACCEL.shape) * 3.0 + [0.0, 0.0, 9.8]  # gravity does not turn in it
+    (tmp_path / "gt.csv").write_text("t,u0,u1,u2,u3\n" + rows(T_S, XYZW))
+    path = tmp_path / "imu.csv"
+    path.write_text("time,gx,gy,gz,ax,ay,az,u0,u1,u2,u3\n" + rows(T_S, np.rad2deg(GYRO), bumpy, XYZW))
+    (sequence,) = table.sequences(path)
+    log = table.read_sequence(sequence, mapping={"quaternion_wxyz": ["u3", "u0", "u1", "u2"]})
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO, atol=1e-8)
+    with pytest.raises(ConfigError, match="no column 'u4'"):
+        table.read_sequence(sequence, mapping={"quaternion_wxyz": ["u4", "u0", "u1", "u2"]})
+    elsewhere = {"quaternion_wxyz": ["w", "x", "y", "z"], "truth_file": "gt.csv"}
+    with pytest.raises(ConfigError, match="state no unit of the gyro"):
+        table.read_sequence(sequence, mapping=elsewhere)
 
 
 def test_the_biases_beside_a_true_state_are_no_imu(tmp_path):

@@ -322,3 +322,42 @@ def test_the_accelerometer_of_a_body_that_swings_shows_its_unit_by_its_steady_pa
     log = read(write_csv(tmp_path / "wand.csv", names, [T_S, *(size * accel).T, *gyro.T]))
     np.testing.assert_allclose(log.imus["/imu0"].accel, accel, rtol=1e-9)
     assert any(note.endswith(f"gravity in {unit}") and "steady part" in note for note in log.remarks.notes)
+
+
+EPOCH_NS = 1_700_000_000_123_456_789  # no float64 holds it exactly
+
+
+@pytest.mark.parametrize("stamp", ["seconds", "two columns"])
+def test_a_table_of_several_sensors_with_a_time_each_keeps_every_row(tmp_path, stamp):
+    """As pandas writes an outer join: a row holds one sensor, and the columns of the others are blank."""
+    imu = [f"angular_velocity_{a}" for a in "xyz"] + [f"linear_acceleration_{a}" for a in "xyz"]
+    poses = [*(f"p{a}" for a in "xyz"), *(f"q{a}" for a in "wxyz")]
+    names = {"imu": imu, "gps": ["lat", "lon"], "vicon": poses}
+    values = {"imu": np.hstack([GYRO, ACCEL]), "gps": P[:, :2], "vicon": np.hstack([P, Q_WXYZ])}
+    stamps = {of: EPOCH_NS + NEXT_NS * np.arange(0, COUNT, step) for of, step in (("imu", 1), ("gps", 50), ("vicon", 4))}
+    header, rows = ["row"], []
+    for of, columns in names.items():
+        header += ([f"time_{of}"] if stamp == "seconds" else [f"sec_{of}", f"nanosec_{of}"]) + columns
+    for of, step in (("imu", 1), ("gps", 50), ("vicon", 4)):
+        for t, row in zip(stamps[of].tolist(), values[of][::step].tolist(), strict=True):
+            at = f"{t // 10**9}.{t % 10**9:09}" if stamp == "seconds" else f"{t // 10**9}.0,{t % 10**9}.0"
+            blank = {o: "," * (len(names[o]) + (stamp != "seconds")) for o in names}
+            rows.append((t, ",".join(blank[o] if o != of else ",".join([at, *map(repr, row)]) for o in names)))
+    text = "".join(f"{number},{row}\n" for number, (_, row) in enumerate(sorted(rows)))
+    (tmp_path / "all.csv").write_text(",".join(header) + "\n" + text)
+    log = read(tmp_path / "all.csv")
+    assert np.array_equal(log.imus["/imu0"].t_ns, stamps["imu"])
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    assert np.array_equal(log.scalars["/gps_lat"].t_ns, stamps["gps"])
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    assert np.array_equal(log.poses["/ground_truth/pose"].t_ns, stamps["vicon"])
+    assert log.remarks.losses == []
+
+
+def test_a_time_that_stands_in_some_rows_of_an_imu_loses_none_of_them(tmp_path):
+    """The rows of the IMU have no time; those of the receiver in between have one."""
+    names = ["time_gps", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    rows = [f"{n if n % 5 == 0 else ''},{','.join(map(repr, row))}" for n, row in enumerate(np.hstack([GYRO, ACCEL]).tolist())]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+    with pytest.raises(ConfigError, match="no column that rises looks like a time"):
+        read(tmp_path / "log.csv")

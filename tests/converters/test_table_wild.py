@@ -131,6 +131,8 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"Gyroscope {a} (deg/sec)" for a in "XYZ"], [f"Accelerometer {a} (m/s/s)" for a in "XYZ"]),
         ([f"gyro{a} (deg.s^-1)" for a in "XYZ"], [f"accel{a} (m.s^-2)" for a in "XYZ"]),  # SBG
         ([f"{a}Rate (deg/s)" for a in "xyz"], [f"{a}Accel (m/s2)" for a in "xyz"]),  # Aceinna
+        ([f"gyro_raw_{a} [deg/s]" for a in "xyz"], [f"acc_raw_{a}" for a in "xyz"]),
+        ([f"ang_vel_uncal_{a}[deg/s]" for a in "xyz"], [f"acc_uncal_{a}[m/s^2]" for a in "xyz"]),
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
@@ -340,3 +342,76 @@ def test_tables_of_a_folder_may_name_their_sensor_in_each_row(tmp_path):
 def test_long_lines_are_no_rows_that_name_their_numbers(text):
     """The search for labels costs the square of their length: it would take hours."""
     assert as_table(text) == ("", 0)
+
+
+def test_numbers_in_a_header_between_tabs_are_no_fields(tmp_path):
+    """Blanks split `Distance 1` into a word and a number, and the header into a row of numbers."""
+    names = [*NAMES, *(f"Distance {n}" for n in range(1, 9))]
+    path = write_csv(tmp_path / "imu.csv", names, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T, *([T_S] * 8)], mark="\t")
+    log = read(path)
+    assert "/Distance_8" in log.scalars
+    assert log.remarks.losses == []
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accels"),
+    [
+        ("{}.Gyroscope {} [deg/s]", ["{}.Wide Range Accelerometer {} [m/s^2]"]),
+        ("{}_gyr_{} [deg/s]", ["{}_lin_acc_{} [m/s^2]", "{}_acc_{} [m/s^2]"]),
+        ("{}_AngVel_{} [deg/s]", ["{}_LinAcc_{} [m/s^2]"]),
+    ],
+)
+def test_accelerations_with_further_words_are_of_the_imu_whose_name_theirs_begin_with(tmp_path, gyro, accels):
+    owners, forms = ("leg", "leg_left"), (gyro, *accels)
+    names = ["t [s]", *(form.format(owner, axis) for owner in owners for form in forms for axis in "xyz")]
+    force = np.array([0.0, 0.0, 9.8]) + np.random.default_rng(3).normal(size=(400, 3))
+    of = {
+        owner: [factor * force, *([0.1 * force] * (len(accels) - 1)), force + factor] for factor, owner in enumerate(owners, 1)
+    }
+    path = write_csv(
+        tmp_path / "gait.csv", names, [np.arange(400) / 100.0, *(v for o in owners for part in of[o] for v in part.T)]
+    )
+    log = table.read_sequence(table.sequences(path)[0])
+    assert {*log.imus} == {"/leg/imu", "/leg_left/imu"}
+    for owner in owners:
+        np.testing.assert_allclose(log.imus[f"/{owner}/imu"].gyro, np.deg2rad(of[owner][0]))
+        np.testing.assert_allclose(log.imus[f"/{owner}/imu"].accel, of[owner][-1])
+
+
+def test_parameters_of_a_sensor_are_no_sensor_and_a_time_of_other_length_is_named(tmp_path):
+    force = np.array([0.0, 0.0, 9.8]) + np.random.default_rng(3).normal(size=(400, 3))
+    arrays = {"gyro": 0.1 * force, "accel": force, "C_gyro": np.eye(3), "C_accel": np.eye(3)}
+    np.savez(tmp_path / "run.npz", t=np.arange(400) / 100.0, **arrays)
+    (sequence,) = table.sequences(tmp_path / "run.npz")
+    log = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
+    np.testing.assert_allclose(log.imus["/imu0"].accel, force)
+    assert "C_gyro[0]" in log.metadata["imutool/constants"]
+    np.savez(tmp_path / "run.npz", t=np.arange(399) / 100.0, **arrays)
+    with pytest.raises(ConfigError, match="'t' rises and has 399 rows, and the gyro 400"):
+        table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"})
+
+
+def test_readings_in_several_states_are_asked_unless_one_has_none(tmp_path):
+    """Raw and calibrated readings of one sensor, `acc_x_raw` and `acc_x_cal`, are two triples."""
+    forces = {"": 9.8 * ACCEL_G, "_raw": 9.8 * ACCEL_G + 0.2, "_cal": 9.8 * ACCEL_G - 0.1}
+    for states in (("", "_raw"), ("_raw", "_cal")):
+        names = ["t", *(f"acc_{a}{state}" for state in states for a in "xyz"), *(f"g{a}" for a in "xyz")]
+        columns = [T_S, *(axis for state in states for axis in forces[state].T), *(COUNTS * 0.07).round(2).T]
+        path = write_csv(tmp_path / "imu.csv", names, columns)
+        if "" in states:
+            np.testing.assert_allclose(read(path).imus["/imu0"].accel, forces[""])
+        else:
+            with pytest.raises(ConfigError, match="2 triples of columns look like the accel: acc_x_raw/y/z, acc_x_cal/y/z"):
+                read(path)
+
+
+def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path):
+    names = ["time (ms)", *(f"gyroscope {a} (0.1 deg/s)" for a in "xyz"), *(f"accelerometer {a} (1e-3 g)" for a in "xyz")]
+    path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *(1e3 * ACCEL_G).T])
+    log = read(path)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(COUNTS * 0.1))
+    np.testing.assert_allclose(log.imus["/imu0"].accel, 9.80665 * ACCEL_G)
+    assert any("gyroscope x (0.1 deg/s) by 0.1 to deg/s" in note for note in log.remarks.notes)
+    names = [name.replace("0.1 deg/s", "deg/s").replace("1e-3 g", "16 g") for name in names]
+    path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *ACCEL_G.T])
+    np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G)

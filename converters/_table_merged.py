@@ -1,0 +1,91 @@
+"""Stamps in two columns, and tables of several sensors with times of their own."""
+
+from __future__ import annotations
+
+import re
+from itertools import product
+
+import numpy as np
+
+from ._table_names import TIME_WORDS, name_and_unit
+from ._table_text import Columns
+from ._table_times import goes_on
+
+LAST_S = 9_223_372_036  # in the year 2262, where nanoseconds in 64 bits end
+SECONDS = re.compile(r"(.*?)(?:secs?|seconds?|(?:unix|utc|posix)[ _]?time)(_\w+)?", re.IGNORECASE)
+BELOW_SECONDS = {  # names of the rest of a second in a column of its own, and its unit in ns
+    re.compile(r"n(ano)?s(ec(ond)?s?)?", re.IGNORECASE): 1,
+    re.compile(r"(u|micro)s(ec(ond)?s?)?", re.IGNORECASE): 1000,
+}
+TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu_time, time_gps
+
+
+def join_stamps(columns: Columns) -> None:
+    """Make one column of a stamp in two, seconds and the rest, as ROS' header.stamp has."""
+    for seconds in [column for column in columns.values if SECONDS.fullmatch(column)]:
+        stem, end = SECONDS.fullmatch(seconds).groups("")  # type: ignore[union-attr]  # it matched
+        ends = product((c for c in columns.values if c.startswith(stem) and c.endswith(end)), BELOW_SECONDS.items())
+        found = ((c, size) for c, (name, size) in ends if name.fullmatch(c[len(stem) : len(c) - len(end)]))
+        rest, size = next(found, ("", 1))
+        name = f"{stem.rstrip('._/ ') or 'stamp'}{end} [ns]"
+        if name in columns.values or not rest or not (_is_whole(columns, seconds) and _is_whole(columns, rest)):
+            continue
+        sec, below = columns.values[seconds], columns.values[rest]
+        known = np.isfinite(sec.astype(float))
+        if len(sec) != len(below) or not np.array_equal(known, np.isfinite(below.astype(float))) or not known.any():
+            continue
+        sec, below = sec[known].astype(np.int64), below[known].astype(np.int64)
+        if not (0 <= sec.min() <= sec.max() < LAST_S and 0 <= below.min() <= below.max() < 10**9 // size):
+            continue
+        t_ns = sec * 10**9 + below * size
+        for column in (seconds, rest):
+            del columns.values[column]
+            columns.texts.pop(column, None)
+        columns.values[name], columns.units[name] = t_ns, "ns"
+        if not known.all():  # float64 rounds nanoseconds since 1970: the texts do not
+            columns.values[name], texts = np.full(len(known), np.nan), [""] * len(known)
+            columns.values[name][known] = t_ns
+            for row, t in zip(np.flatnonzero(known).tolist(), t_ns.tolist(), strict=True):
+                texts[row] = str(t)
+            columns.texts[name] = texts
+
+
+def _is_whole(columns: Columns, column: str) -> bool:
+    """Whether a column holds whole numbers; some may be missing."""
+    values = columns.values[column]
+    return values.dtype.kind in "iu" or bool((np.mod(values[np.isfinite(values)], 1.0) == 0.0).all())
+
+
+def sort_by_clock(columns: Columns) -> None:
+    """Give each sensor of a table its rows, where its time is blank in those of the others.
+
+    The columns of `time_gps` become `gps/time`, `gps/lat`, ...; a column of several sensors is in each of their groups. A table
+    with a time in every row, or with values in rows without any, stays as it is.
+    """
+    known = {column: np.isfinite(values.astype(float)) for column, values in columns.values.items()}
+    named = {c: match for c in known if (match := re.fullmatch(TIME_OF, name_and_unit(c, "")[0] or "time"))}
+    clocks = {c: known[c] for c in named if known[c].any() and goes_on(columns.values[c][known[c]])}
+    if len({len(rows) for rows in known.values()}) != 1 or not clocks or any(rows.all() for rows in clocks.values()):
+        return
+    timed = np.any([*clocks.values()], axis=0)
+    if any((rows & ~timed).any() for rows in known.values()):
+        return
+    groups = {c: named[c]["before"] or named[c]["behind"] or c for c in clocks}
+    apart = Columns()
+    for column in [c for c in known if c not in clocks and known[c].any()]:
+        holders = [clock for clock, rows in clocks.items() if not (known[column] & ~rows).any()]
+        smallest = [min(holders, key=lambda clock: clocks[clock].sum())] if holders else [*clocks]
+        for clock in smallest:
+            _take_rows(columns, column, clocks[clock], apart, f"{groups[clock]}/{column}")
+    for clock, rows in clocks.items():
+        _take_rows(columns, clock, rows, apart, f"{groups[clock]}/time")
+        apart.units[f"{groups[clock]}/time"] = columns.units.get(clock) or name_and_unit(clock, "")[1]
+    columns.remarks.notes.append(f"each of {', '.join(clocks)} is the time of the rows in which it stands")
+    columns.values, columns.units, columns.texts = apart.values, apart.units, apart.texts
+
+
+def _take_rows(columns: Columns, column: str, rows: np.ndarray, into: Columns, name: str) -> None:
+    """Put some rows of a column into other columns."""
+    into.values[name], into.units[name] = columns.values[column][rows], columns.units.get(column, "")
+    if column in columns.texts:
+        into.texts[name] = [columns.texts[column][row] for row in np.flatnonzero(rows).tolist()]
