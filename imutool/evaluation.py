@@ -104,7 +104,7 @@ def _evaluated(
         recording = replace(recording, truths={next(iter(recording.truths)): orientations})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
-        found, std = _corrected(recording.imu, model, start)
+        found, std = _corrected(recording.imu, model, start, with_std=aids is not None)
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid, model, start, recording.imu)
@@ -165,12 +165,12 @@ def _over(imu: Imu, true: Poses) -> Imu:
 
 
 def _corrected(
-    imu: Imu, model: BiasModel | None, start: InitialBias | None
+    imu: Imu, model: BiasModel | None, start: InitialBias | None, *, with_std: bool = False
 ) -> tuple[DebiasedImu, Float64[np.ndarray, "n 6"] | None]:
-    """Samples corrected by a model, with the deviation of its bias; without one as they are."""
+    """Samples corrected by a model, on request with the deviation of its bias; without one as they are."""
     if model is None or start is None:
         return DebiasedImu(imu, np.zeros((len(imu), 6))), None
-    return apply_with_std(model, start, imu)
+    return apply_with_std(model, start, imu) if with_std else (apply(model, start, imu), None)
 
 
 def runs(
