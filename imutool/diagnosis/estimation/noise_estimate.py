@@ -130,13 +130,22 @@ def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"
 
 
 def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
-    """Whether a line beside a simulation is coloured noise, which an autoregression smooths."""
-    exact, chance = [log for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
+    """Whether a line beside a simulation is coloured noise, which an autoregression smooths, or wanders, as no line does."""
+    exact, chance = [log.pair for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
     if effect.name != vibration.EFFECT.name or len(exact) < len(found.logs):
         return False
     others = tuple(entry for entry in found.chosen if entry[0] is not effect)
-    without = ((log.pair.real - expected(log.pair, others), 1.0 / log.pair.period_s) for log in exact)
-    return all(vibration.line_p_value(residual, rate_hz, theta[0]) > chance for residual, rate_hz in without)
+    without = [expected(pair, others) for pair in exact]
+    p_values = (
+        vibration.line_p_value(pair.real - model, 1.0 / pair.period_s, theta[0])
+        for pair, model in zip(exact, without, strict=True)
+    )
+    if all(p_value > chance for p_value in p_values):
+        return True
+    waves = ((*others, (effect, turned)) for turned in (theta, vibration.quarter_turn(theta)))
+    lines = [[expected(pair, acting) - model for pair, model in zip(exact, without, strict=True)] for acting in waves]
+    readings = [pair.real - model for pair, model in zip(exact, without, strict=True)]
+    return all(vibration.wanders(*each) for each in zip(readings, *lines, strict=True))
 
 
 def axis_squares(found: Fit) -> Axes:

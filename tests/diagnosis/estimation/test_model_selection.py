@@ -208,6 +208,17 @@ def test_noise_that_a_filter_has_coloured_is_no_vibration_and_a_line_on_it_is_on
     assert names(found) == (["vibration"] if line_m_s2 else [])
 
 
+@pytest.mark.parametrize("turns", [0.0, 0.05], ids=["steady", "turning"])
+def test_a_line_that_turns_its_phase_is_no_vibration(turns: float) -> None:
+    """As of a motor, whose speed is never quite constant."""
+    felt = planted.rich(duration_s=60.0)
+    phase = turns * np.cumsum(np.random.default_rng(4).normal(size=len(felt.t_s)))
+    line = np.sin(2.0 * np.pi * 31.0 * felt.t_s + phase)[:, None] * [0.0, 0.0, 0.0, 0.1, 0.1, 0.4]
+    pair = planted.pair(felt, seed=52, added=line)
+    found = select_effects([whitened(pair, (), pair.settings.band)], catalogue.diagnosed(["vibration"]))
+    assert names(found) == ([] if turns else ["vibration"])
+
+
 # ── log_p_value ──
 
 
