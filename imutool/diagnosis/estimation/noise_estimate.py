@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import csd, welch
+from scipy.signal import butter, csd, sosfiltfilt, welch
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import Pair
@@ -27,6 +27,7 @@ from imutool.sensor.effects import vibration
 
 RIDGE = 1e-8
 LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
+ALL_SLOW, SLOW_ORDER = 0.9, 4  # of the frequencies, from which on nothing is fast; order of the filter
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 OnAxis = tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q _"]]  # parameters that act on an axis, and their derivatives
@@ -130,7 +131,7 @@ def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"
 
 
 def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
-    """Whether a line beside a simulation is coloured noise, which an autoregression smooths, or wanders, as no line does."""
+    """Whether a line beside a simulation is noise that an autoregression smooths, or wanders."""
     exact, chance = [log.pair for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
     if effect.name != vibration.EFFECT.name or len(exact) < len(found.logs):
         return False
@@ -152,6 +153,25 @@ def axis_squares(found: Fit) -> Axes:
     """Squares of white residuals by axis."""
     each = zip(found.logs, found.residuals, found.bias, strict=True)
     return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
+
+
+def leaves_slow_motion(found: Fit, sensor: str, gain: float) -> bool:
+    """Whether a fit leaves much of a misfit on a sensor, by what an effect on it gains, where a body moves."""
+    part, settings = found.logs[0].pair.signals[sensor], found.logs[0].pair.settings.search
+    return float(_slow_squares(found)[part].sum()) > settings.hysteresis_leaves * gain
+
+
+def _slow_squares(found: Fit) -> Axes:
+    """Squares of white residuals above noise by axis, below the frequency `motion_hz` up to which a body moves."""
+    total = np.zeros(found.logs[0].pair.columns)
+    for log, r, b in zip(found.logs, found.residuals, found.bias, strict=True):
+        settings, residual = log.pair.settings, r - log.constants * b
+        slow = 2.0 * settings.noise.motion_hz * log.pair.period_s * log.whiten.every  # share of the frequencies
+        if slow < ALL_SLOW:
+            residual = sosfiltfilt(butter(SLOW_ORDER, slow, output="sos"), residual, axis=0)
+        rows = residual[log.rows(found.part)]
+        total += np.maximum((rows**2).sum(axis=0) - settings.search.white_chi_square * min(slow, 1.0) * len(rows), 0.0)
+    return total
 
 
 def kurtosis(found: Fit) -> Axes:

@@ -41,7 +41,7 @@ Vector = Float64[np.ndarray, "3"]
 
 
 def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], tuple[Located, ...]]:
-    """Intervals of a wrong reference, as a finding and locations; of shocks the locations alone, none of another misfit."""
+    """Intervals of a wrong reference, as a finding and locations; of shocks their locations."""
     if len(logs) != 1:
         return [], ()
     (log,), block_s, p_value = logs, settings.block_s, settings.p_value
@@ -66,8 +66,7 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
     at = t_s[0] + block_s * np.arange(len(count))
     both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
     few = len(runs) <= settings.most_intervals and inside.mean() <= settings.most_of_time
-    quiet = runs and (outside**2).mean() <= settings.quiet_chi_square
-    if not quiet or not both or not few:
+    if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
         return [], ()
     excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
     share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))

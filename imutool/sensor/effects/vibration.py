@@ -78,10 +78,10 @@ def quarter_turn(theta: Theta) -> Theta:
 
 
 def wanders(samples: Float64[np.ndarray, "n k"], line: Float64[np.ndarray, "n k"], quarter: Float64[np.ndarray, "n k"]) -> bool:
-    """Whether samples have a line, known with its quarter turn, in some eighths of a log alone, or with another phase in each.
+    """Whether a line is in some eighths of a log alone, or has another phase in each.
 
-    By its amplitude and phase in each eighth, all columns together: those of a steady line scatter by noise, which is far less
-    than their mean. A shock rings in few of them, and steps or a motor turn the phase.
+    By the amplitude and phase that samples have of it, and of its `quarter` turn, all columns together: those of a steady line
+    scatter by noise, which is far less than their mean. A shock rings in few eighths, and steps or a motor turn the phase.
     """
     weight, centred = 1.0 / white_noise(samples) ** 2, samples - samples.mean(axis=0)
     real, imaginary, size = ((x * y) @ weight for x, y in ((centred, line), (centred, quarter), (line, line)))
