@@ -156,7 +156,7 @@ def axis_squares(found: Fit) -> Axes:
 
 
 def leaves_slow_motion(found: Fit, sensor: str, gain: float) -> bool:
-    """Whether a fit leaves much of a misfit on a sensor, by what an effect on it gains, where a body moves."""
+    """Whether a fit leaves much of what an effect gains, on its sensor and where a body moves."""
     part, settings = found.logs[0].pair.signals[sensor], found.logs[0].pair.settings.search
     return float(_slow_squares(found)[part].sum()) > settings.hysteresis_leaves * gain
 

@@ -47,7 +47,7 @@ def align_all(
     """
     pairs: list[Pair] = []
     refused: list[ImutoolError] = []
-    remarks: list[str] = []
+    remarks = _held(sim, "the physics step is longer than the sample period") if sim is not None else []
     for recording in recordings:
         try:
             aligned = list(align(recording, sim, truth, settings))
@@ -57,9 +57,7 @@ def align_all(
             refused.append(error.at(recording.name))
             continue
         pairs += [without_unusable(pair, settings.reference) for pair in aligned]
-        if held := len(recording.imu) - len(new_samples(recording).imu):
-            what = f"{held} samples repeat gyro or accel of the one before, and do not count"
-            remarks.append(f"{recording.name}: {what}: the topic is faster than its sensor")
+        remarks += _held(recording, "the topic is faster than its sensor")
         remarks += batch_remark(recording)
         if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
             remarks.append(f"{recording.name}: {again} samples repeat the one before on every axis, and do not count")
@@ -73,6 +71,12 @@ def align_all(
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]
     return pairs, remarks + [f"left out, {error}" if pairs else str(error) for error in refused]
+
+
+def _held(recording: Recording, why: str) -> list[str]:
+    """Remark on samples that repeat the one before, as a simulator or a driver holds them."""
+    held = len(recording.imu) - len(new_samples(recording).imu)
+    return [f"{recording.name}: {held} samples repeat gyro or accel of the one before, and do not count: {why}"] if held else []
 
 
 def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -> tuple[tuple[Effect, ...], Chosen]:
@@ -131,6 +135,7 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """Intervals of the recording that the simulation or its own poses cover without a hole."""
     real, batched_s = on_own_clock(new_samples(real))
+    sim = None if sim is None else new_samples(sim)
     for pair in _aligned(real, sim, truth, settings):
         yield replace(pair, batched_s=batched_s)
 

@@ -11,6 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.reference.coverage import align, align_all
 from imutool.diagnosis.reference.taken_samples import batched, new_samples, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
@@ -21,6 +22,7 @@ from imutool.sensor.made_up_flight import flight
 from imutool.sensor.simulate import TRUTH_TOPIC, simulated
 
 DURATION_S, RATE_HZ = 40.0, 100.0
+HELD_LEAVES = 1.1  # of what the whole simulation leaves: its noise is filtered out of half of the samples
 MEASURED, EXACT = 1e-4, 0.0  # rad and m of a pose
 
 
@@ -129,6 +131,20 @@ def test_a_topic_that_is_faster_than_its_sensor_is_read_at_the_rate_of_the_senso
     stuck = imu.gyro.copy()
     stuck[1000:] = stuck[999]
     assert len(new_samples(replace(real, imu=replace(imu, gyro=stuck))).imu) == len(imu)
+
+
+def test_a_simulation_that_holds_its_samples_is_read_where_its_physics_steps() -> None:
+    """A simulation that is held for two samples is late by half of one, which looked like a clock and a mount."""
+    real = made(EXACT)
+    sim, recorded = along(real), replace(real, imu=along(real, 1).imu)
+    last = np.arange(len(sim.imu)) // 2 * 2
+    held = replace(sim, imu=replace(sim.imu, gyro=sim.imu.gyro[last], accel=sim.imu.accel[last]), truths={})
+    (pair,), remarks = align_all([recorded], held, None, DiagnoseSettings())
+    (whole,), none = align_all([recorded], replace(sim, truths={}), None, DiagnoseSettings())
+    assert none == []
+    assert f"{np.count_nonzero(last != np.arange(len(last)))} samples repeat gyro or accel of the one before" in remarks[0]
+    left, least = ((one.real - expected(one, ()))[100:-100].std(axis=0) for one in (pair, whole))
+    assert (left < HELD_LEAVES * least).all()
 
 
 @pytest.mark.parametrize("with_simulation", [True, False])

@@ -103,10 +103,10 @@ def with_form_of_resonance(logs: Sequence[WhitenedLog], now: Fit, named: Sequenc
 
 
 def with_delay_of_accel(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with a delay of the accelerometer for a low-pass or a hysteresis of it that is clearly worse (BIC).
+    """Fit with a delay of the accelerometer for a clearly worse filter of it (BIC).
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
-    that the search finds the filter of this lag, or of slow motion a hysteresis.
+    that the search finds the low-pass of this lag, or of slow motion a hysteresis.
     """
     both = [of for name in ("clock_offset", "gyro_delay") for of in named if of.name == name and of.key not in now.keys]
     for k, (effect, theta) in enumerate(now.chosen):
