@@ -15,7 +15,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation
 from imutool.diagnosis.reference.own_poses import align_with_poses, band_hz
-from imutool.diagnosis.reference.taken_samples import batch_remark, new_samples, on_own_clock, repeats
+from imutool.diagnosis.reference.taken_samples import batch_remark, filled, new_samples, on_own_clock, repeats
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
@@ -61,6 +61,9 @@ def align_all(
         remarks += batch_remark(recording)
         if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
             remarks.append(f"{recording.name}: {again} samples repeat the one before on every axis, and do not count")
+        if straight := sum(int(filled(pair.stamp_s, pair.real).sum()) for pair in aligned):
+            where = "lie on a straight line between their neighbours on every axis, as where a gap was filled"
+            remarks.append(f"{recording.name}: {straight} samples {where}, and do not count")
         covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
         if covered < settings.reference.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
@@ -184,14 +187,13 @@ def own_poses_sentence(pairs: Sequence[Pair]) -> str:
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
-    """Pair without clipped and repeated samples, and axes stuck or nearly always clipped.
+    """Pair without clipped, repeated and filled samples, and axes stuck or nearly always clipped.
 
     Raises:
         DataError: no axis is left.
     """
-    known = ~(
-        timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real) | repeats(pair.real)[:, None]
-    )
+    whole_rows = (repeats(pair.real) | filled(pair.stamp_s, pair.real))[:, None]
+    known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real) | whole_rows)
     known &= True if pair.known is None else pair.known
     if known.all():
         return pair

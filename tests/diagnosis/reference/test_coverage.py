@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from imutool.diagnosis.diagnose import diagnose
 from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.reference.coverage import align, align_all
-from imutool.diagnosis.reference.taken_samples import batched, new_samples, repeats
+from imutool.diagnosis.reference.taken_samples import batched, filled, new_samples, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
@@ -184,3 +184,25 @@ def test_a_sample_that_repeats_the_one_before_does_not_count() -> None:
     assert f"{len(again)} samples repeat the one before" in remark
     for digit in (0.5, 50.0):
         assert not repeats(np.round(pair.real / digit) * digit).any()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_samples_with_which_a_gap_was_filled_do_not_count(dtype: type) -> None:
+    """A straight line in ten gaps of twelve samples; digits coarser than the noise lie on lines by themselves."""
+    real = made(EXACT)
+    sim, imu = along(real), along(real, 1).imu
+    columns, inside = np.concatenate([imu.gyro, imu.accel], axis=1), np.zeros(len(imu), bool)
+    for start in range(200, 3200, 300):
+        inside[start + 1 : start + 13] = True
+    columns = np.stack([np.interp(imu.t_ns, imu.t_ns[~inside], column[~inside]) for column in columns.T], axis=1)
+    columns = columns.astype(dtype).astype(np.float64)
+    joined = replace(real, imu=Imu(imu.t_ns, columns[:, :3].copy(), columns[:, 3:].copy()))
+    (pair,), (remark,) = align_all([joined], sim, None, DiagnoseSettings())
+    assert pair.known is not None
+    taken = imu.t_ns[:1] + np.round(pair.stamp_s * 1e9).astype(np.int64)
+    np.testing.assert_array_equal(~pair.known.any(axis=1), np.isin(taken, imu.t_ns[inside]))
+    assert f"{inside.sum()} samples lie on a straight line" in remark
+    (whole,), none = align_all([replace(real, imu=imu)], sim, None, DiagnoseSettings())
+    assert none == []
+    assert not filled(whole.stamp_s, whole.real).any()
+    assert not filled(pair.stamp_s, np.round(pair.real / 0.5) * 0.5).any()
