@@ -187,7 +187,7 @@ def own_poses_sentence(pairs: Sequence[Pair]) -> str:
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
-    """Pair without clipped, repeated and filled samples, and axes stuck or nearly always clipped.
+    """Pair without clipped, repeated and filled samples, and axes stuck or mostly clipped.
 
     Raises:
         DataError: no axis is left.

@@ -53,7 +53,7 @@ def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
 
 
 def filled(stamp_s: Float64[np.ndarray, " n"], real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
-    """Samples on a straight line between their neighbours on every axis, as where a gap was filled.
+    """Samples on a line between their neighbours on every axis, as where a gap was filled.
 
     It cuts the peaks of a motion, which looks like a scale. No axis lies on a line elsewhere, unless its digits are coarse.
     """
