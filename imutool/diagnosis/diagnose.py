@@ -144,7 +144,7 @@ def _beside_reference(
     logs = [whitened(pair, (*for_noise(candidates), *unnamed.driven([pair])), settings.band) for pair in pairs]
     pairs = [log.pair for log in logs]
     report(2, 4, "searching")
-    wrong, wrong_at = reference_errors(logs, settings.reference)
+    wrong, places = reference_errors(logs, settings.reference)
     named, unnamed_groups = ((), ()) if wrong else (candidates, unnamed_candidates(pairs))
     named, always = without_unseen_offset(named, pairs)
     first, trying = start_values(begin, named), lambda word: report(2, 4, f"trying {word}")
@@ -164,7 +164,7 @@ def _beside_reference(
     caveat = reference_caveat(recordings) if (poses := any(not pair.exact for pair in pairs)) else ""
     follows = [own_poses_sentence(pairs)] if poses and simulated is not None else []
     remarks = (*another, *left_out, *follows, *diagnosis.remarks, *dict.fromkeys(told))
-    findings, located = (*conventions, *wrong, *diagnosis.findings), tuple(wrong_at) or diagnosis.located
+    findings, located = (*conventions, *wrong, *diagnosis.findings), places if wrong else diagnosis.located or places
     diagnosis = replace(diagnosis, findings=findings, located=located, remarks=remarks, caveat=caveat)
     if sim is not None and len(reals) == 1 and (simulated is not None or signals):
         diagnosis = with_signals(diagnosis, reals[0], sim, signals, report, settings, clock_difference(pairs, selection.whole))

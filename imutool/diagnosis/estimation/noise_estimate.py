@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import csd, welch
+from scipy.signal import butter, csd, sosfiltfilt, welch
 
 from imutool.array_types import Bool, Float64, Int64
 from imutool.diagnosis.estimation.aligned_log import Pair
@@ -27,6 +27,7 @@ from imutool.sensor.effects import vibration
 
 RIDGE = 1e-8
 LEAST_ROWS = 2  # times the order of the noise model: rows that follow others without a gap
+ALL_SLOW, SLOW_ORDER = 0.9, 4  # of the frequencies, from which on nothing is fast; order of the filter
 INDEPENDENT = 1e-3  # of the largest singular value, below which a column is a combination of others
 Axes = Float64[np.ndarray, " _"]
 OnAxis = tuple[Int64[np.ndarray, " q"], Float64[np.ndarray, "q _"]]  # parameters that act on an axis, and their derivatives
@@ -130,19 +131,47 @@ def _left(pair: Pair, candidates: Sequence[Effect]) -> Float64[np.ndarray, "n 6"
 
 
 def is_coloured_noise(effect: Effect, theta: Theta, found: Fit) -> bool:
-    """Whether a line beside a simulation is coloured noise, which an autoregression smooths."""
-    exact, chance = [log for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
+    """Whether a line beside a simulation is noise that an autoregression smooths, or wanders."""
+    exact, chance = [log.pair for log in found.logs if log.pair.exact], found.logs[0].pair.settings.search.false_discovery_rate
     if effect.name != vibration.EFFECT.name or len(exact) < len(found.logs):
         return False
     others = tuple(entry for entry in found.chosen if entry[0] is not effect)
-    without = ((log.pair.real - expected(log.pair, others), 1.0 / log.pair.period_s) for log in exact)
-    return all(vibration.line_p_value(residual, rate_hz, theta[0]) > chance for residual, rate_hz in without)
+    without = [expected(pair, others) for pair in exact]
+    p_values = (
+        vibration.line_p_value(pair.real - model, 1.0 / pair.period_s, theta[0])
+        for pair, model in zip(exact, without, strict=True)
+    )
+    if all(p_value > chance for p_value in p_values):
+        return True
+    waves = ((*others, (effect, turned)) for turned in (theta, vibration.quarter_turn(theta)))
+    lines = [[expected(pair, acting) - model for pair, model in zip(exact, without, strict=True)] for acting in waves]
+    readings = [pair.real - model for pair, model in zip(exact, without, strict=True)]
+    return all(vibration.wanders(*each) for each in zip(readings, *lines, strict=True))
 
 
 def axis_squares(found: Fit) -> Axes:
     """Squares of white residuals by axis."""
     each = zip(found.logs, found.residuals, found.bias, strict=True)
     return np.asarray(sum(((r - log.constants * b)[log.rows(found.part)] ** 2).sum(axis=0) for log, r, b in each))
+
+
+def leaves_slow_motion(found: Fit, sensor: str, gain: float) -> bool:
+    """Whether a fit leaves much of what an effect gains, on its sensor and where a body moves."""
+    part, settings = found.logs[0].pair.signals[sensor], found.logs[0].pair.settings.search
+    return float(_slow_squares(found)[part].sum()) > settings.hysteresis_leaves * gain
+
+
+def _slow_squares(found: Fit) -> Axes:
+    """Squares of white residuals above noise by axis, below the frequency `motion_hz` up to which a body moves."""
+    total = np.zeros(found.logs[0].pair.columns)
+    for log, r, b in zip(found.logs, found.residuals, found.bias, strict=True):
+        settings, residual = log.pair.settings, r - log.constants * b
+        slow = 2.0 * settings.noise.motion_hz * log.pair.period_s * log.whiten.every  # share of the frequencies
+        if slow < ALL_SLOW:
+            residual = sosfiltfilt(butter(SLOW_ORDER, slow, output="sos"), residual, axis=0)
+        rows = residual[log.rows(found.part)]
+        total += np.maximum((rows**2).sum(axis=0) - settings.search.white_chi_square * min(slow, 1.0) * len(rows), 0.0)
+    return total
 
 
 def kurtosis(found: Fit) -> Axes:

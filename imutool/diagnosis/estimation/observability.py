@@ -24,6 +24,7 @@ from imutool.sensor.effects.gyro_hysteresis import play
 
 SMALL = 1e-2  # of the plausible size, at which an effect is still proportional to it
 SHARED, STANDS_STILL = "share", 0.4  # variant of a hysteresis; of the motion, what such a share moves at least
+MOST_SHARE = 1.2  # of the reading that lags: all of it, and what a fit errs by
 LOW_PASSES = ("low_pass", "second_order_low_pass")
 NEEDS_DELAY = {"clock_offset": ("clock_skew", "clock_jump", "clock_wander", *LOW_PASSES, "mount_resonance")}
 """What delays, rings, jumps or wanders needs the motion that shows a delay."""
@@ -242,7 +243,7 @@ def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], s
         takes_back = bool(theta[2:5].sum() < 0.0)  # as no spring does
         overdamped = bool(theta[1] > 1.0)  # a lag, which does not ring
         return outside or takes_back or overdamped or any(_rings_too_loud(effect, theta, log.pair) for log in logs)
-    if effect.variant == SHARED and all(_is_scale(effect, theta, log.pair) for log in logs):
+    if effect.variant == SHARED and (theta[1] > MOST_SHARE or all(_is_scale(effect, theta, log.pair) for log in logs)):
         return True
     noise = [log.pair.sim_noise[log.pair.signals[effect.sensors[0]]].max() for log in logs if isinstance(log.pair, Pair)]
     least = settings.beyond_sim_noise * max(noise, default=0.0)  # a narrower width takes what a filter left of it

@@ -15,7 +15,7 @@ from imutool.diagnosis.estimation.gauss_newton import Fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
 from imutool.diagnosis.estimation.time_alignment import same_motion, with_simulation
 from imutool.diagnosis.reference.own_poses import align_with_poses, band_hz
-from imutool.diagnosis.reference.taken_samples import batch_remark, new_samples, on_own_clock, repeats
+from imutool.diagnosis.reference.taken_samples import batch_remark, filled, new_samples, on_own_clock, repeats
 from imutool.diagnosis.result import Diagnosis, Estimate, Finding, HeldOut, Located
 from imutool.diagnosis.settings import AlignmentSettings, DiagnoseSettings, ReferenceSettings
 from imutool.diagnosis.wording.quantity import percent
@@ -47,7 +47,7 @@ def align_all(
     """
     pairs: list[Pair] = []
     refused: list[ImutoolError] = []
-    remarks: list[str] = []
+    remarks = _held(sim, "the physics step is longer than the sample period") if sim is not None else []
     for recording in recordings:
         try:
             aligned = list(align(recording, sim, truth, settings))
@@ -57,12 +57,13 @@ def align_all(
             refused.append(error.at(recording.name))
             continue
         pairs += [without_unusable(pair, settings.reference) for pair in aligned]
-        if held := len(recording.imu) - len(new_samples(recording).imu):
-            what = f"{held} samples repeat gyro or accel of the one before, and do not count"
-            remarks.append(f"{recording.name}: {what}: the topic is faster than its sensor")
+        remarks += _held(recording, "the topic is faster than its sensor")
         remarks += batch_remark(recording)
         if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
             remarks.append(f"{recording.name}: {again} samples repeat the one before on every axis, and do not count")
+        if straight := sum(int(filled(pair.stamp_s, pair.real).sum()) for pair in aligned):
+            where = "lie on a straight line between their neighbours on every axis, as where a gap was filled"
+            remarks.append(f"{recording.name}: {straight} samples {where}, and do not count")
         covered = sum(float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in aligned)
         if covered < settings.reference.covered_share * recording.imu.duration_s:
             what = "its true poses cover" if sim is None else "the simulation covers"
@@ -73,6 +74,12 @@ def align_all(
     if refused and not pairs and len(recordings) > 1:
         raise refused[0]
     return pairs, remarks + [f"left out, {error}" if pairs else str(error) for error in refused]
+
+
+def _held(recording: Recording, why: str) -> list[str]:
+    """Remark on samples that repeat the one before, as a simulator or a driver holds them."""
+    held = len(recording.imu) - len(new_samples(recording).imu)
+    return [f"{recording.name}: {held} samples repeat gyro or accel of the one before, and do not count: {why}"] if held else []
 
 
 def without_unseen_offset(candidates: Sequence[Effect], pairs: Sequence[Pair]) -> tuple[tuple[Effect, ...], Chosen]:
@@ -131,6 +138,7 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:
     """Intervals of the recording that the simulation or its own poses cover without a hole."""
     real, batched_s = on_own_clock(new_samples(real))
+    sim = None if sim is None else new_samples(sim)
     for pair in _aligned(real, sim, truth, settings):
         yield replace(pair, batched_s=batched_s)
 
@@ -179,14 +187,13 @@ def own_poses_sentence(pairs: Sequence[Pair]) -> str:
 
 
 def without_unusable(pair: Pair, settings: ReferenceSettings) -> Pair:
-    """Pair without clipped and repeated samples, and axes stuck or nearly always clipped.
+    """Pair without clipped, repeated and filled samples, and axes stuck or mostly clipped.
 
     Raises:
         DataError: no axis is left.
     """
-    known = ~(
-        timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real) | repeats(pair.real)[:, None]
-    )
+    whole_rows = (repeats(pair.real) | filled(pair.stamp_s, pair.real))[:, None]
+    known = ~(timestamps.clipped(pair.real, pair.settings.timestamps) | timestamps.stuck(pair.real) | whole_rows)
     known &= True if pair.known is None else pair.known
     if known.all():
         return pair

@@ -1,7 +1,8 @@
 """Errors of a reference: wrong intervals, smoothed poses, a turned attitude.
 
 Poses that were lost and bridged give a simulation, or a truth, another motion there. No effect of a sensor lasts two seconds
-and leaves no trace, so where all the rest is noise, the reference is wrong.
+and leaves no trace, so where all the rest is noise, the reference is wrong. A shock leaves none either, but is faster than a
+body moves, and in the recording's own samples.
 
 Poses that were estimated with the gyro follow it from one second to the next, and their own sensor over many. If that sensor
 is misaligned, R_ref = R_wb Exp(turned): means of the gyro over seconds are turned by Exp(turned), fast motion is not. No
@@ -17,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 from scipy.stats import chi2
 
 from imutool.array_types import Float64
@@ -32,19 +34,20 @@ from imutool.sensor.samples import IdealMotion
 from imutool.units import ASCII_UNITS, AXES, SENSORS
 
 CLEAR = 3.0  # deviations from which a component of the rotation counts
+NYQUIST_SHARE, FAST_SHARE = 0.45, 0.5  # of the sample rate, where nothing faster is left; of a shock's squares, that are fast
 MOSTLY = 0.8  # of the samples of a block that have to be usable
 Matrix = Float64[np.ndarray, "3 3"]
 Vector = Float64[np.ndarray, "3"]
 
 
-def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], list[Located]]:
-    """Intervals of a wrong reference, as a finding and locations; none for another misfit."""
+def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -> tuple[list[Finding], tuple[Located, ...]]:
+    """Intervals of a wrong reference, as a finding and locations; of shocks their locations."""
     if len(logs) != 1:
-        return [], []
+        return [], ()
     (log,), block_s, p_value = logs, settings.block_s, settings.p_value
     rows = log.rows("all")
     if not rows.any():
-        return [], []
+        return [], ()
     t_s = log.pair.stamp_s[:: log.whiten.every][rows]
     white = log.whiten(log.pair.real - expected(log.pair, ()))[rows]
     constant = log.constants[rows]
@@ -64,12 +67,18 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
     both = all(loud[:, (at >= a - 1e-6) & (at < b)].any(axis=1).all() and b - a <= settings.longest_s for a, b in runs)
     few = len(runs) <= settings.most_intervals and inside.mean() <= settings.most_of_time
     if not runs or not both or not few or (outside**2).mean() > settings.quiet_chi_square:
-        return [], []
+        return [], ()
+    excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
+    share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
+    shock = _is_shock(log, runs)
+    places = tuple(
+        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value, shock) for k, signal in enumerate(SENSORS)
+    )
+    if shock:
+        return [], places
     length = float(np.mean([b - a for a, b in runs]))
     parameters = {"length": Estimate(length, block_s / np.sqrt(6.0 * len(runs)) + 0.1 * length, "s")}
     parameters |= {f"t_{k}": Estimate(a, block_s, "s") for k, (a, _) in enumerate(runs)}
-    excess = (white[inside] ** 2).sum() - 6.0 * inside.sum()
-    share = float(np.clip(excess / max(float((white**2).sum() - 6.0 * len(white)), 1e-300), 0.0, 1.0))
     residual = log.pair.real - expected(log.pair, ())
     residual = residual - np.median(residual, axis=0)
     held_rows = log.pair.held_out
@@ -78,9 +87,25 @@ def reference_errors(logs: Sequence[WhitenedImu], settings: ReferenceSettings) -
     before, after = (float(np.sqrt((residual[mask, 3:] ** 2).mean())) for mask in (held_rows, away))
     held_out = HeldOut(before, after, ASCII_UNITS["accel"], round(float(held_rows.sum()) * log.pair.period_s, 1))
     finding = Finding("reference_error", "both", share, p_value, p_value, parameters, "the reference is wrong there", held_out)
-    return [finding], [
-        _where(signal, white[:, 3 * k : 3 * k + 3], inside, runs, share, p_value) for k, signal in enumerate(SENSORS)
-    ]
+    return [finding], places
+
+
+def _is_shock(log: WhitenedImu, runs: Sequence[tuple[float, float]]) -> bool:
+    """Whether the misfit in some intervals is in the recording's own fast samples: a landing or a blow.
+
+    A body moves slower than `motion_hz`. So a reference that lost its motion misses slow samples, and one that jumps has fast
+    samples that the recording lacks.
+    """
+    pair, rate_hz = log.pair, 1.0 / log.pair.period_s
+    own_hz = pair.settings.noise.motion_hz
+    if own_hz >= NYQUIST_SHARE * rate_hz:
+        return False
+    fast = sosfiltfilt(butter(2, own_hz, "high", fs=rate_hz, output="sos"), pair.real, axis=0)
+    inside = np.any([(pair.stamp_s >= a) & (pair.stamp_s <= b) for a, b in runs], axis=0)
+    misfit = pair.real - expected(pair, ())
+    misfit = misfit - np.median(misfit, axis=0)
+    shaken, missed = ((x[inside] ** 2).mean(axis=0) - (x[~inside] ** 2).mean(axis=0) for x in (fast, misfit))
+    return all(shaken[part].sum() > FAST_SHARE * missed[part].sum() for part in pair.signals.values())
 
 
 def _where(
@@ -90,11 +115,12 @@ def _where(
     runs: list[tuple[float, float]],
     share: float,
     p_value: float,
+    shock: bool,
 ) -> Located:
     power = (white[inside] ** 2).mean(axis=0)
     axes = tuple(axis for axis, value in zip(AXES, power, strict=True) if value > 1.3)
-    regime = "no regime: the reference's own moments"
-    return Located(signal, axes or AXES, tuple(runs), regime, share, p_value, extent="intermittent")
+    own = "shocks of the recording" if shock else "the reference's own moments"
+    return Located(signal, axes or AXES, tuple(runs), f"no regime: {own}", share, p_value, extent="intermittent")
 
 
 def _runs(loud: np.ndarray, start_s: float, settings: ReferenceSettings) -> list[tuple[float, float]]:

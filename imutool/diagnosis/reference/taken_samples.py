@@ -17,6 +17,7 @@ from imutool.recording.columns import true_ranges
 SELDOM = 0.1  # of the samples of an axis that are equal to the one before: digits are finer than the noise
 MOSTLY_NEW = 0.3  # of the samples that repeat the one before: more is a topic that is faster than its sensor
 LEAST_NEW = 0.05  # of the samples with news of both sensors: two that take turns have none
+STRAIGHT = 1e-3  # of the median change of the slope, up to which three samples are on a line: float32 rounds far less
 STUCK = 10  # samples in a row that a sensor stands still, and is not held
 JITTER = "timestamp_jitter"
 
@@ -49,6 +50,22 @@ def repeats(real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
     again = equal.all(axis=1)
     by_chance = equal[~again].mean(axis=0) if (~again).any() else np.ones(6)
     return np.asarray(again & bool(by_chance.max() < SELDOM and again.mean() < MOSTLY_NEW))
+
+
+def filled(stamp_s: Float64[np.ndarray, " n"], real: Float64[np.ndarray, "n 6"]) -> Bool[np.ndarray, " n"]:
+    """Samples on a line between their neighbours on every axis, as where a gap was filled.
+
+    It cuts the peaks of a motion, which looks like a scale. No axis lies on a line elsewhere, unless its digits are coarse.
+    """
+    found = np.zeros(len(real), bool)
+    if len(real) < 3:
+        return found
+    slope = np.diff(real, axis=0) / np.diff(stamp_s)[:, None]
+    bend = np.abs(np.diff(slope, axis=0))
+    straight = bend <= STRAIGHT * np.median(bend, axis=0)
+    found[1:-1] = straight.all(axis=1)
+    by_chance = straight[~found[1:-1]].mean(axis=0) if not found[1:-1].all() else np.ones(6)
+    return found & bool(by_chance.max() < SELDOM and found.mean() < MOSTLY_NEW)
 
 
 def on_own_clock(recording: Recording) -> tuple[Recording, float]:

@@ -16,6 +16,7 @@ LINES = 3  # starts: the strongest lines of the residual
 FINER = 4  # times as many frequencies as samples tell: the top of a peak lies between three of them
 ABOUT = 401  # frequencies whose median tells what a line stands out from
 PARTS = 8  # of a log, in each of which a vibration has one amplitude and phase
+STEADY = 2.0  # times their scatter, the squared mean of what the eighths show: a wandering line had 1.7 at most, a steady one 6
 IN_POSES = 0.1  # of the power of a line, from which the poses have it, too
 
 
@@ -69,6 +70,25 @@ def steady_p_value(stamp_s: Float64[np.ndarray, " n"], samples: Float64[np.ndarr
     scatter = (np.abs(each - middle) ** 2).sum(axis=0) / (PARTS - 1) + np.finfo(np.float64).tiny
     log_p = fisher.logsf(PARTS * np.abs(middle) ** 2 / scatter, 2, 2 * (PARTS - 1))
     return float(min(1.0, samples.shape[1] * len(stamp_s) / 2.0 * np.exp(log_p.min())))
+
+
+def quarter_turn(theta: Theta) -> Theta:
+    """Parameters of the same vibration, a quarter of a period away."""
+    return np.concatenate([theta[:1], np.stack([theta[2::2], -theta[1::2]], axis=1).ravel()])
+
+
+def wanders(samples: Float64[np.ndarray, "n k"], line: Float64[np.ndarray, "n k"], quarter: Float64[np.ndarray, "n k"]) -> bool:
+    """Whether a line is in some eighths of a log alone, or has another phase in each.
+
+    By the amplitude and phase that samples have of it, and of its `quarter` turn, all columns together: those of a steady line
+    scatter by noise, which is far less than their mean. A shock rings in few eighths, and steps or a motor turn the phase.
+    """
+    weight, centred = 1.0 / white_noise(samples) ** 2, samples - samples.mean(axis=0)
+    real, imaginary, size = ((x * y) @ weight for x, y in ((centred, line), (centred, quarter), (line, line)))
+    parts = ((x.sum() for x in np.array_split(each, PARTS)) for each in (real - 1j * imaginary, size))
+    each = np.array([of_line / max(of_size, np.finfo(np.float64).tiny) for of_line, of_size in zip(*parts, strict=True)])
+    scatter = float((np.abs(each - each.mean()) ** 2).sum() / (PARTS - 1))
+    return float(np.abs(each.mean()) ** 2) < STEADY * scatter
 
 
 def is_motion(

@@ -24,6 +24,7 @@ from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.estimation.observability import with_plainer_effects
 from imutool.diagnosis.estimation.significance import gain_of, log_p_value
 from imutool.diagnosis.estimation.trial import verdicts
+from imutool.diagnosis.estimation.trial.lag_start import with_delay_of_accel
 from imutool.diagnosis.estimation.trial.selection import Selection
 from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
@@ -206,6 +207,53 @@ def test_noise_that_a_filter_has_coloured_is_no_vibration_and_a_line_on_it_is_on
     pair = planted.pair(felt, seed=51, added=PASSED * passed - (1.0 - WHITE) * white + line)
     found = select_effects([whitened(pair, (), pair.settings.band)], catalogue.diagnosed(["vibration"]))
     assert names(found) == (["vibration"] if line_m_s2 else [])
+
+
+@pytest.mark.parametrize("turns", [0.0, 0.05], ids=["steady", "turning"])
+def test_a_line_that_turns_its_phase_is_no_vibration(turns: float) -> None:
+    """As of a motor, whose speed is never quite constant."""
+    felt = planted.rich(duration_s=60.0)
+    phase = turns * np.cumsum(np.random.default_rng(4).normal(size=len(felt.t_s)))
+    line = np.sin(2.0 * np.pi * 31.0 * felt.t_s + phase)[:, None] * [0.0, 0.0, 0.0, 0.1, 0.1, 0.4]
+    pair = planted.pair(felt, seed=52, added=line)
+    found = select_effects([whitened(pair, (), pair.settings.band)], catalogue.diagnosed(["vibration"]))
+    assert names(found) == ([] if turns else ["vibration"])
+
+
+# ── a misfit of another form ──
+
+DRAG_S, LATE_S = 0.25, 0.02  # of a velocity's acceleration, 1/s; of an accelerometer
+
+
+def with_force(seed: int, what: str) -> Pair:
+    """A flight whose accelerometer reads a drag against the velocity that no simulation knew, or is late."""
+    felt, path = planted.rich(seed, 60.0), planted.moving(seed, 60.0)
+    motion = path.at(path.start_ns + np.round(felt.t_s * 1e9).astype(np.int64))
+    added = np.zeros((len(felt.t_s), 6))
+    if what == "drag":
+        assert motion.v_w is not None
+        added[:, 3:] = -DRAG_S * np.einsum("nji,nj->ni", felt.R_wb, motion.v_w)
+    else:
+        late = np.stack([np.interp(felt.t_s - LATE_S, felt.t_s, column) for column in felt.accel.T], axis=1)
+        added[:, 3:] = late - felt.accel
+    return planted.pair(felt, {}, seed, added=added)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_what_grows_with_the_velocity_is_no_hysteresis_of_which_much_is_left(seed: int) -> None:
+    assert names(asked(with_force(seed, "drag"), beyond=False)) == []
+
+
+@pytest.mark.parametrize("what", ["late", "drag"])
+def test_a_late_accelerometer_is_no_hysteresis_and_what_a_delay_leaves_is_no_delay(what: str) -> None:
+    logs = [planted.weighed(with_force(1, what))]
+    (hysteresis,) = (one for one in planted.catalogue() if one.name == "accel_hysteresis" and not one.variant)
+    found = with_delay_of_accel(logs, fit(logs, ((hysteresis, np.array([0.1])),)), planted.catalogue())
+    both = {effect.name: float(theta[0]) for effect, theta in found.chosen}
+    if what == "late":
+        assert both == {name: pytest.approx(-LATE_S, abs=1e-3) for name in ("clock_offset", "gyro_delay")}
+    else:
+        assert list(both) == ["accel_hysteresis"]
 
 
 # ── log_p_value ──

@@ -11,8 +11,9 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from imutool.diagnosis.diagnose import diagnose
+from imutool.diagnosis.estimation.jacobians import expected
 from imutool.diagnosis.reference.coverage import align, align_all
-from imutool.diagnosis.reference.taken_samples import batched, new_samples, repeats
+from imutool.diagnosis.reference.taken_samples import batched, filled, new_samples, repeats
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.mcap_io.write import write
 from imutool.noise import datasheet
@@ -21,6 +22,7 @@ from imutool.sensor.made_up_flight import flight
 from imutool.sensor.simulate import TRUTH_TOPIC, simulated
 
 DURATION_S, RATE_HZ = 40.0, 100.0
+HELD_LEAVES = 1.1  # of what the whole simulation leaves: its noise is filtered out of half of the samples
 MEASURED, EXACT = 1e-4, 0.0  # rad and m of a pose
 
 
@@ -131,6 +133,20 @@ def test_a_topic_that_is_faster_than_its_sensor_is_read_at_the_rate_of_the_senso
     assert len(new_samples(replace(real, imu=replace(imu, gyro=stuck))).imu) == len(imu)
 
 
+def test_a_simulation_that_holds_its_samples_is_read_where_its_physics_steps() -> None:
+    """A simulation that is held for two samples is late by half of one, which looked like a clock and a mount."""
+    real = made(EXACT)
+    sim, recorded = along(real), replace(real, imu=along(real, 1).imu)
+    last = np.arange(len(sim.imu)) // 2 * 2
+    held = replace(sim, imu=replace(sim.imu, gyro=sim.imu.gyro[last], accel=sim.imu.accel[last]), truths={})
+    (pair,), remarks = align_all([recorded], held, None, DiagnoseSettings())
+    (whole,), none = align_all([recorded], replace(sim, truths={}), None, DiagnoseSettings())
+    assert none == []
+    assert f"{np.count_nonzero(last != np.arange(len(last)))} samples repeat gyro or accel of the one before" in remarks[0]
+    left, least = ((one.real - expected(one, ()))[100:-100].std(axis=0) for one in (pair, whole))
+    assert (left < HELD_LEAVES * least).all()
+
+
 @pytest.mark.parametrize("with_simulation", [True, False])
 def test_samples_stamped_in_batches_are_read_on_the_clock_of_the_sensor(with_simulation: bool) -> None:
     """A driver that reads five samples at a time stamps them together; every step between batches was a gap."""
@@ -168,3 +184,25 @@ def test_a_sample_that_repeats_the_one_before_does_not_count() -> None:
     assert f"{len(again)} samples repeat the one before" in remark
     for digit in (0.5, 50.0):
         assert not repeats(np.round(pair.real / digit) * digit).any()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_samples_with_which_a_gap_was_filled_do_not_count(dtype: type) -> None:
+    """A straight line in ten gaps of twelve samples; digits coarser than the noise lie on lines by themselves."""
+    real = made(EXACT)
+    sim, imu = along(real), along(real, 1).imu
+    columns, inside = np.concatenate([imu.gyro, imu.accel], axis=1), np.zeros(len(imu), bool)
+    for start in range(200, 3200, 300):
+        inside[start + 1 : start + 13] = True
+    columns = np.stack([np.interp(imu.t_ns, imu.t_ns[~inside], column[~inside]) for column in columns.T], axis=1)
+    columns = columns.astype(dtype).astype(np.float64)
+    joined = replace(real, imu=Imu(imu.t_ns, columns[:, :3].copy(), columns[:, 3:].copy()))
+    (pair,), (remark,) = align_all([joined], sim, None, DiagnoseSettings())
+    assert pair.known is not None
+    taken = imu.t_ns[:1] + np.round(pair.stamp_s * 1e9).astype(np.int64)
+    np.testing.assert_array_equal(~pair.known.any(axis=1), np.isin(taken, imu.t_ns[inside]))
+    assert f"{inside.sum()} samples lie on a straight line" in remark
+    (whole,), none = align_all([replace(real, imu=imu)], sim, None, DiagnoseSettings())
+    assert none == []
+    assert not filled(whole.stamp_s, whole.real).any()
+    assert not filled(pair.stamp_s, np.round(pair.real / 0.5) * 0.5).any()

@@ -15,7 +15,7 @@ from imutool.diagnosis.diagnose import candidates_for
 from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.noise_estimate import whitened
 from imutool.diagnosis.reference.coverage import align
-from imutool.diagnosis.reference.errors import SMOOTHED, turned_reference
+from imutool.diagnosis.reference.errors import SMOOTHED, reference_errors, turned_reference
 from imutool.diagnosis.result import Finding
 from imutool.diagnosis.settings import DiagnoseSettings
 from imutool.diagnosis.summarize import vibration_above_band
@@ -75,6 +75,30 @@ def test_smoothed_poses_are_told_from_a_scale_by_the_frequency(scale: dict[str, 
 def test_poses_as_they_are_have_no_smoothing() -> None:
     pair = replace(planted.pair(planted.shaken(2, DURATION_S), {}, 1), band_hz=7.0)
     assert select_effects([planted.weighed(pair)], (*planted.catalogue(), SMOOTHED)).selected == ()
+
+
+BLOWS_S, BLOW_HZ, BLOW_S = (14.2, 37.7, 61.1), 27.0, 0.04
+
+
+@pytest.mark.parametrize("shaken", ["recording", "reference", "reference lost"])
+def test_a_blow_is_no_error_of_the_reference_and_a_jump_or_a_lost_motion_of_it_is(shaken: str) -> None:
+    """A blow is in the recording's own fast samples."""
+    felt = planted.rich(3, DURATION_S)
+    since = [np.where(felt.t_s >= at, felt.t_s - at, np.inf) for at in BLOWS_S]
+    blow = sum(np.exp(-s / BLOW_S) * np.sin(2.0 * np.pi * BLOW_HZ * np.minimum(s, 9.0)) for s in since)
+    blows = np.asarray(blow)[:, None] * [0.3, 0.5, 0.1, 4.0, 2.0, 20.0]
+    pair = planted.pair(felt, {}, 1, added=blows if shaken == "recording" else None)
+    if shaken == "reference":
+        pair = replace(pair, ideal=replace(felt, gyro=felt.gyro + blows[:, :3], accel=felt.accel + blows[:, 3:]))
+    if shaken == "reference lost":
+        lost = np.any([(felt.t_s >= at) & (felt.t_s < at + 2.0) for at in BLOWS_S], axis=0)
+        gyro, accel = (np.where(lost[:, None], x.mean(axis=0), x) for x in (felt.gyro, felt.accel))
+        pair = replace(pair, ideal=replace(felt, gyro=gyro, accel=accel))
+    findings, places = reference_errors([planted.weighed(pair)], SETTINGS.reference)
+    assert [one.effect for one in findings] == ([] if shaken == "recording" else ["reference_error"])
+    assert [one.signal for one in places] == ["gyro", "accel"]
+    assert ("shocks" in places[0].regime) == (shaken == "recording")
+    assert all(abs(a - at) < 0.5 for (a, _), at in zip(places[0].intervals_s, BLOWS_S, strict=True))
 
 
 def test_poses_that_are_turned_against_slow_motion_alone_are_wrong_by_that_rotation() -> None:

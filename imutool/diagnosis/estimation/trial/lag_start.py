@@ -10,6 +10,7 @@ from scipy.optimize import brentq
 from imutool.diagnosis.estimation.aligned_log import Pair
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, expected
+from imutool.diagnosis.estimation.noise_estimate import leaves_slow_motion
 from imutool.diagnosis.estimation.observability import LOW_PASSES, beyond_the_band, exclude_each_other
 from imutool.diagnosis.estimation.significance import bic
 from imutool.diagnosis.estimation.trial.effect_forms import digital, exponential
@@ -21,6 +22,7 @@ from imutool.sensor.effects.second_order_low_pass import BUTTERWORTH
 from imutool.units import SENSORS
 
 LAGS = (*LOW_PASSES, "clock_offset", "gyro_delay")
+HYSTERESIS = "accel_hysteresis"
 LEAST_LAG = 0.05  # of a sample period: less is no filter that a log shows
 CLOCKS_SHARE = 0.5  # of the lag that both sensors have, from where the fit of a clock beside filters starts
 TAKEN_BACK = 0.5  # of a low-pass's lag: a clock that leaves less takes it back
@@ -101,19 +103,22 @@ def with_form_of_resonance(logs: Sequence[WhitenedLog], now: Fit, named: Sequenc
 
 
 def with_delay_of_accel(logs: Sequence[WhitenedLog], now: Fit, named: Sequence[Effect]) -> Fit:
-    """Fit with a delay of the accelerometer for a low-pass of it that is clearly worse (BIC).
+    """Fit with a delay of the accelerometer for a clearly worse filter of it (BIC).
 
     A late accelerometer is a clock that is late, and a gyro that is ahead of it. One alone of these two explains little, so
-    that the search finds the filter of this lag.
+    that the search finds the low-pass of this lag, or of slow motion a hysteresis.
     """
     both = [of for name in ("clock_offset", "gyro_delay") for of in named if of.name == name and of.key not in now.keys]
     for k, (effect, theta) in enumerate(now.chosen):
-        if len(both) == 2 and effect.name in LOW_PASSES and effect.sensors == ("accel",):
-            start = np.array([-Design.of(effect, theta).lag_s])
+        if len(both) == 2 and effect.name in (*LOW_PASSES, HYSTERESIS) and effect.sensors == ("accel",):
+            start = np.array([0.0 if effect.name == HYSTERESIS else -Design.of(effect, theta).lag_s])
             late = (*now.chosen[:k], *now.chosen[k + 1 :], *((of, start) for of in both))
             least = bic(now) - logs[0].pair.settings.search.clearly_better
             trial = fit(logs, late, near=now, give_up_above=now.objective)
-            return trial if bic(trial) < least else now
+            if bic(trial) >= least:
+                return now
+            gain = fit(logs, late[:-2], near=now).objective - trial.objective
+            return now if effect.name == HYSTERESIS and leaves_slow_motion(trial, "accel", gain) else trial
     return now
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from imutool.diagnosis.estimation.candidate_score import Candidates
 from imutool.diagnosis.estimation.gauss_newton import Fit, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, SplineCurve
-from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise, kurtosis
+from imutool.diagnosis.estimation.noise_estimate import axis_squares, is_coloured_noise, kurtosis, leaves_slow_motion
 from imutool.diagnosis.estimation.observability import beyond_the_band, unidentified
 from imutool.diagnosis.estimation.significance import (
     Scatter,
@@ -38,6 +38,8 @@ from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked, of_each
 from imutool.sensor.effect import Effect
 from imutool.sensor.effects.low_pass import Design
+
+HYSTERESES = ("gyro_hysteresis", "accel_hysteresis")
 
 
 @dataclass(eq=False)
@@ -180,7 +182,11 @@ class Trial:
         if effect.lagless is not None:
             std[0] = np.hypot(std[0], theta[0] * Design.of(effect, theta).digital_share)
         no_answer = beyond_the_band(effect, theta, self.logs, self.settings) or takes_noise(effect, theta, self.logs)
-        no_answer = no_answer or is_coloured_noise(effect, theta, whole)
+        no_answer = (
+            no_answer
+            or is_coloured_noise(effect, theta, whole)
+            or (effect.name in HYSTERESES and leaves_slow_motion(whole, effect.sensors[0], gain[0]))
+        )
         if no_answer or has_no_size(effect, theta, std, curve=(curve := isinstance(effect.forward, SplineCurve))):
             return None
         log_p = self.candidates.log_p(effect, gain[1])
