@@ -29,7 +29,7 @@ class Score(Section, frozen=True, kw_only=True):
     """Scores of an estimate of a log; degrees, metres, biases in rad/s and m/s².
 
     Relative errors are keyed by their distance in metres; a figure that the log does not show is null. `aids` are the topics
-    that an aided path used, by kind.
+    that an aided path used, by kind. The drift is that of windows from the truth, with the deviation that the bias expects.
     """
 
     log: str
