@@ -26,18 +26,24 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
-from imutool.inertial.strapdown import StartPose, along_truth, drift_windows, gaps_crossed, window_drift
+from imutool.inertial.strapdown import Drift, StartPose, along_truth, drift_windows, gaps_crossed, window_drift
 from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.target import writing
-from imutool.recording import Imu, Poses, Recording
+from imutool.recording import Imu, Poses, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
 
 RAW = "raw"
 DRIFT_S = 5.0
+DELAY_WINDOW_S, CLEAR_STDS, LEFT = (
+    1.0,
+    4.0,
+    0.9,
+)  # windows that show a delay of the poses; a clear one; the drift it leaves at most
 DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
+DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
 DEG = 180.0 / np.pi
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
@@ -108,6 +114,7 @@ def _evaluated(
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
         drifted = _drift(integrated, true, valid, model, start, recording.imu)
+        drifted |= _without_delay(found.imu, recording) if model else dict.fromkeys(DELAY)
         if name == RAW and (gaps := gaps_crossed(integrated, GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
         estimates = {PURE: integrated}
@@ -156,6 +163,33 @@ def _drift(
         known = name in squares and len(windows) > 0 and (is_angle or truth.has_positions)
         out[name] = float(np.sqrt(squares[name].mean())) * (DEG if is_angle else 1.0) if known else None
     return out
+
+
+def _without_delay(imu: Imu, recording: Recording) -> dict[str, float | None]:
+    """Delay of the poses against the debiased gyro, and the scores without it; None where it is not clear.
+
+    By the trapezoidal rule: the Euler rule of the other scores lags by half a sample, as if the poses were early.
+    """
+    means = (np.concatenate([0.5 * (u[1:] + u[:-1]), u[-1:]]) for u in (imu.gyro, imu.accel))
+    smooth, nothing = Imu(imu.t_ns, *means), dict[str, float | None].fromkeys(DELAY)
+    before = along_truth(smooth, recording.truth, recording.name)
+    found = metrics.pose_delay(*before[:2], drift_windows(before[0], before[2], DELAY_WINDOW_S))
+    if found is None or abs(found[0]) < CLEAR_STDS * found[1]:
+        return nothing
+    moved = replace(recording.truth, t_ns=recording.truth.t_ns - nanoseconds(found[0]))
+    try:
+        after = along_truth(smooth, moved, recording.name)
+    except DataError:
+        return nothing
+    drifts = [_rms(window_drift(p, true, *drift_windows(p, valid, DRIFT_S).T)) for p, true, valid in (before, after)]
+    if not drifts[1] < LEFT * drifts[0]:
+        return nothing
+    return dict(zip(DELAY, (*found, metrics.absolute(*after)["aoe_deg"], DEG * drifts[1]), strict=True))
+
+
+def _rms(drifted: Drift) -> float:
+    """Root mean square of the drift of the orientation (rad)."""
+    return float(np.sqrt(np.mean(drifted.orientation_rad**2))) if len(drifted.orientation_rad) else float("nan")
 
 
 def _over(imu: Imu, true: Poses) -> Imu:

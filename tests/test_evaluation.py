@@ -32,7 +32,7 @@ from imutool.inertial.strapdown import StartPose, along_truth, dead_reckon
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording
-from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO_BIAS, FlightSettings, TriadSettings, flight
+from imutool.sensor.made_up_flight import ACCEL_BIAS, GYRO, GYRO_BIAS, FlightSettings, TriadSettings, flight
 
 # AOE of the raw samples in degrees, unaligned, from the true start: the published column (method.md), rooms as in issue 2.
 PUBLISHED = {
@@ -93,6 +93,22 @@ def test_the_drift_is_as_large_as_the_covariance_of_the_bias_lets_expect(init: s
         shares.append([found[f"drift_{name}"] / found[f"drift_{std}"] for name, std in DRIFTS])
     assert (np.sqrt(np.mean(np.square(shares), axis=0)) < 2.0).all()
     assert (np.median(shares, axis=0) > 0.1).all()
+
+
+@pytest.mark.parametrize("late_s", [0.006, -0.004])
+def test_late_poses_are_named_and_their_part_of_the_error(late_s: float, tmp_path: Path) -> None:
+    made = flight(3, duration_s=40.0, gyro=msgspec.structs.replace(GYRO, scale=0.0, misalignment_rad=0.0, warm_up=0.0))
+    late = {topic: replace(p, t_ns=p.t_ns + round(late_s * 1e9)) for topic, p in made.truths.items()}
+    for name, recording in (("straight", made), ("late", replace(made, truths=late))):
+        write(recording, tmp_path / f"{name}.mcap")
+    (_, straight), (raw, found) = (evaluate(tmp_path / f"{name}.mcap", models=["static"]) for name in ("straight", "late"))
+    assert straight["pose_delay_s"] is None
+    assert raw["pose_delay_s"] is None
+    assert found["pose_delay_s"] == pytest.approx(late_s, abs=3e-4)
+    assert 0.0 < found["pose_delay_std_s"] < 3e-4
+    for name in ("aoe", "drift_orientation"):
+        assert found[f"{name}_without_delay_deg"] < 1.1 * straight[f"{name}_deg"]
+    assert found["drift_orientation_without_delay_deg"] < 0.8 * found["drift_orientation_deg"]
 
 
 # ── real recordings ──────────────────────────────────────────────────────────────────────────────────────────────────

@@ -29,7 +29,8 @@ class Score(Section, frozen=True, kw_only=True):
     """Scores of an estimate of a log; degrees, metres, biases in rad/s and m/s².
 
     Relative errors are keyed by their distance in metres; a figure that the log does not show is null. `aids` are the topics
-    that an aided path used, by kind. The drift is that of windows from the truth, with the deviation that the bias expects.
+    that an aided path used, by kind. The drift is that of windows from the truth, with the deviation that the bias expects. A
+    positive delay says that the poses are late; the figures without it are there where it is clear.
     """
 
     log: str
@@ -53,6 +54,10 @@ class Score(Section, frozen=True, kw_only=True):
     drift_velocity_m_s: float | None
     drift_orientation_std_deg: float | UnsetType | None = UNSET
     drift_velocity_std_m_s: float | UnsetType | None = UNSET
+    pose_delay_s: float | UnsetType | None = UNSET
+    pose_delay_std_s: float | UnsetType | None = UNSET
+    aoe_without_delay_deg: float | UnsetType | None = UNSET
+    drift_orientation_without_delay_deg: float | UnsetType | None = UNSET
     drift_window_s: float
     gyro_bias: list[float]
     accel_bias: list[float]
@@ -122,7 +127,7 @@ def evaluate(
     if not common.write(Evaluation(convert(results, list[Score]))):
         rows = [{**row, "model": f"{row['model']} aided"} if row["estimate"] == "aided" else row for row in results]
         figures(rows, aligned=aligned)
-        for sentence in [*_used(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
+        for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
     _raise_first(errors)
 
@@ -145,6 +150,19 @@ def _fits(results: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences about the models that may not fit a log."""
     rows = [row for row in results if row["estimate"] == "integration" and row["fit"] and row["fit"]["verdict"] != "fits"]
     return [f"{row['log']}: {convert(row['fit'], Fitness).sentence(row['model'])}" for row in rows]
+
+
+def _late(results: Sequence[dict[str, Any]]) -> list[str]:
+    """Sentences about poses whose clock makes a part of the errors."""
+    from imutool.cleaning.pose_delay import lateness
+
+    told = []
+    for row in results:
+        if row["estimate"] == "integration" and row["pose_delay_s"] is not None:
+            aoe, drift = row["aoe_without_delay_deg"], row["drift_orientation_without_delay_deg"]
+            late = f"{row['log']}, {row['model']}: the poses are {lateness(row['pose_delay_s'], 1)} by the debiased gyro"
+            told.append(f"{late}; without that AOE is {aoe:.2f}°, and {drift:.2f}° after {row['drift_window_s']:g} s")
+    return told
 
 
 def _used(results: Sequence[dict[str, Any]]) -> list[str]:

@@ -29,13 +29,15 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
 from imutool.mcap_io.storage.target import Target
-from imutool.recording import Poses
+from imutool.recording import Poses, seconds
+from imutool.recording.columns import median
 
 DISTANCES_M = (5.0, 10.0, 15.0, 20.0)
 PAIR_TOLERANCE = 0.1  # relative tolerance of a pair's distance: evo's default
 AT_ONCE = 1 << 13  # pairs, so that their arrays stay in the cache
 # least singular value (m²): below it positions lie on a line for evo, and rotation about the line is free
 FLAT = np.finfo(np.float64).eps
+FEWEST_WINDOWS, MOST_MISSED = 10, 4.0  # that show a delay of the poses; of the median error of windows, that of one that counts
 
 Mask = Bool[np.ndarray, " n"]
 Points = Float64[np.ndarray, "n 3"]
@@ -172,6 +174,36 @@ def pairs_by_distance(
     j = np.where(miss_below <= miss_above, below, above)
     near = np.minimum(miss_below, miss_above) <= distance_m * tolerance
     return i[near], j[near]
+
+
+def pose_delay(path: Poses, truth: Poses, windows: Int64[np.ndarray, "m 2"]) -> tuple[float, float] | None:
+    """Delay of the true poses (s) and its standard deviation, by windows; None for few of them.
+
+    `path` is the integration of debiased samples on the stamps of `truth`. Where these are late by d, a window from one pose to
+    another misses (w_last - w_first) d, with the angular rate w in the world, by first order. Windows of poses that jump do not
+    count.
+    """
+    inner = windows[(windows[:, 0] > 0) & (windows[:, 1] < len(path) - 1)]
+    if len(inner) < FEWEST_WINDOWS:
+        return None
+    first, last = inner.T
+    turned = quaternion.multiply(quaternion.inverse(path.q_wb_wxyz[first]), path.q_wb_wxyz[last])
+    error = quaternion.log(
+        quaternion.multiply(quaternion.multiply(truth.q_wb_wxyz[first], turned), quaternion.inverse(truth.q_wb_wxyz[last]))
+    )
+    to_truth = quaternion.multiply(truth.q_wb_wxyz[first], quaternion.inverse(path.q_wb_wxyz[first]))
+    t_s, rates = seconds(path.t_ns, int(path.t_ns[0])), []
+    for row in (first, last):
+        step = quaternion.multiply(path.q_wb_wxyz[row + 1], quaternion.inverse(path.q_wb_wxyz[row - 1]))
+        rates.append(quaternion.log(step) / (t_s[row + 1] - t_s[row - 1])[:, None])
+    miss = quaternion.rotate(to_truth, rates[1] - rates[0])
+    size = quaternion.length(error)
+    kept = size <= MOST_MISSED * median(size)
+    error, miss = error[kept], miss[kept]
+    power = max(float((miss**2).sum()), np.finfo(np.float64).tiny)
+    delay_s = float((miss * error).sum()) / power
+    variance = float(((error - delay_s * miss) ** 2).sum()) / (3 * len(error) - 1)
+    return delay_s, float(np.sqrt(variance / power))
 
 
 def write_tum(poses: Poses, path: Path, overwrite: bool = False) -> None:
