@@ -151,6 +151,10 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
     width = _width(rows, _fields(lines[:first], delimiter))
     names, units = _header(lines[:first], delimiter, width)
+    if names[:1] == ["column 1"] and delimiter is not None and (above := _fields(lines[:first], delimiter)[-1:]):
+        if 1 < len(above[0]) < width and not any(map(is_number, above[0])):
+            said = f"the header has {len(above[0])} names and the rows {width} fields: of which columns they are is not certain"
+            columns.remarks.losses.append(f"{said}, and they are not used ({', '.join(above[0])[:200]})")
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")

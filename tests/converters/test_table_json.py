@@ -133,3 +133,13 @@ def test_rows_of_two_kinds_below_one_name_are_both_kept_and_so_is_a_rare_third(t
 def test_words_of_a_sample_make_no_rows(tmp_path):
     tagged = [{**row, "tags": ["walk", "fast"]} for row in FLAT]
     assert np.array_equal(read(tmp_path / "log.json", json.dumps(tagged)).imus["/imu0"].t_ns, 10_000_000 * np.arange(COUNT))
+
+
+@pytest.mark.parametrize("between", ["\n", ","])
+def test_vectors_in_texts_are_vectors(tmp_path, between):
+    """As NumPy prints them, padded to a width: a value a line, or one document."""
+    rows = [json.dumps({"t_ms": t, "gyro": str(np.array(g)), "accel": str(np.array(a))}) for t, g, a in SAMPLES]
+    text = between.join(rows)
+    imu = read(tmp_path / "log.json", text if between == "\n" else f"[{text}]").imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-8)
+    np.testing.assert_allclose(imu.accel, ACCEL)

@@ -247,6 +247,22 @@ def test_rows_that_name_their_numbers(tmp_path, row):
     assert "1 lines of other words are left out" in log.remarks.losses
 
 
+def test_rows_that_name_padded_numbers_between_lines_of_the_state(tmp_path):
+    gyro = np.round(COUNTS * 0.07, 2)
+    form = "t={:6d} ax={:7.3f} ay={:7.3f} az={:7.3f} gx={:8.2f} gy={:8.2f} gz={:8.2f}\nstate: sys 3, gyro 3, accel 0, mag 3\n"
+    rows = [form.format(1000 + 10 * n, *values) for n, values in enumerate(np.hstack([ACCEL_G, gyro]).tolist())]
+    (tmp_path / "serial.log").write_text("ready\n" + "".join(rows))
+    log = read(tmp_path / "serial.log")
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(gyro), rtol=1e-9)
+    assert log.remarks.losses == [f"{COUNT + 1} lines of other words are left out"]
+
+
+def test_a_header_that_is_shorter_than_its_rows_is_named(tmp_path):
+    path = write_csv(tmp_path / "imu.csv", ["time", "accel", "gyro"], [T_S, *ACCEL_G.T, *COUNTS.T])
+    with pytest.raises(ConfigError, match=r"the header has 3 names and the rows 7 fields.*\(time, accel, gyro\)"):
+        read(path)
+
+
 @pytest.mark.parametrize("row", ["a: 1 b: - 2 c: 3 d: 4 e: 5", "1.5,2.5,3.5,x: left,4.5", "level: 1, 2"])
 def test_other_rows_name_no_numbers(row):
     assert as_table("\n".join([row] * 20)) == ("", 0)
