@@ -174,9 +174,8 @@ def _rows(record: Row) -> list[Row]:
 
 
 def _flatten(node: Row, name: str, flat: Row, batches: dict[str, list[Any]]) -> None:
-    for key, value in node.items():
-        inner = f"{name}.{key}" if name else key
-        value = _vector(value) if isinstance(value, str) else value
+    for key, stated in node.items():
+        inner, value = f"{name}.{key}" if name else key, _vector(stated) if isinstance(stated, str) else stated
         if isinstance(value, dict):
             _flatten(value, inner, flat, batches)
         elif not isinstance(value, list):

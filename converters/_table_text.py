@@ -52,6 +52,7 @@ class Columns:
     texts: dict[str, list[str]] = field(default_factory=dict)
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
+    has_structures: bool = False  # whose fields follow a dot, which in the name of a plain table's column makes no group
 
     def add(self, name: str, array: Any, unit: str = "") -> None:
         """Take in an array of numbers of one, two or three dimensions."""
@@ -151,10 +152,10 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
     width = _width(rows, _fields(lines[:first], delimiter))
     names, units = _header(lines[:first], delimiter, width)
-    if names[:1] == ["column 1"] and delimiter is not None and (above := _fields(lines[:first], delimiter)[-1:]):
-        if 1 < len(above[0]) < width and not any(map(is_number, above[0])):
-            said = f"the header has {len(above[0])} names and the rows {width} fields: of which columns they are is not certain"
-            columns.remarks.losses.append(f"{said}, and they are not used ({', '.join(above[0])[:200]})")
+    above = _fields(lines[:first], delimiter)[-1] if first and delimiter is not None else []
+    if names[:1] == ["column 1"] and 1 < len(above) < width and not any(map(is_number, above)):
+        said = f"the header has {len(above)} names and the rows {width} fields: of which columns they are is not certain"
+        columns.remarks.losses.append(f"{said}, and they are not used ({', '.join(above)[:200]})")
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")

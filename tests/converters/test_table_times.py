@@ -361,3 +361,19 @@ def test_a_time_that_stands_in_some_rows_of_an_imu_loses_none_of_them(tmp_path):
     (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
     with pytest.raises(ConfigError, match="no column that rises looks like a time"):
         read(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("start_s", [2.0, 1000.0, 1.6e9])
+def test_a_structure_of_as_many_rows_as_the_imus_has_its_own_time(tmp_path, start_s):
+    """Also one on a clock apart from the IMU's, which is said."""
+    own_s = np.linspace(start_s, start_s + 15.0, COUNT)
+    gps = {"t": own_s, "lat": 52.0 + 1e-4 * T_S}
+    scipy.io.savemat(tmp_path / "log.mat", {"t": T_S, "gyro_rad_s": GYRO, "accel": ACCEL, "gps": gps})
+    log = read(tmp_path / "log.mat")
+    np.testing.assert_allclose(log.scalars["/gps_lat"].t_ns * 1e-9, own_s)
+    is_apart = "gps.t (in s) stays apart from the IMU's clock: gps.lat" in log.remarks.notes
+    assert is_apart == (start_s > 2.0)
+    assert log.remarks.losses == []
+    names = ["t", *(f"gyro.{a} [rad/s]" for a in "xyz"), *(f"accel.{a}" for a in "xyz"), "gps.t", "gps.lat"]
+    rows = read(write_csv(tmp_path / "log.csv", names, [T_S, *GYRO.T, *ACCEL.T, *gps.values()]))
+    assert np.array_equal(rows.scalars["/gps_lat"].t_ns, rows.imus["/imu0"].t_ns)  # of a row of text all columns are
