@@ -19,7 +19,7 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_dates import calendar_times, join_dates
+from ._table_dates import calendar_times, damaged_times, join_dates
 from ._table_names import unit_named
 from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers
 
@@ -189,6 +189,12 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
         columns.remarks.notes.extend(f"{name}: {note}" for note in dated[1])
     elif len(set(texts)) == 1:
         columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
+    elif damaged := damaged_times(texts):
+        usual = next(text for row, text in enumerate(texts, 1) if (row, text) not in damaged)
+        first = f"the first in row {damaged[0][0]}: {damaged[0][1][:40]!r}"
+        columns.remarks.losses.append(
+            f"{name} is left out: {len(damaged)} of its fields are no times as {usual!r} is ({first})"
+        )
     else:
         wrong = next((text for text in texts if text and not is_number(text)), texts[0])
         columns.remarks.losses.append(f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers")

@@ -377,3 +377,17 @@ def test_a_structure_of_as_many_rows_as_the_imus_has_its_own_time(tmp_path, star
     names = ["t", *(f"gyro.{a} [rad/s]" for a in "xyz"), *(f"accel.{a}" for a in "xyz"), "gps.t", "gps.lat"]
     rows = read(write_csv(tmp_path / "log.csv", names, [T_S, *GYRO.T, *ACCEL.T, *gps.values()]))
     assert np.array_equal(rows.scalars["/gps_lat"].t_ns, rows.imus["/imu0"].t_ns)  # of a row of text all columns are
+
+
+@pytest.mark.parametrize("damaged", ["34:22.9", "", "2026-03-01 12:3x:20"])
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%H:%M:%S.%f"])
+@pytest.mark.parametrize("row", [0, 100])
+def test_the_damaged_field_of_a_column_of_times_is_named(tmp_path, form, damaged, row):
+    texts = [(datetime(2026, 3, 1, 12) + timedelta(seconds=t)).strftime(form) for t in T_S[:200].tolist()]
+    texts[row] = damaged if form.startswith("%Y") or damaged != "34:22.9" else "Excel"
+    lines = [
+        ",".join([text, *map(repr, values)]) for text, values in zip(texts, np.hstack([GYRO, ACCEL]).tolist(), strict=False)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["time,gx,gy,gz,ax,ay,az", *lines]) + "\n")
+    with pytest.raises(ConfigError, match=rf"time is left out: 1 of its fields are no .* in row {row + 1}: {texts[row]!r}"):
+        read(tmp_path / "log.csv")
