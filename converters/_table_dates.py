@@ -68,7 +68,7 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
 
 
 def damaged_times(texts: list[str]) -> list[tuple[int, str]]:
-    """Rows and fields that have another form than the dates, or the clocks, that most fields are."""
+    """Rows and fields of another form than most, which are dates or clocks."""
     odd = ([(row, text) for row, text in enumerate(texts, 1) if not form.fullmatch(text)] for form in (DATE, CLOCK))
     return next((fields for fields in odd if len(fields) < len(texts) / 2), [])
 
