@@ -47,6 +47,26 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
 
 
+@pytest.mark.parametrize(("program", "start"), [("Excel", 25_569), ("MATLAB", 719_529)])
+@pytest.mark.parametrize("name", ["time", "Date", "datetime [days]"])
+def test_days_as_spreadsheets_count_them_are_utc(tmp_path, program, start, name):
+    days = start + 20_000.25 + T_S / 86_400
+    names = [name, *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "log.csv", names, [days, *GYRO.T, *ACCEL.T]))
+    expected = round(20_000.25 * 86_400e9) + NEXT_NS * np.arange(COUNT)
+    assert np.abs(log.imus["/imu0"].t_ns - expected).max() < 12_000  # a double of MATLAB's days keeps 10 us
+    assert f"{name!r} counts days as {program} does; it names no zone and counts as UTC" in log.remarks.notes
+    since = read(write_csv(tmp_path / "since.csv", ["time [days]", *names[1:]], [T_S / 86_400, *GYRO.T, *ACCEL.T]))
+    assert np.abs(since.imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
+@pytest.mark.parametrize("first", [100.0, 45_000.25, 738_000.5])
+def test_seconds_of_the_size_of_days_are_seconds(tmp_path, first):
+    names = ["time", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "log.csv", names, [first + T_S, *GYRO.T, *ACCEL.T]))
+    assert np.abs(log.imus["/imu0"].t_ns - first * 1e9 - NEXT_NS * np.arange(COUNT)).max() < 1000
+
+
 def test_gps_weeks_and_the_time_in_them_are_utc_across_the_end_of_a_week(tmp_path):
     names = ["GPS Week", "TOW (s)", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
     since_ms = (2394 * 604_800 + 604_800 - 10) * 1000 + 4 * np.arange(COUNT)

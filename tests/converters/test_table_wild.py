@@ -204,6 +204,16 @@ def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named,
     assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
 
 
+@pytest.mark.parametrize("unit", [" [ft/s^2]", " (ft/s2)", " [feet/s²]", " [ft/s/s]", " (ft/sec/sec)", "_ft_s2"])
+def test_feet_are_read_where_they_are_stated_alone(tmp_path, unit):
+    names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"acc_{a}{unit}" for a in "xyz")]
+    feet = 9.80665 / 0.3048 * ACCEL_G
+    imu = read(write_csv(tmp_path / "imu.csv", names, [T_S, *COUNTS.T, *feet.T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G)
+    with pytest.raises(ConfigError, match="no unit of the accel"):
+        read(write_csv(tmp_path / "imu.csv", [name.removesuffix(unit) for name in names], [T_S, *COUNTS.T, *feet.T]))
+
+
 def test_forces_are_no_accelerations(tmp_path):
     names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"F{a}" for a in "xyz")]
     with pytest.raises(ConfigError, match="no unit of the accel"):
