@@ -18,7 +18,6 @@ import numpy as np
 from imutool.errors import DataError
 
 from ._table_headerless import name_headerless
-from ._table_numbers import is_number
 from ._table_packed import read_bytes
 from ._table_sensors import name_columns, read_rows, sensors_among
 from ._table_text import Columns, read_csv
@@ -174,8 +173,8 @@ def _rows(record: Row) -> list[Row]:
 
 
 def _flatten(node: Row, name: str, flat: Row, batches: dict[str, list[Any]]) -> None:
-    for key, stated in node.items():
-        inner, value = f"{name}.{key}" if name else key, _vector(stated) if isinstance(stated, str) else stated
+    for key, value in node.items():
+        inner = f"{name}.{key}" if name else key
         if isinstance(value, dict):
             _flatten(value, inner, flat, batches)
         elif not isinstance(value, list):
@@ -184,13 +183,6 @@ def _flatten(node: Row, name: str, flat: Row, batches: dict[str, list[Any]]) -> 
             flat |= {f"{inner}[{n}]": each for n, each in enumerate(value)}
         else:
             batches[inner] = value
-
-
-def _vector(text: str) -> list[str] | str:
-    """Fields of a vector in a text, as NumPy prints one: `[ 0.1 -0.2  9.8]`; any other text as it is."""
-    match = re.fullmatch(r"\s*\[([^\[\]]*)\]\s*", text)
-    fields = re.split(r"[\s,;]+", match[1].strip()) if match else []
-    return fields if len(fields) > 1 and all(map(is_number, fields)) else text
 
 
 def _text(rows: list[Row]) -> str:

@@ -21,7 +21,7 @@ from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
 from ._table_names import unit_named
-from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers
+from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers, vector, vectors
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
@@ -128,7 +128,11 @@ def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:
     """Whether a line has `least` numbers."""
-    return not line.startswith(COMMENTS) and sum(map(is_number, line.split(delimiter))) >= least
+    fields = [] if line.startswith(COMMENTS) else line.split(delimiter)
+    if any(mark in line for mark in "[(") and delimiter is not None:
+        (fields,) = _fields([line], delimiter)
+        fields = [number for field in fields for number in vector(field) or [field]]
+    return sum(map(is_number, fields)) >= least
 
 
 def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS) -> None:
@@ -179,8 +183,10 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
 
 
 def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
-    """Add a column of texts as numbers or times, or say what it is instead."""
-    if (found := numbers(texts)) is not None:
+    """Add a column of texts as numbers, vectors or times, or say what it is instead."""
+    if (rows := vectors(texts)) is not None:
+        columns.add(name, rows, unit)
+    elif (found := numbers(texts)) is not None:
         columns.values[name], columns.texts[name], columns.units[name] = found[0], texts, unit
         if odd := found[1]:
             columns.remarks.notes.append(f"{name}: {len(odd)} fields, as {odd[0][:40]!r}, are no numbers and count as missing")

@@ -63,9 +63,9 @@ def join_gps_weeks(columns: Columns) -> None:
 
 
 def read_serial_days(columns: Columns) -> None:
-    """Make nanoseconds of times in days as Excel (since 1899-12-30) and MATLAB (since the year 0) count them.
+    """Make nanoseconds of times in days as Excel and MATLAB count them.
 
-    Steps of a sensor are so small in days that they fit no other unit.
+    They begin in 1899 and in the year 0. Steps of a sensor are so small in days that they fit no other unit.
     """
     for column, values in columns.values.items():
         name, unit = name_and_unit(column, columns.units.get(column, ""))
