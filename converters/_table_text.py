@@ -20,7 +20,7 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
-from ._table_names import unit_named
+from ._table_names import TIME_WORDS, split_name, unit_named
 from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers, vector, vectors
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
@@ -158,8 +158,10 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     names, units = _header(lines[:first], delimiter, width)
     above = _fields(lines[:first], delimiter)[-1] if first and delimiter is not None else []
     if names[:1] == ["column 1"] and 1 < len(above) < width and not any(map(is_number, above)):
-        said = f"the header has {len(above)} names and the rows {width} fields: of which columns they are is not certain"
-        columns.remarks.losses.append(f"{said}, and they are not used ({', '.join(above)[:200]})")
+        named = ", ".join(above)[:200]
+        said = f"the line above the rows has {len(above)} fields and the rows {width}: it names no column ({named})"
+        is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, above))  # else perhaps a title
+        (columns.remarks.losses if is_header else columns.remarks.notes).append(said)
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
