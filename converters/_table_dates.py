@@ -67,6 +67,12 @@ def calendar_times(texts: list[str]) -> tuple[Int64[np.ndarray, " n"], list[str]
     return np.array(stamps, np.int64), notes
 
 
+def damaged_times(texts: list[str]) -> list[tuple[int, str]]:
+    """Rows and fields of another form than most, which are dates or clocks."""
+    odd = ([(row, text) for row, text in enumerate(texts, 1) if not form.fullmatch(text)] for form in (DATE, CLOCK))
+    return next((fields for fields in odd if len(fields) < len(texts) / 2), [])
+
+
 def join_dates(names: list[str], fields: list[list[str]]) -> None:
     """Make one column of a column of dates and that of their clocks."""
     dates = [n for n, texts in enumerate(fields) if re.fullmatch(DAY, next(iter(texts), ""))]

@@ -245,13 +245,14 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: b
     A unit that is not stated is the one in which it covers the IMU's time best; of a clock `apart` from the IMU's the one in
     which it lasts about as long.
     """
-    if "/" not in column and len(columns.values[column]) == len(columns.values[time]):
-        return None  # a dot in the name of a plain table's column makes no group
+    length = len(columns.values[column])
+    if "/" not in column and not columns.has_structures and length == len(columns.values[time]):
+        return None
     group, other = group_of(column), ""
     while group and not other:
-        for wanted, values in columns.values.items():
-            if group_of(wanted) == group and is_time(wanted) and len(values) == len(columns.values[column]) and goes_on(values):
-                other = other or wanted
+        long = {c: values for c, values in columns.values.items() if group_of(c) == group and len(values) == length}
+        found = [c for c, values in long.items() if is_time(c) and goes_on(values)]
+        other = time if time in found else next(iter(found), "")
         group = group_of(group)
     if other in ("", time):
         return None

@@ -30,7 +30,7 @@ ROS_IMU = [  # `ros2 topic echo --csv` of sensor_msgs/Imu
     *(f"linear_acceleration_covariance{place}" for place in SQUARE),
 ]
 LOOKED_AT = 200  # first lines, which show the words between the numbers
-LEAST_ROWS, LEAST_SHARE = 5, 0.5  # of the lines looked at that have the same words
+LEAST_ROWS, LEAST_SHARE = 5, 0.3  # of the lines looked at that have the same words; status lines may stand between
 LEAST_TENTH = 0.5  # of the median length, which 90 % of an accelerometer's readings exceed
 LEAST_NUMBERS, LEAST_LABELS = 4, 2  # in a row
 LONGEST_LINE, LONGEST_LABEL = 2_000, 80  # characters; the search for labels costs the square of their length
@@ -160,7 +160,7 @@ def _words(line: str) -> tuple[str, ...]:
     """What stands before each number and behind the last; empty where fewer than two numbers have a label."""
     if len(line) > LONGEST_LINE:
         return ()
-    words = tuple(NUMBER.split(line)[::2])
+    words = tuple(" ".join(text.split()) for text in NUMBER.split(line)[::2])  # numbers may be padded to a width
     named = sum(bool(LABEL.search(text[-LONGEST_LABEL:])) for text in words[:-1])
     return words if len(words) > LEAST_NUMBERS and named >= LEAST_LABELS and not any(map(SIGN.search, words)) else ()
 

@@ -39,6 +39,7 @@ def load_mat(path: Path, columns: Columns) -> None:
         if not has_objects:
             raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
         content = {}
+    columns.has_structures = True
     for name, value in _flat(content):
         labels = [str(label) for label in np.ravel(content.get(f"{name}_label", []))]  # as Mission Planner writes a log
         if np.ndim(value) == 2 and len(labels) == value.shape[1]:

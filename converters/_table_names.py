@@ -17,6 +17,7 @@ UNITS = {
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
+    "ft/s^2": r"(ft|feet|foot)/s(ec)?((\^|\*\*)?2|²|/s(ec)?)|(ft|feet|foot)[ .·]?s\^?-2|fps\^?2|ft_?(per_?)?s_?2",
     "mg": r"mg|milli[ -]?gs?",
     "g": r"gs?",
     "ns": r"ns|nanoseconds?|nsec",
@@ -25,11 +26,12 @@ UNITS = {
     "s": r"s|sec|seconds?",
     "min": r"min(ute)?s?",
     "h": r"h|hrs?|hours?",
+    "day": r"days?",
     "m": r"m|met(er|re)s?",
     "cm": r"cm|centimet(er|re)s?",
     "mm": r"mm|millimet(er|re)s?",
 }
-RATE_OR_FORCE_UNITS = r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|m_(?:per_)?s_?2|mg"  # in a name
+RATE_OR_FORCE_UNITS = r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|(?:m|ft)_(?:per_)?s_?2|mg"  # in a name
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
 ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth|ref|reference)(_|$)"  # no sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion

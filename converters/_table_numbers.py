@@ -17,6 +17,21 @@ def is_number(text: str) -> bool:
     return _number(text) is not None or ("_" not in text and bool(COMMA_NUMBER.fullmatch(text)))
 
 
+def vector(text: str) -> list[str]:
+    """Numbers of a vector in a text, as NumPy prints it: `[ 0.1 -0.2  9.8]`; none of others."""
+    match = re.fullmatch(r"\s*[\[(]([^\[\]()]*)[\])]\s*", text)
+    fields = re.split(r"[\s,;]+", match[1].strip()) if match else []
+    return fields if len(fields) > 1 and all(_number(field) is not None for field in fields) else []
+
+
+def vectors(texts: list[str]) -> np.ndarray | None:
+    """Vectors of a column; None of other texts, or of several lengths."""
+    if not vector(texts[0]):
+        return None
+    found = [vector(text) for text in texts]
+    return np.array(found).astype(np.float64) if len({*map(len, found)}) == 1 else None
+
+
 def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
     """Fields with points for their decimal commas; none where no field has one."""
     has_one = any("," in text and mark.fullmatch(text) for text in texts)

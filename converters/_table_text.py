@@ -19,9 +19,9 @@ from imutool.array_types import Float64
 from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
-from ._table_dates import calendar_times, join_dates
-from ._table_names import unit_named
-from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers
+from ._table_dates import calendar_times, damaged_times, join_dates
+from ._table_names import TIME_WORDS, split_name, unit_named
+from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers, vector, vectors
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
@@ -52,6 +52,7 @@ class Columns:
     texts: dict[str, list[str]] = field(default_factory=dict)
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
+    has_structures: bool = False  # whose fields follow a dot, which in the name of a plain table's column makes no group
 
     def add(self, name: str, array: Any, unit: str = "") -> None:
         """Take in an array of numbers of one, two or three dimensions."""
@@ -127,7 +128,11 @@ def _delimiter(rows: list[str], least: int = LEAST_NUMBERS) -> str | None:
 
 def _is_row(line: str, delimiter: str | None, least: int) -> bool:
     """Whether a line has `least` numbers."""
-    return not line.startswith(COMMENTS) and sum(map(is_number, line.split(delimiter))) >= least
+    fields = [] if line.startswith(COMMENTS) else line.split(delimiter)
+    if any(mark in line for mark in "[(") and delimiter is not None:
+        (fields,) = _fields([line], delimiter)
+        fields = [number for field in fields for number in vector(field) or [field]]
+    return sum(map(is_number, fields)) >= least
 
 
 def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS) -> None:
@@ -151,6 +156,12 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
     width = _width(rows, _fields(lines[:first], delimiter))
     names, units = _header(lines[:first], delimiter, width)
+    above = _fields(lines[:first], delimiter)[-1] if first and delimiter is not None else []
+    if names[:1] == ["column 1"] and 1 < len(above) < width and not any(map(is_number, above)):
+        named = ", ".join(above)[:200]
+        said = f"the line above the rows has {len(above)} fields and the rows {width}: it names no column ({named})"
+        is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, above))  # else perhaps a title
+        (columns.remarks.losses if is_header else columns.remarks.notes).append(said)
     whole = [row for row in rows if len(row) == width]
     if len(whole) < len(rows):
         columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
@@ -174,8 +185,10 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
 
 
 def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
-    """Add a column of texts as numbers or times, or say what it is instead."""
-    if (found := numbers(texts)) is not None:
+    """Add a column of texts as numbers, vectors or times, or say what it is instead."""
+    if (rows := vectors(texts)) is not None:
+        columns.add(name, rows, unit)
+    elif (found := numbers(texts)) is not None:
         columns.values[name], columns.texts[name], columns.units[name] = found[0], texts, unit
         if odd := found[1]:
             columns.remarks.notes.append(f"{name}: {len(odd)} fields, as {odd[0][:40]!r}, are no numbers and count as missing")
@@ -184,6 +197,12 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
         columns.remarks.notes.extend(f"{name}: {note}" for note in dated[1])
     elif len(set(texts)) == 1:
         columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
+    elif damaged := damaged_times(texts):
+        usual = next(text for row, text in enumerate(texts, 1) if (row, text) not in damaged)
+        first = f"the first in row {damaged[0][0]}: {damaged[0][1][:40]!r}"
+        columns.remarks.losses.append(
+            f"{name} is left out: {len(damaged)} of its fields are no times as {usual!r} is ({first})"
+        )
     else:
         wrong = next((text for text in texts if text and not is_number(text)), texts[0])
         columns.remarks.losses.append(f"{name} is left out: its fields, as {wrong[:40]!r}, are no numbers")

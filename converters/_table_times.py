@@ -12,7 +12,7 @@ from imutool.errors import ConfigError
 from imutool.recording.message_log import MessageLog
 
 from ._table_dates import WEEK_NS, gps_times
-from ._table_names import split_name, unit_named
+from ._table_names import TIME_WORDS, name_and_unit, split_name, unit_named
 from ._table_text import Columns
 from ._table_units import TIME_NS, USUAL_TIME_NS
 
@@ -33,6 +33,9 @@ GPS_TIME = "gps_time [ns]"
 GPS_WEEK = r"(.*_)?(gps_?)?(week|wk|gwk|wn)(_?(no?|num(ber)?))?"
 TIME_OF_WEEK = r"(.*_)?((gps_?)?(tow|sow|time_?of_?week|sec(onds)?_?of_?week)|gps_?(time|sec(onds)?))"
 LEAST_WEEK, MOST_WEEK = 990, 5000  # of 1999, before which receivers counted again from 0, and of 2075
+DAY_NS = 86_400 * NS
+SERIAL_DAYS = {"Excel": 25_569, "MATLAB": 719_529}  # days of their calendars at the start of 1970
+FIRST_DAY, LAST_DAY = 10_957, 47_482  # of 2000 and of 2100, since 1970
 WORD_SIZES = 2**8, 2**16, 2**32  # at which a counter begins again
 
 
@@ -57,6 +60,27 @@ def join_gps_weeks(columns: Columns) -> None:
         columns.texts.pop(column, None)
     columns.values, columns.units[GPS_TIME] = {GPS_TIME: t_ns, **columns.values}, "ns"
     columns.remarks.notes.append(f"{weeks[0]!r} and {times[0]!r} are UTC in the log, {leap_s} leap seconds behind GPS")
+
+
+def read_serial_days(columns: Columns) -> None:
+    """Make nanoseconds of times in days as Excel and MATLAB count them.
+
+    They begin in 1899 and in the year 0. Steps of a sensor are so small in days that they fit no other unit.
+    """
+    for column, values in columns.values.items():
+        name, unit = name_and_unit(column, columns.units.get(column, ""))
+        is_named = re.search(r"time|date|day|stamp|utc", name) or re.fullmatch(TIME_WORDS, name)
+        if values.dtype.kind != "f" or unit not in ("", "day") or not is_named or not np.isfinite(values).all():
+            continue
+        for program, start in SERIAL_DAYS.items():
+            days = values.astype(np.float64) - start
+            if not (FIRST_DAY <= days.min(initial=np.inf) <= days.max(initial=0.0) <= LAST_DAY and goes_on(values)):
+                continue
+            step_ns = float(np.median(np.diff(days))) * DAY_NS
+            if step_ns > 0.0 and SLOWEST_HZ[1] <= NS / step_ns <= PLAUSIBLE_HZ[1]:
+                columns.values[column], columns.units[column] = np.rint(days * DAY_NS).astype(np.int64), "ns"
+                columns.texts.pop(column, None)
+                columns.remarks.notes.append(f"{column!r} counts days as {program} does; it names no zone and counts as UTC")
 
 
 def rises(values: np.ndarray) -> bool:

@@ -16,10 +16,10 @@ from imutool.recording.joined_imu import unit_by_gravity
 from ._table_text import Columns
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-TIME_NS = {**USUAL_TIME_NS, "100us": 1e5, "min": 60e9, "h": 3600e9}  # the last three only where they are stated
+TIME_NS = {**USUAL_TIME_NS, "100us": 1e5, "min": 60e9, "h": 3600e9, "day": 86400e9}  # the last four only where they are stated
 GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
 STANDARD_GRAVITY = 9.80665
-ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01}
+ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01, "ft/s^2": 0.3048}
 POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 ANGLE_SI = {"deg": np.pi / 180.0, "rad": 1.0}
 UNITS_OF: dict[str, dict[str, float]] = {
@@ -61,7 +61,7 @@ def gravity_units(columns: Columns, chosen: Sequence[str], factor: float = 1.0) 
     """Median length times a factor, and units in which it is gravity; none for motion alone."""
     level = factor * _usual(np.linalg.norm([columns.values[c].astype(float) for c in chosen], axis=0), 0.5)
     return level, [] if is_motion_alone(columns, chosen) else [
-        u for u, size in ACCEL_SI.items() if abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND
+        u for u, size in ACCEL_SI.items() if u != "ft/s^2" and abs(level * size / STANDARD_GRAVITY - 1.0) < GRAVITY_BAND
     ]
 
 

@@ -267,33 +267,34 @@ def _further(
 ) -> tuple[dict[str, Scalars], dict[str, str]]:
     """Further columns as topics, on the clock of their group or on an IMU's, and short ones without time as texts."""
     times = [(each, times_named(columns, each.time, each.time_unit, where)) for each in tables]
-    clocks: dict[str, Int64[np.ndarray, " n"]] = {}
-    constants, left = {}, []
+    constants, left, clocks, apart = {}, [], dict[str, Int64[np.ndarray, " n"]](), dict[str, list[str]]()
     for column in [c for c in columns.values if c not in used]:
         table, t_ns = max(times, key=lambda each: shared_group(each[0].time, column))
-        beside = time_beside(columns, column, table.time, table.time_unit)
+        beside = time_beside(columns, column, table.time, table.time_unit, apart=True)
         if beside is not None:
             if beside[0] != column:
-                clocks[column] = times_named(columns, *beside, where)
+                clocks[column] = own_ns = times_named(columns, *beside, where)
+                if own_ns[0] > t_ns[-1] or own_ns[-1] < t_ns[0]:
+                    apart.setdefault(f"{beside[0]} (in {beside[1]})", []).append(column)
         elif len(columns.values[column]) == len(t_ns):
             clocks[column] = t_ns
         elif len(columns.values[column]) <= MOST_CONSTANTS:
             constants[column] = str(columns.values[column].tolist())
         else:
             left.append(column)
+    notes = (f"{clock} stays apart from the IMU's clock: {', '.join(names[:20])}" for clock, names in apart.items())
+    columns.remarks.notes.extend(notes)
     if left:
-        said = f"columns of another length than the IMU's, without a time on its clock, are left out: {', '.join(left[:20])}"
-        columns.remarks.losses.append(said)
-    if len(clocks) > MOST_SCALARS:
-        said = f"the table has {len(clocks)} further columns: {len(clocks) - MOST_SCALARS} of them are left out"
-        columns.remarks.losses.append(said)
+        said = "columns of another length than the IMU's, without a time, are left out"
+        columns.remarks.losses.append(f"{said}: {', '.join(left[:20])}")
+    if (over := len(clocks) - MOST_SCALARS) > 0:
+        columns.remarks.losses.append(f"the table has {len(clocks)} further columns: {over} of them are left out")
     scalars = {}
     for column, times_ns in list(clocks.items())[:MOST_SCALARS]:
         kept = in_order(times_ns, columns.values[column].astype(np.float64)[:, None], column)
         if len(kept.t_ns):
             unit = re.search(r"[\[(]([^\])]*)[\])]\s*$", column)
             topic = re.sub(r"[^A-Za-z0-9_]+", "_", column).strip("_") or "column"
-            scalars[f"/{topic if topic[0].isalpha() else f'column_{topic}'}"] = Scalars(
-                kept.t_ns, kept.values, unit[1] if unit else ""
-            )
+            topic = f"/{topic}" if topic[0].isalpha() else f"/column_{topic}"
+            scalars[topic] = Scalars(kept.t_ns, kept.values, unit[1] if unit else "")
     return scalars, constants

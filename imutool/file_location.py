@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, ForwardRef, NamedTuple, TypeAlias
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from imutool.errors import ConfigError, redact
 
@@ -37,6 +37,7 @@ STORES = {
     "https": CLOUD,
     "memory": CLOUD,
 }
+WEB = "http://", "https://"  # URLs whose names are percent-encoded; those of stores are not
 ACCOUNTS = ("az", "abfs")  # their URLs say CONTAINER@ACCOUNT, which is not secret
 BLOCK_BYTES = 4 << 20
 COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"\x04\x22\x4d\x18": "lz4"}
@@ -107,6 +108,11 @@ def location(path: object) -> Location:
         return path  # type: ignore[return-value]
     what = f"an argument is of type {type(path).__name__}"
     raise ConfigError(what, expected="a path or a URL", fix="`imutool.write` makes a log of arrays")
+
+
+def log_name(where: Location) -> str:
+    """Name of a log: that of its file without the suffix."""
+    return unquote(where.stem) if str(where).startswith(WEB) else where.stem
 
 
 def local(path: object, parameter: str) -> Path:

@@ -259,16 +259,16 @@ class _Quiet(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None: ...
 
 
-def test_a_web_server_s_log_is_debiased_as_the_file_is(logs: Path, tmp_path: Path) -> None:
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(logs))) as server:
+def test_a_web_server_s_log_is_debiased_as_the_file_is_under_its_own_name(logs: Path, tmp_path: Path) -> None:
+    model, file = logs / "linear.safetensors", tmp_path / "two words.mcap"
+    file.write_bytes((logs / "flight_1.mcap").read_bytes())
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(tmp_path))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        log = to_location(f"http://127.0.0.1:{server.server_port}/flight_1.mcap")
-        report = debias(log, tmp_path / "out.mcap", model=logs / "linear.safetensors")
+        log = to_location(f"http://127.0.0.1:{server.server_port}/two%20words.mcap")
+        assert inspect(log).log == "two words"
+        report = debias(log, tmp_path / "out.mcap", model=model)
         server.shutdown()
-    assert (
-        report.rewrite.added
-        == debias(logs / "flight_1.mcap", tmp_path / "b.mcap", model=logs / "linear.safetensors").rewrite.added
-    )
+    assert report.rewrite.added == debias(file, tmp_path / "b.mcap", model=model).rewrite.added
 
 
 def test_a_name_with_a_zero_byte_is_said() -> None:

@@ -37,7 +37,7 @@ from imutool.cleaning import Survey, cleaned
 from imutool.cleaning.survey import raw_batches
 from imutool.cleaning.truth import read_truth
 from imutool.errors import ConfigError, DataError, LogError, ModelError
-from imutool.file_location import Location
+from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import Blocks, block_statistics, white_noise
 from imutool.log_info.convention_report import contradictions, warn_of_conventions
 from imutool.mcap_io.codec import schemas
@@ -245,7 +245,7 @@ def _first_minute(log: Log, topic: str, init: str, survey: Survey | None) -> Rec
     samples = _samples(log, topic, survey, end_ns if survey is None else survey.start_ns + nanoseconds(HEAD_S))
     if init.partition(":")[0] == "truth":
         return longest_recording(read_recordings(log, imu=topic, end_ns=end_ns, samples=samples))
-    return Recording(log.path.stem, samples, imu_topic=topic, source=str(log.path))
+    return Recording(log_name(log.path), samples, imu_topic=topic, source=str(log.path))
 
 
 def _samples(log: Log, topic: str, survey: Survey | None, end_ns: int | None = None) -> Imu:

@@ -21,7 +21,7 @@ from typer.models import CommandFunctionType
 
 from imutool import __version__, registry
 from imutool.cli.overview import ABOUT, show
-from imutool.cli.parameters import PlainValue, current, error_with_flags, flags, instead_of, with_flags
+from imutool.cli.parameters import FOLDERS, PlainValue, current, error_with_flags, flags, instead_of, with_flags
 from imutool.cli.terminal import log_to_stderr, plain, progress, say, tell_error, write_json
 from imutool.errors import INTERRUPTED, ConfigError, ImutoolError, redact, was_interrupted
 from imutool.file_location import first_bytes
@@ -124,7 +124,7 @@ class Command(TyperCommand):
         flag_of = flags(self)
         current.set(flag_of)
         try:
-            self._check(ctx.params)
+            self._check(ctx.params, ctx.meta)
             return super().invoke(ctx)
         except ImutoolError as error:
             values = ctx.params.values()
@@ -133,16 +133,16 @@ class Command(TyperCommand):
         except KeyboardInterrupt as interrupt:
             raise KeyboardInterrupt(with_flags(str(interrupt), flag_of)) from interrupt
 
-    def _check(self, values: Mapping[str, Any]) -> None:
+    def _check(self, values: Mapping[str, Any], told: Mapping[str, Any]) -> None:
         """Refuse outputs that would destroy something; on --resume a report of the run before may be replaced."""
         marks = written(type(self).function)
         places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
+        places |= {name: f"{place}/" for name, place in places.items() if isinstance(place, Path) and told.get(FOLDERS + name)}
         wanted = [
             replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and _is_report(place)))
             for name, place in places.items()
         ]
-        inputs = [value for name, value in values.items() if name not in marks]
-        check_outputs(wanted, inputs, overwrite=bool(values.get("overwrite")))
+        check_outputs(wanted, [values[name] for name in values if name not in marks], overwrite=bool(values.get("overwrite")))
 
 
 def _is_report(place: str | Path | None) -> bool:

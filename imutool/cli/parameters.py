@@ -45,6 +45,7 @@ TAUGHT_ELSEWHERE = (
     (("--topic",), ("--imu",)),
     (("--jobs", "-j"), ("--workers",)),
 )
+FOLDERS = "imutool.folder."  # begins the key in a context of whether a parameter's word ends in a slash
 LIKE = 0.75  # of a misspelt option to the one that is meant, by difflib
 current: ContextVar[Mapping[str, str]] = ContextVar("flags of the command that runs", default={})  # noqa: B039  never changed
 QUOTED = re.compile(r"`([a-z_]+)(?:=([^`]*))?`")
@@ -141,6 +142,7 @@ class PlainValue:
         unreadable = self._kind is Path and any(Path(word).exists() and not os.access(word, os.R_OK) for word in words)
         if self._kind is None or unreadable or not all(isinstance(word, str | Path) for word in words):
             return self._otherwise().coerce(value, param=param, ctx=ctx)
+        ctx.meta[f"{FOLDERS}{param.name}"] = any(str(word).endswith(("/", os.sep)) for word in words)  # a Path does not
         found = [_of_url(word) if self._kind is Path and "://" in str(word) else self._kind(word) for word in words]
         return found if several else found[0]
 

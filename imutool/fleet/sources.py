@@ -17,8 +17,19 @@ from urllib.parse import quote
 import msgspec
 
 from imutool.errors import ConfigError, redact
-from imutool.file_location import Location, exists, identity, io_errors, is_file, is_folder, reason, size_and_etag, to_location
-from imutool.fleet.targets import WEB, relative, shown
+from imutool.file_location import (
+    WEB,
+    Location,
+    exists,
+    identity,
+    io_errors,
+    is_file,
+    is_folder,
+    reason,
+    size_and_etag,
+    to_location,
+)
+from imutool.fleet.targets import relative, shown
 from imutool.fleet.task import Source
 
 logger = logging.getLogger(__name__)

@@ -8,12 +8,11 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from imutool.errors import ConfigError, ImutoolError
-from imutool.file_location import Location, identity, io_errors, is_file, reason
+from imutool.file_location import WEB, Location, identity, io_errors, is_file, reason
 from imutool.fleet.task import Result
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.source import sha256
 
-WEB = "http://", "https://"  # URLs whose names are percent-encoded; those of stores are not
 LONGEST = 200  # bytes of one part of a name: room for what is written beside it under another, within the usual 255
 PARTIAL = re.compile(r"\.(?P<name>.+)\.\d+\.[0-9a-f]{8,24}\.partial", re.DOTALL)
 OWN = "fleet."  # how the names of what the fleet itself writes at the top of OUT begin

@@ -19,7 +19,7 @@ from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
 from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
-from imutool.file_location import Location
+from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import rest_stretches
 from imutool.log_info.convention_report import (
     QUATERNIONS,
@@ -96,7 +96,7 @@ def describe(log: RecoveredLog, *, check: bool = True) -> LogInfo:
     stamps = [clock for clock in clocks.values() if len(clock)]
     first, last = min((int(c.min()) for c in stamps), default=None), max((int(c.max()) for c in stamps), default=None)
     return LogInfo(
-        log=log.path.stem,
+        log=log_name(log.path),
         path=str(log.path),
         bytes=log.path.stat().st_size,
         profile=log.index.header.profile,

@@ -13,7 +13,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64, UInt32
 from imutool.errors import LogError
-from imutool.file_location import Location
+from imutool.file_location import Location, log_name
 from imutool.mcap_io.codec import messages, schemas
 from imutool.mcap_io.codec.decode import decode_image
 from imutool.mcap_io.log import Log
@@ -99,7 +99,7 @@ def read_recordings(
     found = []
     for run in columns.runs(samples):
         recording = Recording(
-            name=own.get("name", log.path.stem),
+            name=own.get("name", log_name(log.path)),
             imu=columns.imu() if samples is None else samples,
             truths=columns.truths(truth),
             scalars=columns.scalars(),

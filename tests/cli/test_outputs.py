@@ -222,13 +222,9 @@ def test_a_suffix_that_does_not_fit_is_refused(refused: Refused, tmp_path: Path,
     assert re.search(rf"expected .*{re.escape(suffixes[0])}", said)
 
 
-@pytest.mark.parametrize(
-    ("command", "parameter"),
-    [("debias", "target"), ("simulate", "target"), ("train", "model"), ("info", "json_to"), ("repair", "target")],
-)
+@pytest.mark.parametrize(("command", "parameter"), FILES)
 def test_a_file_that_is_named_as_a_folder_is_refused(refused: Refused, tmp_path: Path, command: str, parameter: str) -> None:
-    """`debias LOG new/` wrote a file `new`."""
-    assert (command, parameter) in FILES
+    """`debias LOG new/` and `view LOG --html new/` wrote a file `new`."""
     said = refused(USAGE, command, *line(command, parameter, "new/"))
     assert "new/: ends in a slash, as the name of a folder; expected the name of a file. Write the file's own name" in said
     assert not (tmp_path / "new").exists()

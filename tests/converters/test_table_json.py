@@ -133,3 +133,19 @@ def test_rows_of_two_kinds_below_one_name_are_both_kept_and_so_is_a_rare_third(t
 def test_words_of_a_sample_make_no_rows(tmp_path):
     tagged = [{**row, "tags": ["walk", "fast"]} for row in FLAT]
     assert np.array_equal(read(tmp_path / "log.json", json.dumps(tagged)).imus["/imu0"].t_ns, 10_000_000 * np.arange(COUNT))
+
+
+@pytest.mark.parametrize("form", ["lines", "document", "csv"])
+@pytest.mark.parametrize("printed", [lambda vector: str(np.array(vector)), str, lambda vector: str((*vector,))])
+def test_vectors_in_texts_are_vectors(tmp_path, form, printed):
+    """As Python prints them and NumPy, which pads them to a width."""
+    rows = [{"t_ms": t, "gyro": printed(g), "accel": printed(a)} for t, g, a in SAMPLES]
+    lines = [json.dumps(row) for row in rows]
+    text = {
+        "lines": "\n".join(lines),
+        "document": f"[{','.join(lines)}]",
+        "csv": "\n".join(["t_ms,gyro,accel", *(f'{row["t_ms"]},"{row["gyro"]}","{row["accel"]}"' for row in rows)]),
+    }[form]
+    imu = read(tmp_path / "log.json", text).imus["/imu0"]
+    np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-8)
+    np.testing.assert_allclose(imu.accel, ACCEL)

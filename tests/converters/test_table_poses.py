@@ -171,9 +171,7 @@ def test_files_that_are_numbered_in_turn_are_the_imus_whose_names_they_share(tmp
     log = read(tmp_path)
     assert {*log.imus} == {"/imu/imu", "/second/imu"}
     assert not [topic for topic in log.scalars if "location" in topic]
-    assert any(
-        "without a time on its clock, are left out: " in loss and "location_8/lat" in loss for loss in log.remarks.losses
-    )
+    assert any("without a time, are left out: " in loss and "location_8/lat" in loss for loss in log.remarks.losses)
 
 
 @pytest.mark.parametrize("first", [0, 1])

@@ -47,6 +47,26 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
 
 
+@pytest.mark.parametrize(("program", "start"), [("Excel", 25_569), ("MATLAB", 719_529)])
+@pytest.mark.parametrize("name", ["time", "Date", "datetime [days]"])
+def test_days_as_spreadsheets_count_them_are_utc(tmp_path, program, start, name):
+    days = start + 20_000.25 + T_S / 86_400
+    names = [name, *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "log.csv", names, [days, *GYRO.T, *ACCEL.T]))
+    expected = round(20_000.25 * 86_400e9) + NEXT_NS * np.arange(COUNT)
+    assert np.abs(log.imus["/imu0"].t_ns - expected).max() < 12_000  # a double of MATLAB's days keeps 10 us
+    assert f"{name!r} counts days as {program} does; it names no zone and counts as UTC" in log.remarks.notes
+    since = read(write_csv(tmp_path / "since.csv", ["time [days]", *names[1:]], [T_S / 86_400, *GYRO.T, *ACCEL.T]))
+    assert np.abs(since.imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
+@pytest.mark.parametrize("first", [100.0, 45_000.25, 738_000.5])
+def test_seconds_of_the_size_of_days_are_seconds(tmp_path, first):
+    names = ["time", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "log.csv", names, [first + T_S, *GYRO.T, *ACCEL.T]))
+    assert np.abs(log.imus["/imu0"].t_ns - first * 1e9 - NEXT_NS * np.arange(COUNT)).max() < 1000
+
+
 def test_gps_weeks_and_the_time_in_them_are_utc_across_the_end_of_a_week(tmp_path):
     names = ["GPS Week", "TOW (s)", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
     since_ms = (2394 * 604_800 + 604_800 - 10) * 1000 + 4 * np.arange(COUNT)
@@ -360,4 +380,34 @@ def test_a_time_that_stands_in_some_rows_of_an_imu_loses_none_of_them(tmp_path):
     rows = [f"{n if n % 5 == 0 else ''},{','.join(map(repr, row))}" for n, row in enumerate(np.hstack([GYRO, ACCEL]).tolist())]
     (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
     with pytest.raises(ConfigError, match="no column that rises looks like a time"):
+        read(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("start_s", [2.0, 1000.0, 1.6e9])
+def test_a_structure_of_as_many_rows_as_the_imus_has_its_own_time(tmp_path, start_s):
+    """Also one on a clock apart from the IMU's, which is said."""
+    own_s = np.linspace(start_s, start_s + 15.0, COUNT)
+    gps = {"t": own_s, "lat": 52.0 + 1e-4 * T_S}
+    scipy.io.savemat(tmp_path / "log.mat", {"t": T_S, "gyro_rad_s": GYRO, "accel": ACCEL, "gps": gps})
+    log = read(tmp_path / "log.mat")
+    np.testing.assert_allclose(log.scalars["/gps_lat"].t_ns * 1e-9, own_s)
+    is_apart = "gps.t (in s) stays apart from the IMU's clock: gps.lat" in log.remarks.notes
+    assert is_apart == (start_s > 2.0)
+    assert log.remarks.losses == []
+    names = ["t", *(f"gyro.{a} [rad/s]" for a in "xyz"), *(f"accel.{a}" for a in "xyz"), "gps.t", "gps.lat"]
+    rows = read(write_csv(tmp_path / "log.csv", names, [T_S, *GYRO.T, *ACCEL.T, *gps.values()]))
+    assert np.array_equal(rows.scalars["/gps_lat"].t_ns, rows.imus["/imu0"].t_ns)  # of a row of text all columns are
+
+
+@pytest.mark.parametrize("damaged", ["34:22.9", "", "2026-03-01 12:3x:20"])
+@pytest.mark.parametrize("form", ["%Y-%m-%d %H:%M:%S.%f", "%H:%M:%S.%f"])
+@pytest.mark.parametrize("row", [0, 100])
+def test_the_damaged_field_of_a_column_of_times_is_named(tmp_path, form, damaged, row):
+    texts = [(datetime(2026, 3, 1, 12) + timedelta(seconds=t)).strftime(form) for t in T_S[:200].tolist()]
+    texts[row] = damaged if form.startswith("%Y") or damaged != "34:22.9" else "Excel"
+    lines = [
+        ",".join([text, *map(repr, values)]) for text, values in zip(texts, np.hstack([GYRO, ACCEL]).tolist(), strict=False)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(["time,gx,gy,gz,ax,ay,az", *lines]) + "\n")
+    with pytest.raises(ConfigError, match=rf"time is left out: 1 of its fields are no .* in row {row + 1}: {texts[row]!r}"):
         read(tmp_path / "log.csv")

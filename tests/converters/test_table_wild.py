@@ -204,6 +204,16 @@ def test_a_stated_unit_against_the_way_gravity_turns_is_doubted(tmp_path, named,
     assert any("gravity turns" in note and "is the unit right?" in note for note in notes) == doubted
 
 
+@pytest.mark.parametrize("unit", [" [ft/s^2]", " (ft/s2)", " [feet/s²]", " [ft/s/s]", " (ft/sec/sec)", "_ft_s2"])
+def test_feet_are_read_where_they_are_stated_alone(tmp_path, unit):
+    names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"acc_{a}{unit}" for a in "xyz")]
+    feet = 9.80665 / 0.3048 * ACCEL_G
+    imu = read(write_csv(tmp_path / "imu.csv", names, [T_S, *COUNTS.T, *feet.T])).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G)
+    with pytest.raises(ConfigError, match="no unit of the accel"):
+        read(write_csv(tmp_path / "imu.csv", [name.removesuffix(unit) for name in names], [T_S, *COUNTS.T, *feet.T]))
+
+
 def test_forces_are_no_accelerations(tmp_path):
     names = ["time_s", *(f"w{a}_dps" for a in "xyz"), *(f"F{a}" for a in "xyz")]
     with pytest.raises(ConfigError, match="no unit of the accel"):
@@ -245,6 +255,22 @@ def test_rows_that_name_their_numbers(tmp_path, row):
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-9)
     assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
     assert "1 lines of other words are left out" in log.remarks.losses
+
+
+def test_rows_that_name_padded_numbers_between_lines_of_the_state(tmp_path):
+    gyro = np.round(COUNTS * 0.07, 2)
+    form = "t={:6d} ax={:7.3f} ay={:7.3f} az={:7.3f} gx={:8.2f} gy={:8.2f} gz={:8.2f}\nstate: sys 3, gyro 3, accel 0, mag 3\n"
+    rows = [form.format(1000 + 10 * n, *values) for n, values in enumerate(np.hstack([ACCEL_G, gyro]).tolist())]
+    (tmp_path / "serial.log").write_text("ready\n" + "".join(rows))
+    log = read(tmp_path / "serial.log")
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(gyro), rtol=1e-9)
+    assert log.remarks.losses == [f"{COUNT + 1} lines of other words are left out"]
+
+
+def test_a_header_that_is_shorter_than_its_rows_is_named(tmp_path):
+    path = write_csv(tmp_path / "imu.csv", ["time", "accel", "gyro"], [T_S, *ACCEL_G.T, *COUNTS.T])
+    with pytest.raises(ConfigError, match=r"has 3 fields and the rows 7: it names no column \(time, accel, gyro\)"):
+        read(path)
 
 
 @pytest.mark.parametrize("row", ["a: 1 b: - 2 c: 3 d: 4 e: 5", "1.5,2.5,3.5,x: left,4.5", "level: 1, 2"])

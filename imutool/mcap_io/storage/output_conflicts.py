@@ -115,7 +115,8 @@ def _check_name(output: OutputFile) -> None:
         UsageError: with the suffix, or the slash.
     """
     place = output.where
-    if output.files is None and not output.may_be_folder and str(output.place).endswith(("/", os.sep)):
+    is_in_folder = output.files is not None or (output.may_be_folder and is_folder(place))
+    if not is_in_folder and str(output.place).endswith(("/", os.sep)):
         fix = f"Write the file's own name behind the slash, as {output.place}NAME{next(iter(output.suffixes), '')}"
         raise UsageError("ends in a slash, as the name of a folder", where=output.place, expected="the name of a file", fix=fix)
     if not output.suffixes or place.suffix.lower() in (*output.suffixes, ""):  # a name without a suffix claims nothing
