@@ -209,7 +209,7 @@ def test_positions_of_no_certain_scale_have_no_other_unit(scale: float, flown: t
     assert judge(motion_of(imu), truth._replace(p_wb=scale * truth.p_wb), 1.0).unit == "m"
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("noise_m", [0.02, 0.2, 2.0, 20.0])
 def test_noisy_or_unrelated_positions_have_no_other_unit(noise_m: float, seed: int, flown: tuple[Imu, Truth]) -> None:
     imu, truth = flown
