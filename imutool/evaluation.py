@@ -113,8 +113,10 @@ def _evaluated(
         found, std = _corrected(recording.imu, model, start, with_std=aids is not None)
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
         integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
-        drifted = _drift(integrated, true, valid, model, start, recording.imu)
-        drifted |= _without_delay(found.imu, recording) if model else dict.fromkeys(DELAY)
+        means = _trapezoidal(found.imu)
+        scored = along_truth(means, recording.truth, recording.name)
+        drifted = _drift(scored, model, start, recording.imu)
+        drifted |= _without_delay(means, scored, recording) if model else dict.fromkeys(DELAY)
         if name == RAW and (gaps := gaps_crossed(integrated, GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
         estimates = {PURE: integrated}
@@ -143,13 +145,24 @@ def _evaluated(
     return results
 
 
-def _drift(
-    path: Poses, truth: Poses, valid: Bool[np.ndarray, " n"], model: BiasModel | None, start: InitialBias | None, imu: Imu
-) -> dict[str, float | None]:
+Scored = tuple[Poses, Poses, Bool[np.ndarray, " n"]]  # estimate, truth, and rows with truth, as of `along_truth`
+
+
+def _trapezoidal(imu: Imu) -> Imu:
+    """Samples whose Euler steps are those of the trapezoidal rule of the given ones.
+
+    The Euler rule, by which the paths are integrated, lags by half a sample, as if the poses were early.
+    """
+    gyro, accel = (np.concatenate([0.5 * (u[1:] + u[:-1]), u[-1:]]) for u in (imu.gyro, imu.accel))
+    return Imu(imu.t_ns, gyro, accel)
+
+
+def _drift(scored: Scored, model: BiasModel | None, start: InitialBias | None, imu: Imu) -> dict[str, float | None]:
     """Root mean squares of the drift of windows that start from the truth, and of what the bias covariance expects.
 
     None if no window fits.
     """
+    path, truth, valid = scored
     windows = drift_windows(path, valid, DRIFT_S)
     found = window_drift(path, truth, *windows.T)
     squares = {"drift_orientation_deg": found.orientation_rad**2, "drift_velocity_m_s": found.velocity_m_s**2}
@@ -165,20 +178,15 @@ def _drift(
     return out
 
 
-def _without_delay(imu: Imu, recording: Recording) -> dict[str, float | None]:
-    """Delay of the poses against the debiased gyro, and the scores without it; None where it is not clear.
-
-    By the trapezoidal rule: the Euler rule of the other scores lags by half a sample, as if the poses were early.
-    """
-    means = (np.concatenate([0.5 * (u[1:] + u[:-1]), u[-1:]]) for u in (imu.gyro, imu.accel))
-    smooth, nothing = Imu(imu.t_ns, *means), dict[str, float | None].fromkeys(DELAY)
-    before = along_truth(smooth, recording.truth, recording.name)
+def _without_delay(imu: Imu, before: Scored, recording: Recording) -> dict[str, float | None]:
+    """Delay of the poses against the debiased gyro, and the scores without it; None where it is not clear."""
+    nothing = dict[str, float | None].fromkeys(DELAY)
     found = metrics.pose_delay(*before[:2], drift_windows(before[0], before[2], DELAY_WINDOW_S))
     if found is None or abs(found[0]) < CLEAR_STDS * found[1]:
         return nothing
     moved = replace(recording.truth, t_ns=recording.truth.t_ns - nanoseconds(found[0]))
     try:
-        after = along_truth(smooth, moved, recording.name)
+        after = along_truth(imu, moved, recording.name)
     except DataError:
         return nothing
     drifts = [_rms(window_drift(p, true, *drift_windows(p, valid, DRIFT_S).T)) for p, true, valid in (before, after)]

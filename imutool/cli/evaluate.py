@@ -29,8 +29,9 @@ class Score(Section, frozen=True, kw_only=True):
     """Scores of an estimate of a log; degrees, metres, biases in rad/s and m/s².
 
     Relative errors are keyed by their distance in metres; a figure that the log does not show is null. `aids` are the topics
-    that an aided path used, by kind. The drift is that of windows from the truth, with the deviation that the bias expects. A
-    positive delay says that the poses are late; the figures without it are there where it is clear.
+    that an aided path used, by kind. The drift is that of windows from the truth, by the trapezoidal rule, with the deviation
+    that the bias expects. A positive delay says that the poses are late; the scores without it, by the same rule, are there
+    where it is clear.
     """
 
     log: str
@@ -161,7 +162,7 @@ def _late(results: Sequence[dict[str, Any]]) -> list[str]:
         if row["estimate"] == "integration" and row["pose_delay_s"] is not None:
             aoe, drift = row["aoe_without_delay_deg"], row["drift_orientation_without_delay_deg"]
             late = f"{row['log']}, {row['model']}: the poses are {lateness(row['pose_delay_s'], 1)} by the debiased gyro"
-            told.append(f"{late}; without that AOE is {aoe:.2f}°, and {drift:.2f}° after {row['drift_window_s']:g} s")
+            told.append(f"{late}; without that, by the trapezoidal rule, AOE is {aoe:.2f}°, and {drift:.2f}° after {row['drift_window_s']:g} s")
     return told
 
 
