@@ -37,11 +37,8 @@ logger = logging.getLogger(__name__)
 
 RAW = "raw"
 DRIFT_S = 5.0
-DELAY_WINDOW_S, CLEAR_STDS, LEFT = (
-    1.0,
-    4.0,
-    0.9,
-)  # windows that show a delay of the poses; a clear one; the drift it leaves at most
+DELAY_WINDOW_S = 1.0  # of the windows that show a delay of the poses
+CLEAR_STDS, LEFT = 4.0, 0.9  # of a clear delay: deviations at least, and share of the drift that is left without it at most
 DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
 DEG = 180.0 / np.pi

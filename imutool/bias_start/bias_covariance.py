@@ -107,7 +107,9 @@ def expected_drift(
     t_ns, samples = imu.t_ns[good], model_samples(model, imu)
     out, done = np.zeros((len(windows), 6, 6)), 0
     for k, (first_ns, last_ns) in enumerate(path.t_ns[windows]):
-        a, b = np.searchsorted(t_ns, (first_ns, last_ns)).tolist()
+        a, b = int(np.searchsorted(t_ns, first_ns)), int(np.searchsorted(t_ns, last_ns, side="right")) - 1
+        if b <= a:  # nothing was measured
+            continue
         estimator.parts(*(column[done:a] for column in samples))
         _, rest, roots = estimator.parts(*(column[a:b] for column in samples))
         done = b

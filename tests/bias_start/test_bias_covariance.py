@@ -106,16 +106,17 @@ def test_static_is_as_sure_in_motion_as_a_sensor_nobody_calibrated(turning: Samp
     np.testing.assert_allclose(added[SIZE // 2 :, 3:], static.CALIBRATION_STD * 9.81 * np.sqrt(2.0), rtol=1e-6)
 
 
-@pytest.mark.parametrize("lost", [0, 7])
-def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: int) -> None:
+@pytest.mark.parametrize("lost", [slice(0), slice(100, 107), slice(1000, 1003), slice(1995, None)])
+def test_a_body_at_rest_is_expected_to_drift_as_a_constant_bias_makes_it(lost: slice) -> None:
     """Attitude by s t, velocity by s t and, where gravity is tilted, by g s t^2 / 2; samples may be no measurement."""
     count, length_s = 2001, 5.0
     accel = np.tile([0.0, 0.0, 9.81], (count, 1))
-    accel[100 : 100 + lost] = 0.0
+    accel[lost] = 0.0
     imu = Imu(np.arange(count) * 5_000_000, np.zeros((count, 3)), accel)
     still = Poses(imu.t_ns, np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), np.zeros((count, 3)))
-    windows = np.array([[200, 1200], [1200, 2000]]) if lost else np.array([[0, 1000], [1000, 2000]])
-    found = expected_drift(static.Model(), WAYS["held"], imu, still, windows).diagonal(axis1=1, axis2=2)[0]
+    windows = np.array([[0, 1000], [1000, 2000]])
+    found = expected_drift(static.Model(), WAYS["held"], imu, still, windows).diagonal(axis1=1, axis2=2)
     tilted = (9.81 * STD[:3] * length_s**2 / 2) ** 2 * [1.0, 1.0, 0.0]
-    np.testing.assert_allclose(found[:3], (STD[:3] * length_s) ** 2, rtol=3e-3)
-    np.testing.assert_allclose(found[3:], (STD[3:] * length_s) ** 2 + tilted, rtol=3e-3)
+    for variances in found:
+        np.testing.assert_allclose(variances[:3], (STD[:3] * length_s) ** 2, rtol=0.02)
+        np.testing.assert_allclose(variances[3:], (STD[3:] * length_s) ** 2 + tilted, rtol=0.03)
