@@ -22,8 +22,8 @@ TIME_OF = rf"((?P<before>.+?)_)?{TIME_WORDS}|{TIME_WORDS}_(?P<behind>.+)"  # imu
 
 def join_stamps(columns: Columns) -> None:
     """Make one column of a stamp in two, seconds and the rest, as ROS' header.stamp has."""
-    for seconds in [column for column in columns.values if SECONDS.fullmatch(column)]:
-        stem, end = SECONDS.fullmatch(seconds).groups("")  # type: ignore[union-attr]  # it matched
+    for seconds, match in [(column, match) for column in columns.values if (match := SECONDS.fullmatch(column))]:
+        stem, end = match.groups("")
         ends = product((c for c in columns.values if c.startswith(stem) and c.endswith(end)), BELOW_SECONDS.items())
         found = ((c, size) for c, (name, size) in ends if name.fullmatch(c[len(stem) : len(c) - len(end)]))
         rest, size = next(found, ("", 1))

@@ -198,7 +198,8 @@ def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> Non
     elif len(set(texts)) == 1:
         columns.remarks.notes.append(f"{name} is {texts[0][:200]!r} in every row")
     elif damaged := damaged_times(texts):
-        usual = next(text for row, text in enumerate(texts, 1) if (row, text) not in damaged)
+        rows_left_out = {row for row, _ in damaged}
+        usual = next(text for row, text in enumerate(texts, 1) if row not in rows_left_out)
         first = f"the first in row {damaged[0][0]}: {damaged[0][1][:40]!r}"
         columns.remarks.losses.append(
             f"{name} is left out: {len(damaged)} of its fields are no times as {usual!r} is ({first})"

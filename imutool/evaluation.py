@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 RAW = "raw"
 DRIFT_S = 5.0
 DELAY_WINDOW_S = 1.0  # of the windows that show a delay of the poses
-CLEAR_STDS, LEFT = 4.0, 0.9  # of a clear delay: deviations at least, and share of the drift that is left without it at most
+CLEAR_STDS, MOST_DRIFT_LEFT = 4.0, 0.9  # of a clear delay: deviations, and share of the drift that is left without it
 DRIFTS = "drift_orientation_deg", "drift_velocity_m_s", "drift_orientation_std_deg", "drift_velocity_std_m_s"
 DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orientation_without_delay_deg"
 DEG = 180.0 / np.pi
@@ -187,7 +187,7 @@ def _without_delay(imu: Imu, before: Scored, recording: Recording) -> dict[str, 
     except DataError:
         return nothing
     drifts = [_rms(window_drift(p, true, *drift_windows(p, valid, DRIFT_S).T)) for p, true, valid in (before, after)]
-    if not drifts[1] < LEFT * drifts[0]:
+    if not drifts[1] < MOST_DRIFT_LEFT * drifts[0]:
         return nothing
     return dict(zip(DELAY, (*found, metrics.absolute(*after)["aoe_deg"], DEG * drifts[1]), strict=True))
 

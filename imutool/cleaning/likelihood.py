@@ -61,7 +61,7 @@ class Reading(NamedTuple):
     misfit: float
     misfit_as_is: float
     sole: bool = True  # else the nearest to the log's axes of several that fit alike
-    straight: bool = False  # whether a rotation by any angle is a small one, where the axes are not sole
+    straight: bool = False  # whether the best rotation is a small one, although other axes fit, too
 
     @property
     def names(self) -> str:

@@ -103,12 +103,12 @@ def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) ->
         slow, fast = (_Turns.of(motion, truth, n, period_ns, bias, longest_s) for n in apart)
         count = min(most_parts, min(len(slow.size) + fewest, len(fast.size)) // fewest)  # of the slow ones a log holds fewer
         if count >= FEWEST_PARTS:
-            return _found(slow, fast, longest_s, count, motion.middle_ns)
+            return _searched(slow, fast, longest_s, count, motion.middle_ns)
     return None
 
 
-def _found(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns: int) -> Delay | None:
-    """Delay that turns over a second find and turns between neighbouring poses refine, in `count` parts."""
+def _searched(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns: int) -> Delay | None:
+    """Delay by turns over a second, refined by turns between neighbouring poses, in `count` parts."""
     coarse = np.arange(-longest_s, longest_s + 1e-9, STEP_S)
     slowly = slow.correlations(coarse, count)
     if count == DELAY_PARTS and (stepped := _stepped(slow, fast, coarse, slowly, start_ns)) is not None:

@@ -38,7 +38,7 @@ def position_unit(residuals: Residuals, readings: int, blocks: Int64[np.ndarray,
 
 
 def _averaged(residuals: Residuals, width: int, factor: float, row: int) -> Float64[np.ndarray, "m 3"]:
-    """Misfits averaged as differences of positions over so many rows average the acceleration: by a triangle."""
+    """Triangular average of the misfits, as second differences over `width` rows average an acceleration."""
     triangle = np.convolve(np.full(width, 1.0 / width), np.full(width, 1.0 / width))
     return np.stack([np.convolve(column, triangle, mode="valid") for column in residuals(factor, row).T], axis=1)
 

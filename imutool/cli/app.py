@@ -133,11 +133,11 @@ class Command(TyperCommand):
         except KeyboardInterrupt as interrupt:
             raise KeyboardInterrupt(with_flags(str(interrupt), flag_of)) from interrupt
 
-    def _check(self, values: Mapping[str, Any], told: Mapping[str, Any]) -> None:
+    def _check(self, values: Mapping[str, Any], meta: Mapping[str, Any]) -> None:
         """Refuse outputs that would destroy something; on --resume a report of the run before may be replaced."""
         marks = written(type(self).function)
         places, resume = {name: values[name] for name in marks if values[name] != "-"}, bool(values.get("resume"))
-        places |= {name: f"{place}/" for name, place in places.items() if isinstance(place, Path) and told.get(FOLDERS + name)}
+        places |= {name: f"{place}/" for name, place in places.items() if isinstance(place, Path) and meta.get(FOLDERS + name)}
         wanted = [
             replace(marks[name], parameter=name, place=place, keeps=marks[name].keeps or (resume and _is_report(place)))
             for name, place in places.items()

@@ -157,14 +157,14 @@ def _late(results: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences about poses whose clock makes a part of the errors."""
     from imutool.cleaning.pose_delay import lateness
 
-    told = []
+    sentences = []
     for row in results:
         if row["estimate"] == "integration" and row["pose_delay_s"] is not None:
             aoe, drift = row["aoe_without_delay_deg"], row["drift_orientation_without_delay_deg"]
             late = f"{row['log']}, {row['model']}: the poses are {lateness(row['pose_delay_s'], 1)} by the debiased gyro"
             without = f"AOE is {aoe:.2f}°, and {drift:.2f}° after {row['drift_window_s']:g} s"
-            told.append(f"{late}; without that, by the trapezoidal rule, {without}")
-    return told
+            sentences.append(f"{late}; without that, by the trapezoidal rule, {without}")
+    return sentences
 
 
 def _used(results: Sequence[dict[str, Any]]) -> list[str]:

@@ -19,7 +19,7 @@ from imutool.cleaning.rule import Rule, TopicSummary
 
 DISTRUST = "the axes of {} contradict {}"
 LATE_S, LATE_STDS = 0.03, 5.0  # a delay of the poses from which on it is a warning
-FIXED = 0.8  # of that, the delay from which on `fix` corrects it: what a later command warns of must not be left
+FIXED = 0.8  # of that, the delay from which on `fix` corrects it, so that it leaves nothing of which a later command warns
 TO_Z_UP = {  # rotations of the world after which z is up
     "-z": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),  # NED to ENU
     "+y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),

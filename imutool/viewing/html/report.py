@@ -29,6 +29,7 @@ from imutool.viewing.html.report_wording import (
     worst_orientation_error,
 )
 from imutool.viewing.model.run_data import RunData
+from imutool.viewing.model.trajectory_error import WINDOWS_NOTE
 
 PICTURES: tuple[Callable[[RunData], Picture | None], ...] = (
     report_paths.paths,
@@ -234,7 +235,7 @@ def _windows(data: RunData) -> Iterator[str]:
                 continue
             words = f"{name.split('_')[0].capitalize()} after {length:g} s ({unit})"
             yield f"<tr><td>{words}</td>{_cells(values, index_of_best(values, name))}</tr>"
-    yield '</tbody></table></div><p class="note">Root mean squares at the ends of windows that each start from the truth.</p>'
+    yield f'</tbody></table></div><p class="note">{WINDOWS_NOTE}</p>'
     yield "</section>"
 
 

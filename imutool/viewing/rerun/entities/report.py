@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from imutool.viewing.model.run_data import RunData
+from imutool.viewing.model.trajectory_error import WINDOWS_NOTE
 from imutool.viewing.rerun import sdk
 from imutool.viewing.rerun.entities.paths import error_scale_top
 from imutool.viewing.rerun.entities.styles import color_name
@@ -85,8 +86,7 @@ def _windows(data: RunData) -> list[str]:
         for w in trace.windows
     ]
     heads = ["window", "run", "count", "orientation (deg)", "velocity (m/s)", "position (m)"]
-    caption = "Root mean square errors at the ends of windows that each start from the truth."
-    return ["## Windows", "", caption, "", *table(heads, rows), ""] if rows else []
+    return ["## Windows", "", WINDOWS_NOTE, "", *table(heads, rows), ""] if rows else []
 
 
 def _events(data: RunData) -> list[str]:
