@@ -92,7 +92,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     tables = [_clocked(columns, table, place) for table in tables]
     table = tables[0]  # other columns are on its clock
     imus = {each.topic: _imu(columns, each, place) for each in tables}
-    used = {c.removeprefix("-") for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
+    used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
     if not poses and path.is_dir() and (file := columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)):
         said = f"{file} gives no poses: no time with positions and rotations of a certain order was found in it"
@@ -100,7 +100,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     if poses and not table.truth_file:
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
         used |= {table.truth_time, *table.position, *turns}
-    scalars, constants = _further(columns, tables, used, place)
+    scalars, constants = _further(columns, tables, {column.removeprefix("-") for column in used}, place)
     log = MessageLog(
         sequence.name,
         path.name,

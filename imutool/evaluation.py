@@ -258,7 +258,7 @@ def _model_and_start(
         return estimate_at_rest(recording.imu, where)
     model: BiasModel = static.Model() if trained is None else bound_to(trained, recording)
     if trained is not None:
-        check_rate(model, 1.0 / recording.imu.period_s, where)
+        check_rate(model, 1.0 / recording.imu.period_s, where, recording.imu.t_ns)
     for remark in model.remarks:
         logger.warning("%s: %s", recording.name, remark)
     if smooth:

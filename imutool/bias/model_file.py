@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as save_bytes
 
 from imutool import registry
+from imutool.array_types import Int64
 from imutool.bias.model import BiasModel, check_card
 from imutool.config import build, plain
 from imutool.errors import ImutoolError, ModelError, did_you_mean
@@ -35,6 +36,7 @@ UNITS = {  # sensor and data set of the shipped models: the names of the sequenc
     ("bmi160", "tum_vi"): r"(room|corridor|magistrale|outdoors|slides|calib-cam|calib-imu)[1-9]?",
     ("fetch", "fetch"): r"0[1-8]_(square|um|eight|random|right_turn|left_turn|origin)",
 }
+BATCHES = "The stamps come in batches: imutool convert LOG OUT --restamp puts them on the clock of the sensor"
 RATE_TOLERANCE = 0.05  # a real rate differs from its nominal one by a few per mille (BMI160: 199.4 for 200)
 
 
@@ -240,19 +242,20 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def check_rate(model: BiasModel, rate_hz: float, where: object) -> None:
-    """Refuse a log at another sample rate than the model's training logs.
+def check_rate(model: BiasModel, rate_hz: float, where: object, t_ns: Int64[np.ndarray, " n"] | None = None) -> None:
+    """Refuse a log at another rate than the training logs; its times show stamps in batches.
 
     Raises:
         ModelError: the rates differ by more than 5 %.
     """
-    if model.rate_hz and abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
-        raise ModelError(
-            f"IMU at {rate_hz:.1f} Hz",
-            where=where,
-            expected=f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained",
-            fix="Choose or train a model for this sensor",
-        )
+    if not model.rate_hz or abs(rate_hz / model.rate_hz - 1) < RATE_TOLERANCE:
+        return
+    mean_hz = 1e9 * (len(t_ns) - 1) / max(int(t_ns[-1] - t_ns[0]), 1) if t_ns is not None else 0.0
+    batches = abs(mean_hz / model.rate_hz - 1) < RATE_TOLERANCE
+    what = f"IMU at {rate_hz:.1f} Hz{f' by most of its steps, and {mean_hz:.1f} Hz in the mean' if batches else ''}"
+    expected = f"{model.rate_hz:.1f} Hz, at which model {model.card.get('name', model.method)!r} was trained"
+    fix = BATCHES if batches else "Choose or train a model for this sensor"
+    raise ModelError(what, where=where, expected=expected, fix=fix)
 
 
 def header_of(path: Path) -> dict[str, Any]:

@@ -141,7 +141,7 @@ def choose_model_and_start(
         return _estimate(block_statistics(batches, period_s), log.path)
     model: BiasModel = static.Model() if name is None or untrained else shared_model(name, 1.0 / period_s)
     if not untrained:
-        check_rate(model, 1.0 / period_s, log.path)
+        check_rate(model, 1.0 / period_s, log.path, first_minute.imu.t_ns)
     if model.temperature_parameters():
         start_ns = int(first_minute.imu.t_ns[0])
         model = bound(model, temperatures(log), topic, start_ns, start_ns + _duration_ns(log, topic))

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imutool.array_types import Float64, Int64
+from imutool.cleaning.likelihood import STUDENT
 from imutool.cleaning.samples import STEP_NS, STEP_S, Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.cleaning.unit_evidence import POSES_APART_NS
@@ -21,6 +22,7 @@ LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
 DELAY_PARTS, FEWEST_PARTS = 8, 4  # parts whose own lags show how sure the delay is
+SCALE_STEPS, GAUSS = 20, 1.4  # steps to Student's scale of a few parts, and by how much it is below a Gaussian's deviation
 SEARCHES = (LONGEST_DELAY_S, 40, DELAY_PARTS), (0.5, 20, FEWEST_PARTS)  # longest delay, poses in each part, most parts
 STEP_LEAST_S, STEP_STDS = 0.03, 8.0  # of a step of one clock, at least; and in deviations of the parts on each side
 
@@ -125,7 +127,16 @@ def _searched(slow: _Turns, fast: _Turns, longest_s: float, count: int, start_ns
     parts = peaks[1:][np.isfinite(peaks[1:])]
     if not np.isfinite(peaks[0]) or len(parts) < FEWEST_PARTS:
         return None
-    return Delay(float(peaks[0]), float(np.std(parts, ddof=1)) / len(parts) ** 0.5)
+    return Delay(float(peaks[0]), _scatter(parts) / len(parts) ** 0.5)
+
+
+def _scatter(parts: Float64[np.ndarray, " p"]) -> float:
+    """Standard deviation of the parts' delays by Student's scale, so that one part that errs does not decide."""
+    off = np.square(parts - median(parts))
+    squared = max(float(off.mean()), 1e-18)
+    for _ in range(SCALE_STEPS):
+        squared = max(float(((STUDENT + 1.0) * off / (STUDENT + off / squared)).mean()), 1e-18)
+    return float(GAUSS * squared**0.5)
 
 
 def _stepped(

@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -16,16 +17,16 @@ from imutool import registry
 from imutool.array_types import Float64
 from imutool.cleaning import CleaningSettings, Survey, look
 from imutool.cleaning.likelihood import axis_names
-from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corrections
+from imutool.conversion.common_setup import combined, fitted_to
+from imutool.conversion.corrections import CONVENTIONS, NOT_TURNED, STAMPS, Corrections, pose_notes
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import find_stamps
-from imutool.geometry import quaternion
 from imutool.log_info.inspection import sound_samples
 from imutool.log_info.pose_imu_rotation import Body, body_of, frames_of_copies, is_straight, turned_body
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
-from imutool.mcap_io.topics import ENCODINGS
+from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.recording.message_log import MessageLog
 
 MOST_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
@@ -75,7 +76,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
             turned: Body | None = None if mount is None else body_of(log, survey.pose_topic, mount.T)
             if mount is None and not comes_later:
                 turned = turned_body(log, sound_samples(log, topic), survey.pose_topic)
-            if changes := _pose_notes(survey, turned):
+            if changes := pose_notes(survey.world, survey.quaternions, survey.position_unit, survey.pose_delay_ns, turned):
                 world, late_ns, body, pose_topic = survey.world, survey.pose_delay_ns, turned or NOT_TURNED, survey.pose_topic
                 unit, quaternions, copies = survey.position_unit, survey.quaternions, frames_of_copies(log, pose_topic)
                 frame_id = next(log.pose_batches(pose_topic)).frame_id
@@ -97,52 +98,79 @@ def _imu_note(survey: Survey) -> str:
     return f"{scale}; x, y, z are now {gyro} of gyro and {accel} of accel as recorded"
 
 
-def _pose_notes(survey: Survey, turned: Body | None) -> list[str]:
-    parts = [f"the world's x, y, z are now {axis_names(survey.world)} as recorded"] if (survey.world != np.eye(3)).any() else []
-    if survey.quaternions:
-        parts.append(f"quaternions now take vectors of the body to the world (as recorded, they {survey.quaternions})")
-    if survey.position_unit != "m":
-        parts.append(f"positions are now in m, and were in {survey.position_unit}")
-    if survey.pose_delay_ns:
-        side = "earlier" if survey.pose_delay_ns > 0 else "later"
-        parts.append(f"stamps are {abs(survey.pose_delay_ns) * 1e-9:.6f} s {side} now")
-    if turned is not None:
-        deg = ", ".join(f"{angle:.4f}" for angle in np.degrees(quaternion.log(quaternion.of_matrix(turned.turn))[0]))
-        parts.append(f"the body is now that of the IMU, turned by ({deg})° from that recorded")
-    return parts
+def write_corrected(
+    log: Path,
+    target: Path,
+    wanted: Sequence[str],
+    common: Corrections | None = None,
+    *,
+    compression: str,
+    overwrite: bool,
+) -> tuple[tuple[str, ...], Corrections]:
+    """Write a log with corrections of what its motion shows to be wrong.
 
-
-def write_corrected(log: Path, target: Path, wanted: Sequence[str], *, compression: str, overwrite: bool) -> tuple[str, ...]:
-    """Write a log with corrections of what its motion shows to be wrong; return notes on them.
-
-    After each round a log without images, in a new folder next to `log`, shows what the next has to correct.
+    The notes come back, and the corrections in one. `common` are corrections of the other logs of its setup: they come first,
+    unless the motion contradicts them.
 
     Raises:
         ImutoolError: damage, or the target cannot be written.
     """
     refuse_existing(target, overwrite=overwrite)
-    judged, rounds, kept = log, list[Corrections](), list[str]()
-    most = MOST_ROUNDS if CONVENTIONS in wanted else 1
-    for number in range(most):
-        found = find_corrections(judged, [CONVENTIONS] if number else wanted)
-        kept = list(found.kept)
-        if not found:
-            break
-        rounds.append(found)
-        if number + 1 == most:
-            break
-        small = log.parent / f"round_{number}" / log.name
-        small.parent.mkdir()
-        write_log(found.put_on(_content(judged, images=False)), small, compression="none")
-        judged = small
+    first = None if common is None else fitted_to(log, common)
+    rounds, kept = ([], []) if first is None else _rounds(log, wanted, _with_stamps(first, log, wanted))
+    if not rounds or not all(found.is_of_clock for found in rounds[1:]):
+        rounds, kept = _rounds(log, wanted)
+    kept += _unjudged_poses(log)
     if not rounds:
         log.replace(target)
-        return (*kept,) or ("the motion shows nothing to correct",)
+        return (*kept,) or ("the motion shows nothing to correct",), Corrections()
     content = _content(log)
     for found in rounds:
         content = found.put_on(content)
     write_log(content, target, compression=compression, overwrite=overwrite)
-    return (*content.remarks.notes, *kept)
+    return (*content.remarks.notes, *kept), combined(rounds)
+
+
+def _unjudged_poses(path: Path) -> list[str]:
+    """Note on poses that no rule judges, as a filter gives them, where a log has no others."""
+    with Log(path) as log:
+        topics = [] if log.truth_topics or not log.imu_topics else log.with_schema(MESSAGE_POSES)
+        return [
+            f"{topic.name} is of kind {topic.pose_kind}, so its axes, unit and clock were not judged; --kind {topic.name}=truth"
+            " has them judged"
+            for topic in topics
+        ]
+
+
+def _with_stamps(first: Corrections, log: Path, wanted: Sequence[str]) -> Corrections:
+    """Corrections of a first round with new stamps, if they are wanted."""
+    found = find_corrections(log, [STAMPS]) if STAMPS in wanted else Corrections()
+    notes = {topic: "; ".join(filter(None, (found.notes.get(topic), note))) for topic, note in first.notes.items()}
+    reflected = {**found.reflected, **first.reflected}
+    return replace(first, stamps=found.stamps, reflected=reflected, notes={**found.notes, **notes})
+
+
+def _rounds(log: Path, wanted: Sequence[str], first: Corrections | None = None) -> tuple[list[Corrections], list[str]]:
+    """Corrections of one round after the other, and what stays wrong.
+
+    After each round a log without images, in a new folder next to `log`, shows what the next has to correct.
+    """
+    judged, rounds, kept = log, list[Corrections](), list[str]()
+    most = MOST_ROUNDS if CONVENTIONS in wanted else 1
+    with TemporaryDirectory(prefix="rounds-", dir=log.parent) as folder:
+        for number in range(most):
+            by_setup = first if number == 0 else None
+            found = find_corrections(judged, [CONVENTIONS] if number else wanted) if by_setup is None else by_setup
+            kept = list(found.kept)
+            if not found:
+                break
+            rounds.append(found)
+            if number + 1 == most:
+                break
+            small = Path(folder) / f"{number}_{log.name}"
+            write_log(found.put_on(_content(judged, images=False)), small, compression="none")
+            judged = small
+    return rounds, kept
 
 
 def _content(log: Path, *, images: bool = True) -> MessageLog:

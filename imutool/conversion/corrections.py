@@ -16,20 +16,22 @@ from itertools import tee
 import numpy as np
 
 from imutool.array_types import Float64, Int64
+from imutool.cleaning.likelihood import axis_names
 from imutool.cleaning.pose_quaternions import read_right
 from imutool.cleaning.position_unit import POSITIONS
-from imutool.conversion.message_patch import WXYZ_FROM_XYZW, XYZW_FROM_WXYZ, MessagePatch, corrected_imu
 from imutool.conversion.restamping import SAME_CLOCK_NS
-from imutool.errors import ConfigError
+from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.log_info.pose_imu_rotation import Body
 from imutool.mcap_io.codec import schemas
+from imutool.mcap_io.codec.encode import NO_ORIENTATION
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES, VELOCITY_KEY
 from imutool.recording.message_log import Message, MessageLog, MessageTopic
 
 RECORD = "imutool_corrections"
 CONVENTIONS, STAMPS = "conventions", "stamps"  # what may be corrected
+XYZW_FROM_WXYZ, WXYZ_FROM_XYZW = [1, 2, 3, 0], [3, 0, 1, 2]
 NOT_TURNED = Body(np.eye(3), frozenset())
 
 
@@ -62,6 +64,12 @@ class Corrections:
     reflected: Mapping[str, Reflected] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
     kept: Sequence[str] = ()
+
+    @property
+    def is_of_clock(self) -> bool:
+        """Whether stamps alone are corrected."""
+        same = (self.world == np.eye(3)).all() and (self.body.turn == np.eye(3)).all()
+        return not self.imus and bool(same) and self.unit == "m" and not self.quaternions
 
     def __bool__(self) -> bool:
         """Whether there is anything to correct."""
@@ -112,7 +120,7 @@ class Corrections:
             if (reflected := self.reflected.get(name)) is not None:
                 raw = reflected.with_stamp(raw, stamp_ns)
             else:
-                patch = MessagePatch(message.topic, raw)
+                patch = _MessagePatch(message.topic, raw)
                 patch.move_stamp(stamp_ns - patch.stamp_ns())
                 raw = bytes(patch.data)
             yield self._corrected(message._replace(payload=raw))
@@ -125,10 +133,10 @@ class Corrections:
             patched = self.reflected[topic.name].with_vectors(bytes(message.payload), self.imus[topic.name])
             return message._replace(payload=patched)
         if topic.name in self.imus:
-            return message._replace(payload=corrected_imu(topic, bytes(message.payload), *self.imus[topic.name]))
+            return message._replace(payload=_corrected_imu(topic, bytes(message.payload), *self.imus[topic.name]))
         if not (self.pose_topic and _is_pose(topic)):
             return message
-        patch = MessagePatch(topic, bytes(message.payload))
+        patch = _MessagePatch(topic, bytes(message.payload))
         before_ns = patch.stamp_ns()
         self._correct_poses(topic, patch)
         moved_ns = patch.stamp_ns() - before_ns
@@ -142,7 +150,7 @@ class Corrections:
         turn, body = quaternion.of_matrix(self.world), quaternion.of_matrix(self.body.turn.T)
         return quaternion.multiply(turn, np.eye(4)).T, quaternion.multiply(np.eye(4), body).T
 
-    def _correct_poses(self, topic: MessageTopic, patch: MessagePatch) -> None:
+    def _correct_poses(self, topic: MessageTopic, patch: _MessagePatch) -> None:
         """Correct the poses or the velocity in the judged poses' frame."""
         named = 2 if "text" in schemas.SHAPES[patch.schema_name] else 1
         turn, body = self._turns
@@ -164,6 +172,75 @@ class Corrections:
             if patch.layout.texts[2 * which + 1] in self.body.frames if named == 2 else topic.name == self.pose_topic:
                 q_wxyz = body @ q_wxyz
             numbers[schemas.XYZW] = (turn @ q_wxyz)[XYZW_FROM_WXYZ]
+
+
+class _MessagePatch:
+    """Payload whose numbers and stamps are written in place."""
+
+    def __init__(self, topic: MessageTopic, payload: bytes) -> None:
+        self.schema_name = schemas.canonical(topic.schema_name)
+        self.layout = schemas.layout_of(self.schema_name, topic.message_encoding, message=payload)
+        self.data = bytearray(payload)
+
+    def numbers(self, which: int = 0) -> np.ndarray:
+        """Numbers of one element: a view."""
+        at, count = self.layout.numbers[which]
+        return np.frombuffer(self.data, f"{self.layout.order}f8", count, at)
+
+    def stamp_ns(self, which: int = 0) -> int:
+        """Stamp of one element."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        return int(seconds[0]) * schemas.NS_PER_S + int(np.frombuffer(self.data, f"{order}u4", 1, at + 4)[0])
+
+    def move_stamp(self, by_ns: int, which: int = 0) -> None:
+        """Shift a stamp."""
+        at, order = self.layout.stamps[which], self.layout.order
+        seconds = np.frombuffer(self.data, f"{order}{self.layout.seconds}", 1, at)
+        nanos = np.frombuffer(self.data, f"{order}u4", 1, at + 4)
+        moved_ns = self.stamp_ns(which) + by_ns
+        if moved_ns < 0 and self.layout.seconds == "u4":
+            what = f"a stamp of {moved_ns - by_ns} ns, moved by {by_ns} ns, lies before 0"
+            raise DataError(what, expected="stamps that ROS 1 can store", fix="Cut the log there, or convert it to ROS 2 first")
+        seconds[0], nanos[0] = divmod(moved_ns, schemas.NS_PER_S)
+
+
+def _corrected_imu(
+    topic: MessageTopic, payload: bytes, gyro: Float64[np.ndarray, "3 3"], accel: Float64[np.ndarray, "3 3"]
+) -> bytes:
+    """Message of an IMU in right units and axes: both vectors, covariances, own orientation."""
+    patch = _MessagePatch(topic, payload)
+    numbers = patch.numbers()
+    for matrix, vector, covariance in (
+        (gyro, schemas.GYRO, schemas.GYRO_COVARIANCE),
+        (accel, schemas.ACCEL, schemas.ACCEL_COVARIANCE),
+    ):
+        numbers[vector] = matrix @ numbers[vector]
+        if numbers[covariance][0] != -1.0:
+            numbers[covariance] = (matrix @ numbers[covariance].reshape(3, 3) @ matrix.T).reshape(-1)
+    if numbers[schemas.ORIENTATION_COVARIANCE][0] != NO_ORIENTATION:
+        P, Q = (np.sign(matrix) * (matrix != 0) for matrix in (gyro, accel))
+        if (P == Q).all() and np.linalg.det(P) > 0:
+            q_wxyz = numbers[schemas.ORIENTATION][WXYZ_FROM_XYZW][None].astype(np.float64)
+            numbers[schemas.ORIENTATION] = quaternion.multiply(q_wxyz, quaternion.of_matrix(P.T))[0][XYZW_FROM_WXYZ]
+        else:
+            numbers[schemas.ORIENTATION_COVARIANCE.start] = NO_ORIENTATION
+    return bytes(patch.data)
+
+
+def pose_notes(world: Float64[np.ndarray, "3 3"], quaternions: str, unit: str, late_ns: int, turned: Body | None) -> list[str]:
+    """Notes on what is corrected of poses."""
+    parts = [f"the world's x, y, z are now {axis_names(world)} as recorded"] if (world != np.eye(3)).any() else []
+    if quaternions:
+        parts.append(f"quaternions now take vectors of the body to the world (as recorded, they {quaternions})")
+    if unit != "m":
+        parts.append(f"positions are now in m, and were in {unit}")
+    if late_ns:
+        parts.append(f"stamps are {abs(late_ns) * 1e-9:.6f} s {'earlier' if late_ns > 0 else 'later'} now")
+    if turned is not None:
+        deg = ", ".join(f"{angle:.4f}" for angle in np.degrees(quaternion.log(quaternion.of_matrix(turned.turn))[0]))
+        parts.append(f"the body is now that of the IMU, turned by ({deg})° from that recorded")
+    return parts
 
 
 def _is_pose(topic: MessageTopic) -> bool:

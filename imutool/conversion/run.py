@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 
 from imutool import registry
 from imutool.conversion import Failure
+from imutool.conversion.common_setup import shared
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.unread_formats import ENOUGH, describe_folder, describe_unread
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
@@ -118,13 +119,19 @@ def convert(
 
 
 def _outcomes(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
-    """Outcomes of jobs by their numbers; `of` counts also sequences that cannot be read, and are no jobs."""
-    outcomes: dict[int, Outcome] = {}
-    for number, outcome in run_jobs(jobs, workers):
-        outcomes[number] = outcome
+    """Outcomes of jobs by their numbers; what lacks corrections that the other logs share is done once more."""
+    outcomes = dict(_run(jobs, of, workers, progress))
+    common, lacking = shared({n: outcome.corrections for n, outcome in outcomes.items() if outcome.error is None})
+    again = [replace(jobs[number], common=common, overwrite=True) for number in lacking]
+    return outcomes | {lacking[n]: outcome for n, outcome in _run(again, len(again), workers, progress)}
+
+
+def _run(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> Iterator[tuple[int, Outcome]]:
+    """Run jobs; `of` counts also sequences that cannot be read, and are no jobs."""
+    for done, (number, outcome) in enumerate(run_jobs(jobs, min(workers, len(jobs))), start=1):
         if progress is not None:
-            progress(of - len(jobs) + len(outcomes), of, jobs[number].sequence.name)
-    return outcomes
+            progress(of - len(jobs) + done, of, jobs[number].sequence.name)
+        yield number, outcome
 
 
 def _find(source: Path, format: str, out: Path) -> _Sequences:
@@ -206,12 +213,8 @@ def _only(source_sequences: _Sequences, wanted: Sequence[str]) -> _Sequences:
     names = source_sequences.names()
     for name in wanted:
         if name not in names:
-            raise ConfigError(
-                f"{name!r} is not in the source",
-                where="sequences",
-                expected=f"one of {', '.join(sorted(names))}",
-                fix=did_you_mean(name, names, "{!r}"),
-            )
+            expected, fix = f"one of {', '.join(sorted(names))}", did_you_mean(name, names, "{!r}")
+            raise ConfigError(f"{name!r} is not in the source", where="sequences", expected=expected, fix=fix)
     return _Sequences(
         [job for job in source_sequences.jobs if job.sequence.name in wanted],
         [(name, error) for name, error in source_sequences.errors if name in wanted],
@@ -241,11 +244,8 @@ def _check_targets(jobs: Sequence[Job]) -> None:
     jobs_by_target: dict[Path, Job] = {}
     for job in jobs:
         if (other := jobs_by_target.setdefault(job.target, job)) is not job:
-            raise ConfigError(
-                f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}",
-                where="source",
-                fix="Convert them one at a time",
-            )
+            what = f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}"
+            raise ConfigError(what, where="source", fix="Convert them one at a time")
         path = getattr(job.sequence, "path", None)
         if path is not None and _is_part_of(job.target, path):
             raise ConfigError("is the source itself", where=job.target, expected="another `out`")
@@ -282,8 +282,7 @@ def _from_stream(
 
     The first failure ends the conversion.
     """
-    recordings: Iterable[Recording | MessageLog] = (r for r in module.read(source) if not wanted or r.name in wanted)
-    recordings = iter(recordings)
+    recordings: Iterator[Recording | MessageLog] = (r for r in module.read(source) if not wanted or r.name in wanted)
     first = list(islice(recordings, 2))
     if not first:
         raise DataError("no sequence found", where=source, expected=" or ".join(wanted) or "at least one")

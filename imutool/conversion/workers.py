@@ -11,6 +11,7 @@ from typing import Any
 
 from imutool import registry
 from imutool.conversion.correction_rounds import write_corrected
+from imutool.conversion.corrections import Corrections
 from imutool.conversion.message_writer import write_log
 from imutool.conversion.user_labels import Labels
 from imutool.errors import ConfigError, DataError, ImutoolError
@@ -37,6 +38,7 @@ class Job:
     labels: Labels = field(default_factory=Labels)
     mapping: Path | Mapping[str, Any] | None = None  # what the columns of a table mean
     correct: tuple[str, ...] = ()  # `conventions`, `stamps`
+    common: Corrections | None = None  # of the other logs of its setup
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ class Outcome:
     error: ImutoolError | None = None
     notes: tuple[str, ...] = ()
     losses: tuple[str, ...] = ()
+    corrections: Corrections = field(default_factory=Corrections)  # in one, without stamps
 
 
 def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
@@ -85,9 +88,9 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
         with holder as folder:
             recorded = Path(folder) / job.target.name
             outcome = write_content(content, replace(job, target=recorded, correct=()))
-            ways = {"compression": job.compression}
-            notes = write_corrected(recorded, job.target, job.correct, overwrite=job.overwrite, **ways)
-            return replace(outcome, notes=(*outcome.notes, *notes))
+            ways = job.correct, job.common
+            notes, found = write_corrected(recorded, job.target, *ways, compression=job.compression, overwrite=job.overwrite)
+            return replace(outcome, notes=(*outcome.notes, *notes), corrections=found)
     labelled = job.labels.put_on(content)
     if isinstance(labelled, Recording):
         write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)

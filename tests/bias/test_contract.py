@@ -406,6 +406,15 @@ def test_another_rate_is_refused_and_a_nearly_equal_one_is_not(model: BiasModel)
             check_rate(model, rate_hz, "log.mcap")
 
 
+def test_stamps_in_batches_are_named_and_not_another_sensor(model: BiasModel) -> None:
+    number = np.arange(400)
+    t_ns = number // 4 * 20_000_000 + number % 4 * 150_000  # four samples at once, every 20 ms
+    with pytest.raises(ModelError, match=r"IMU at 6666.7 Hz by most of its steps, and 20\d.\d Hz in the mean.* --restamp"):
+        check_rate(model, 1e9 / 150_000, "log.mcap", t_ns)
+    with pytest.raises(ModelError, match="Choose or train a model for this sensor"):
+        check_rate(model, 1e9 / 150_000, "log.mcap", 150_000 * number)
+
+
 def test_the_settings_in_a_header_are_json(saved: Path) -> None:
     with safe_open(saved, framework="pt") as file:
         header = file.metadata()

@@ -242,6 +242,19 @@ def test_the_clock_of_poses_is_found_however_far_it_is_off(rotation: np.ndarray,
     assert (found.gyro.axes == rotation).all()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_one_part_that_errs_does_not_make_a_delay_unsure(seed: int) -> None:
+    """A part whose poses are 0.1 s off, as of exchanged markers: the others tell the delay as surely as without it."""
+    imu, poses = turned(waves(16.0, (0.5, 0.4, 0.6), seed))
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    late_ns = np.where(np.arange(len(truth.t_ns)) < 0.8 * len(truth.t_ns), 80_000_000, 180_000_000)
+    found = judge(motion_of(imu), truth._replace(t_ns=truth.t_ns + late_ns), 1.0).delay
+    assert found is not None
+    assert found.seconds == pytest.approx(0.08, abs=0.04)
+    assert 5.0 * found.std_s < 0.08
+
+
 @pytest.mark.parametrize(
     ("length_s", "late_s", "accuracy_s"), [(21.0, 0.35, 0.012), (21.0, -1.2, 0.012), (10.0, 0.12, 0.05), (10.0, -0.3, 0.05)]
 )

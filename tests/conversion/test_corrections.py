@@ -179,6 +179,44 @@ def test_late_poses_of_a_turned_body_in_another_world_are_corrected_at_once(tmp_
     assert sorted(path.name for path in tmp_path.iterdir()) == ["late.mcap", "right.mcap"]
 
 
+def test_short_logs_are_corrected_as_the_others_of_their_setup_and_a_right_one_stays(tmp_path: Path) -> None:
+    """Seven seconds show no order of axes and no unit of positions; a log of another setup contradicts the others."""
+    turn, y_up = Rotation.from_rotvec([3.0, -2.0, 94.0], degrees=True), Rotation.from_euler("x", -90.0, degrees=True)
+    made = flight(3, duration_s=40.0, rate_hz=100.0, truth_rate_hz=50.0)
+    start_ns = int(made.imu.t_ns[0])
+    spans_s = {
+        "long_1": (0.0, 40.0),
+        "long_2": (5.0, 35.0),
+        "short_1": (20.0, 27.0),
+        "short_2": (30.0, 37.0),
+        "right": (8.0, 40.0),
+    }
+    (tmp_path / "in").mkdir()
+    for name, ends_s in spans_s.items():
+        first_ns, last_ns = (start_ns + round(s * 1e9) for s in ends_s)
+        poses = made.truth.between(first_ns, last_ns)
+        if name != "right":
+            q_wxyz = y_up * Rotation.from_quat(poses.q_wb_wxyz.copy(), scalar_first=True) * turn
+            p_wb = 1000.0 * poses.p_wb @ y_up.as_matrix().T
+            poses = Poses(poses.t_ns + 80_000_000, p_wb, q_wxyz.as_quat(scalar_first=True))
+        part = replace(made, imu=made.imu.between(first_ns, last_ns), truths={"/vicon/pose": poses})
+        write(part, tmp_path / "in" / f"{name}.mcap")
+    alone = convert(tmp_path / "in" / "short_1.mcap", tmp_path / "alone.mcap", correct=["conventions"])
+    assert not any("positions are now in m" in note for note in alone.notes)
+    report = convert(tmp_path / "in", tmp_path / "out", correct=["conventions"], workers=1)
+    assert [note.partition(":")[0] for note in report.notes if "as in the other logs" in note] == [
+        "short_1.mcap",
+        "short_2.mcap",
+    ]
+    assert "right.mcap: the motion shows nothing to correct" in report.notes
+    for name in spans_s:
+        fixed = read(tmp_path / "out" / f"{name}.mcap").truth
+        true = made.truth.at(fixed.t_ns)[0]
+        turns = [Rotation.from_quat(poses.q_wb_wxyz.copy(), scalar_first=True) for poses in (fixed, true)]
+        assert np.degrees((turns[0] * turns[1].inv()).magnitude()).max() < 2.0, name
+        np.testing.assert_allclose(fixed.p_wb, true.p_wb, atol=0.05, err_msg=name)
+
+
 def test_a_small_delay_does_not_turn_the_body(tmp_path: Path) -> None:
     """At 60 ms the poses still explain most of the gyro, by a rotation that is off by degrees."""
     made = flight(3, duration_s=40.0, rate_hz=50.0, truth_rate_hz=25.0)

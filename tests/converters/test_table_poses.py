@@ -293,6 +293,7 @@ def test_quaternions_from_the_world_to_the_body_keep_the_world_of_their_position
     poses = log.poses["/estimate/pose"]
     np.testing.assert_allclose(np.abs((poses.q_wb_wxyz * XYZW[:, [3, 0, 1, 2]]).sum(axis=1)), 1.0, atol=1e-7)
     assert any("from the world to the body" in note for note in log.remarks.notes) == inverse
+    assert not log.scalars  # the negative columns of the quaternion are poses, too
 
 
 def test_a_setpoint_of_a_robot_is_no_pose(tmp_path):

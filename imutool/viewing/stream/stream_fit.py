@@ -49,7 +49,7 @@ def check_first(imu: Imu, model: BiasModel) -> None:
         raise DataError("none of the first samples is a measurement", where=STREAM, expected=expected)
     if len(imu) > 1:
         imu.check_rate(STREAM)
-        check_rate(model, 1.0 / imu.period_s, STREAM)
+        check_rate(model, 1.0 / imu.period_s, STREAM, imu.t_ns)
 
 
 @dataclass

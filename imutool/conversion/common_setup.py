@@ -1,0 +1,148 @@
+"""Corrections that the logs of one setup share: some show what others are too short for.
+
+Each log is corrected by its own motion first. What most of the logs that show anything agree on is then put on the others,
+unless their motion contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from imutool.array_types import Float64
+from imutool.conversion.corrections import NOT_TURNED, Corrections, pose_notes
+from imutool.geometry import quaternion
+from imutool.log_info.pose_imu_rotation import Body, body_of, frames_of_copies
+from imutool.mcap_io.codec.reflection import Reflected
+from imutool.mcap_io.log import Log
+from imutool.mcap_io.topics import ENCODINGS, Topic
+from imutool.recording.columns import median
+
+FEWEST = 2  # logs that show the same
+ALIKE_RAD, ALIKE_NS = np.radians(10.0), 30_000_000  # between rotations of the body, and between delays, of one setup
+SAME_RAD = np.radians(0.5)  # between rotations of the body that need not be made equal
+SAID = "as in the other logs"
+
+T = TypeVar("T")
+
+
+def combined(rounds: Sequence[Corrections]) -> Corrections:
+    """Corrections of some rounds in one, without stamps.
+
+    Misread quaternions are corrected in the first round, if in any.
+    """
+    made = Corrections()
+    for found in rounds:
+        imus = {topic: matrices @ made.imus.get(topic, np.eye(3)) for topic, matrices in found.imus.items()}
+        made = Corrections(
+            imus={**made.imus, **imus},
+            world=found.world @ made.world,
+            late_ns=made.late_ns + found.late_ns,
+            body=Body(found.body.turn @ made.body.turn, frozenset()),
+            pose_topic=found.pose_topic or made.pose_topic,
+            unit=found.unit if made.unit == "m" else made.unit,
+            quaternions=made.quaternions or found.quaternions,
+        )
+    return made
+
+
+def shared(own: Mapping[int, Corrections]) -> tuple[Corrections, list[int]]:
+    """Corrections that logs of one setup share, and the numbers of those that lack any of them."""
+    common = _agreed([*own.values()])
+    return common, [number for number, found in own.items() if _lacks(found, common)]
+
+
+def _agreed(logs: Sequence[Corrections]) -> Corrections:
+    """What most of the logs that are corrected in a point agree on, point by point."""
+    topics = dict.fromkeys(chain.from_iterable(each.imus for each in logs))
+    pose_topic = _most([each.pose_topic for each in logs if each.pose_topic], _equal) or ""
+    of_poses = [each for each in logs if each.pose_topic == pose_topic != ""]
+    worlds = [each.world for each in of_poses if not _is_identity(each.world)]
+    turns = [each.body.turn for each in of_poses if not _is_identity(each.body.turn)]
+    late = _group([each.late_ns for each in of_poses if each.late_ns], lambda a, b: abs(a - b) < ALIKE_NS)
+    world = _most(worlds, np.array_equal)
+    found = {topic: _most([each.imus[topic] for each in logs if topic in each.imus], np.allclose) for topic in topics}
+    return Corrections(
+        imus={topic: matrices for topic, matrices in found.items() if matrices is not None},
+        world=np.eye(3) if world is None else world,
+        late_ns=round(median(np.array(late, float))) if late else 0,
+        body=Body(_mean(_group(turns, lambda a, b: _angle(a, b) < ALIKE_RAD)), frozenset()),
+        pose_topic=pose_topic,
+        unit=_most([each.unit for each in of_poses if each.unit != "m"], _equal) or "m",
+        quaternions=_most([each.quaternions for each in of_poses if each.quaternions], _equal) or "",
+    )
+
+
+def _lacks(own: Corrections, common: Corrections) -> bool:
+    """Whether a log lacks a common correction; of its delay its own motion says most."""
+    return (
+        any(topic not in own.imus or not np.allclose(own.imus[topic], matrices) for topic, matrices in common.imus.items())
+        or not (_is_identity(common.world) or np.array_equal(own.world, common.world))
+        or not (_is_identity(common.body.turn) or _angle(own.body.turn, common.body.turn) < SAME_RAD)
+        or (common.unit not in ("m", own.unit))
+        or (common.quaternions not in ("", own.quaternions))
+        or (common.late_ns != 0 and own.late_ns == 0)
+    )
+
+
+def fitted_to(path: Path, common: Corrections) -> Corrections | None:
+    """Common corrections for a log; None if it lacks a topic, or has messages of another kind."""
+    with Log(path) as log:
+        needed = [*common.imus, *filter(None, [common.pose_topic])]
+        if not needed or not all(name in log.topics and _is_corrected(log.topics[name]) for name in needed):
+            return None
+        own_types = {t: found for t in common.imus if isinstance(found := log.topics[t].reflected, Reflected)}
+        notes = dict.fromkeys(common.imus, f"units and axes are now {SAID}")
+        if not common.pose_topic:
+            return replace(common, reflected=own_types, notes=notes)
+        turned = None if _is_identity(common.body.turn) else body_of(log, common.pose_topic, common.body.turn)
+        frame_id = next(log.pose_batches(common.pose_topic)).frame_id
+        copies = frames_of_copies(log, common.pose_topic)
+    said = pose_notes(common.world, common.quaternions, common.unit, common.late_ns, turned)
+    notes[common.pose_topic] = f"{SAID}, {'; '.join(said)}"
+    body = turned or NOT_TURNED
+    return replace(common, frame_id=frame_id, body=body, copies=copies, reflected=own_types, notes=notes)
+
+
+def _is_corrected(topic: Topic) -> bool:
+    patched = topic.reflected is None or isinstance(topic.reflected, Reflected)
+    return patched and topic.message_encoding in ENCODINGS and topic.count > 0
+
+
+def _group(values: Sequence[T], alike: Callable[[T, T], bool]) -> Sequence[T]:
+    """Largest group of values that are like one of them; empty if it is small, or no majority."""
+    groups = [[other for other in values if alike(value, other)] for value in values]
+    largest = max(groups, key=len, default=[])
+    return largest if len(largest) >= FEWEST and 2 * len(largest) > len(values) else []
+
+
+def _most(values: Sequence[T], alike: Callable[[T, T], bool]) -> T | None:
+    group = _group(values, alike)
+    return group[0] if group else None
+
+
+def _equal(a: str, b: str) -> bool:
+    return a == b
+
+
+def _is_identity(R: Float64[np.ndarray, "3 3"]) -> bool:
+    return np.array_equal(R, np.eye(3))
+
+
+def _angle(a: Float64[np.ndarray, "3 3"], b: Float64[np.ndarray, "3 3"]) -> float:
+    return float(np.linalg.norm(quaternion.log(quaternion.of_matrix(a.T @ b))))
+
+
+def _mean(turns: Sequence[Float64[np.ndarray, "3 3"]]) -> Float64[np.ndarray, "3 3"]:
+    """Mean rotation; of orders of axes and measured rotations that of the measured ones."""
+    measured = [turn for turn in turns if not np.isin(np.abs(turn), (0.0, 1.0)).all()] or turns
+    if not measured:
+        return np.eye(3)
+    left, _, right = np.linalg.svd(np.sum(measured, axis=0))
+    mean: Float64[np.ndarray, "3 3"] = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    return mean
