@@ -40,9 +40,8 @@ def load_mat(path: Path, columns: Columns) -> None:
             raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
         content = {}
     columns.has_structures = True
-    for name, value in _flat(content):
-        labels = [str(label) for label in np.ravel(content.get(f"{name}_label", []))]  # as Mission Planner writes a log
-        if np.ndim(value) == 2 and len(labels) == value.shape[1]:
+    for name, value, labels in _flat(content):
+        if labels:
             for label, column in zip(labels, value.T, strict=True):
                 columns.add(f"{name}/{label}", column)
         else:
@@ -82,11 +81,28 @@ def _unpacked_bytes(path: Path) -> int:
     return total
 
 
-def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Arrays of nested structures, with dotted names."""
+def _flat(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, list[str]]]:
+    """Arrays of nested structures, with dotted names, and the labels of their columns."""
     for name, value in content.items():
         if not name.startswith("__"):
             if isinstance(value, dict):
                 yield from _flat(value, f"{prefix}{name}.")
             elif isinstance(value, np.ndarray | int | float):
-                yield f"{prefix}{name}", value
+                yield f"{prefix}{name}", value, _labels(name, value, content)
+
+
+def _labels(name: str, value: Any, beside: dict[str, Any]) -> list[str]:
+    """Texts that name the columns of a matrix.
+
+    `NAME_label`, as Mission Planner writes it, or texts beside it that are as many, as MATLAB's `importdata` gives.
+    """
+    if np.ndim(value) != 2:
+        return []
+    own = f"{name}_label"
+    found = map(_texts, [beside[own]] if own in beside else beside.values())
+    return next((texts for texts in found if len(texts) == value.shape[1] == len(set(texts))), [])
+
+
+def _texts(value: Any) -> list[str]:
+    texts = np.ravel(value).tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "UO" else []
+    return [text.strip() for text in texts] if all(isinstance(text, str) and text.strip() for text in texts) else []

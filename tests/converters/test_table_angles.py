@@ -169,6 +169,17 @@ def test_a_log_that_mission_planner_wrote_for_matlab_names_its_columns_beside_th
     assert (TURN[::4].inv() * seen).magnitude().max() < 1e-6
 
 
+def test_the_structure_that_matlab_imports_a_table_to_has_names_of_columns_beside_them(tmp_path):
+    heads = ["Time (ms)", *(f"gyr_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (m/s^2)" for a in "xyz")]
+    cells = np.array(heads, dtype=object)[None]
+    data = np.column_stack([1000.0 * T_S, GYRO, ACCEL])
+    scipy.io.savemat(tmp_path / "walk.mat", {"A": {"data": data, "textdata": cells, "colheaders": cells}})
+    log = read(tmp_path / "walk.mat")
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, GYRO)
+    np.testing.assert_allclose(log.imus["/imu0"].accel, ACCEL)
+    np.testing.assert_allclose(log.imus["/imu0"].t_ns * 1e-9, T_S, atol=1e-9)
+
+
 @pytest.mark.parametrize("form", ["npy", "named npy", "text with the time twice"])
 def test_an_array_or_text_without_names_has_an_imu_that_gravity_shows(tmp_path, form):
     source = tmp_path / ("imu.txt" if "text" in form else "imu.npy")
