@@ -192,7 +192,7 @@ def sound_samples(log: Log, topic: str) -> Imu:
 
 
 def _columns(log: Log, topic: str) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """Stamps, rates and accelerations of an IMU as recorded."""
+    """Stamps, rates and accelerations of an IMU as recorded; they cannot be written, so that an `Imu` need not copy them."""
     stamps, rates, forces = [np.empty(0, np.int64)], [np.empty((0, 3))], [np.empty((0, 3))]
     for batch in raw_batches(log, topic):  # copies, as a batch holds whole messages
         stamps.append(batch.stamp_ns.copy())
@@ -200,7 +200,10 @@ def _columns(log: Log, topic: str) -> tuple[Int64[np.ndarray, " n"], Float64[np.
         forces.append(batch.accel.copy())
     gyro = np.concatenate(rates)
     rates.clear()
-    return np.concatenate(stamps), gyro, np.concatenate(forces)
+    t_ns, accel = np.concatenate(stamps), np.concatenate(forces)
+    for column in (t_ns, gyro, accel):
+        column.flags.writeable = False
+    return t_ns, gyro, accel
 
 
 def _sound(t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]) -> Imu:

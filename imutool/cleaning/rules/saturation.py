@@ -7,10 +7,11 @@ from itertools import product
 
 import numpy as np
 
-from imutool.array_types import Bool, Float64, Int64
+from imutool.array_types import Bool, Float64, Int64, Shaped
 from imutool.cleaning.finding import Finding, Intervals
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.rules.not_finite import AXES
+from imutool.cleaning.samples import BLOCK as PART
 from imutool.cleaning.samples import Numbers, Samples
 from imutool.recording.columns import median, quantile
 from imutool.units import ASCII_UNITS, SENSORS
@@ -30,6 +31,9 @@ RULE = (
     f"{1 - BAND:.0%} of it, change by less than {QUIET:.0%} of the axis' calmest steps: clipped before a calibration"
 )
 KEPT = 3  # values at either end: the last one, and the two it is compared with
+MOST_NEAR = (
+    1_000_000  # samples near an extreme value that are held: an axis with more, as that of gravity at rest, has no plateau
+)
 
 
 class Ends:
@@ -70,6 +74,36 @@ class Ends:
         return float(levels[0 if side < 0 else -1]) if len(levels) else np.nan
 
 
+NONE = np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)
+
+
+class _Near:
+    """Samples above a value that grows: themselves, their steps, numbers and stamps."""
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[Shaped[np.ndarray, " n"], ...]] = [NONE]
+        self._held, self._most = 0, PART
+
+    def add(self, least: float, *columns: Shaped[np.ndarray, " n"]) -> None:
+        """Add samples above `least`; too many are not held any more."""
+        if self._held > MOST_NEAR:
+            return
+        self._parts.append(columns)
+        self._held += len(columns[0])
+        if self._held > self._most:  # twice as many as were left last: each is moved a few times at most
+            self._held = len(self.above(least)[0])
+            self._most = 2 * self._held + PART
+
+    def above(self, least: float) -> tuple[Shaped[np.ndarray, " n"], ...]:
+        """Samples above `least`; none where they were too many."""
+        if self._held > MOST_NEAR:
+            self._parts = [NONE]
+        whole = [np.concatenate(column) for column in zip(*self._parts, strict=True)]
+        kept = whole[0] > least
+        self._parts = [tuple(column[kept] for column in whole)]
+        return self._parts[0]
+
+
 class Plateau:
     """Samples near an end of an axis that change less than at rest.
 
@@ -80,7 +114,7 @@ class Plateau:
         self._last, self._samples = np.nan, 0
         self._blocks = [np.zeros((2, 0))]  # largest size and median step
         self._extreme = {-1: 0.0, 1: 0.0}
-        self._near = {side: (np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)) for side in (-1, 1)}
+        self._near = {-1: _Near(), 1: _Near()}
 
     def see(self, values: Float64[np.ndarray, " n"], number: Numbers, stamp_ns: Int64[np.ndarray, " n"]) -> None:
         """Add the next samples, in order."""
@@ -94,13 +128,12 @@ class Plateau:
         self._blocks.append(np.stack(blocks))
         for side, near in self._near.items():
             self._extreme[side] = float(np.max(side * values, where=finite, initial=self._extreme[side]))
-            both = [np.concatenate(pair) for pair in zip(near, (side * values, step, number, stamp_ns), strict=True)]
-            kept = both[0] > BAND * self._extreme[side]
-            self._near[side] = both[0][kept], both[1][kept], both[2][kept], both[3][kept]
+            kept = side * values > (least := BAND * self._extreme[side])
+            near.add(least, side * values[kept], step[kept], number[kept], stamp_ns[kept])
 
     def flat(self, side: int) -> tuple[float, Numbers, Int64[np.ndarray, " m"]] | None:
         """Limit at the low (-1) or high (1) end, numbers and stamps of the samples there; None without saturation."""
-        value, step, number, stamp_ns = self._near[side]
+        value, step, number, stamp_ns = self._near[side].above(BAND * self._extreme[side])
         size, calm = np.concatenate(self._blocks, axis=1)
         calm = calm[(size < 0.5 * self._extreme[side]) & (calm > 0.0) & np.isfinite(calm)]
         if len(calm) < FEW_BLOCKS or 2 * len(value) > self._samples:
@@ -114,8 +147,11 @@ class Plateau:
 def at_limit(values: Float64[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Saturated samples of an axis, by `RULE`."""
     ends, plateau, found = Ends(), Plateau(), np.zeros(len(values), bool)
-    ends.see(values)
-    plateau.see(values, np.arange(len(values)), np.arange(len(values)))
+    for first in range(0, len(values), PART):
+        block = values[first : first + PART]
+        number = first + np.arange(len(block))
+        ends.see(block)
+        plateau.see(block, number, number)
     for side in (-1, 1):
         if (limit := ends.limit(side)) is not None:
             found |= values == limit
