@@ -73,18 +73,20 @@ def damaged_times(texts: list[str]) -> list[tuple[int, str]]:
     return next((fields for fields in odd if len(fields) < len(texts) / 2), [])
 
 
-def join_dates(names: list[str], fields: list[list[str]]) -> None:
-    """Make one column of a column of dates and that of their clocks."""
+def join_dates(names: list[str], fields: list[list[str]]) -> int | None:
+    """Make one column of dates and their clocks; return the place of the one that is gone."""
     dates = [n for n, texts in enumerate(fields) if re.fullmatch(DAY, next(iter(texts), ""))]
     times = [n for n, texts in enumerate(fields) if re.fullmatch(DAYTIME, next(iter(texts), ""), re.IGNORECASE)]
     clocks = [n for n in times if not re.search(SPANS, names[n], re.IGNORECASE)]
     if len(dates) != 1 or len(clocks) != 1:
-        return
+        return None
     (date,), (clock,) = dates, clocks
     both = [" ".join(each) for each in zip(fields[date], fields[clock], strict=True)]
-    if calendar_times(both) is not None:
-        names[clock], fields[clock] = f"{names[date]} {names[clock]}", both
-        del names[date], fields[date]
+    if calendar_times(both) is None:
+        return None
+    names[clock], fields[clock] = f"{names[date]} {names[clock]}", both
+    del names[date], fields[date]
+    return date
 
 
 def gps_times(week: Int64[np.ndarray, " n"], ns: Int64[np.ndarray, " n"]) -> tuple[Int64[np.ndarray, " n"], int]:

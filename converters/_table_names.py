@@ -138,3 +138,21 @@ def split_name(column: str) -> tuple[str, str]:
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, inside[1]))
         name = name[: inside.start()] + name[inside.end() :]
     return name, unit
+
+
+def distinct_names(names: list[str]) -> list[str]:
+    """Names of columns, of which one that repeats stands below the last that does not.
+
+    So are messages of a bag that are written as a table:
+    `angular_velocity,x,y,z,linear_acceleration,x,y,z` has `angular_velocity.x`, `linear_acceleration.x`, ....
+    """
+    above, distinct = "", list[str]()
+    for text in names:
+        if names.count(text) > 1:
+            name = f"{above}.{text}" if above else text
+            repeated = sum(re.fullmatch(rf"{re.escape(name)}( \(\d+\))?", other) is not None for other in distinct)
+            distinct.append(f"{name} ({repeated + 1})" if repeated else name)
+        else:
+            above = text
+            distinct.append(text)
+    return distinct

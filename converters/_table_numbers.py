@@ -8,7 +8,46 @@ import numpy as np
 
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?(0?,\d+|\d+,(\d\d?|\d{4,}))([eE][+-]?\d+)?")  # in quotes; of 1,234 it may mark thousands
+WHOLE_NUMBER = re.compile(r"[+-]?\d{1,19}")
+SAMPLED = 200  # rows that show which columns are whole numbers
+EXACT = 2.0**15  # larger numbers that are not whole keep their texts: seconds since 1970 and days lose nanoseconds as float64
 MOST_ODD = 0.1  # share of the fields of a column of numbers that are none: `-`, `ERR`, a garbled line
+
+
+def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndarray | None], list[list[str]]] | None:
+    """Numbers and texts of columns, of lines of equally many fields; None of other lines.
+
+    A field has no quotes. A column is all of numbers, and has its texts only where float64 rounds them, or is all of texts.
+    NumPy takes a tenth of the time and memory of Python's fields.
+    """
+    looked = [line.split(delimiter) for line in [*lines[:SAMPLED], *lines[-1:]]]
+    width = len(looked[0]) if looked else 0
+    if (
+        not width
+        or any('"' in line or _count(line, delimiter) != width for line in lines)
+        or not any(row[-1] for row in looked)
+    ):
+        return None
+    fields = [[text.strip() for text in column] for column in zip(*looked, strict=True)]
+    kinds = {
+        str(k): np.int64 if all(map(WHOLE_NUMBER.fullmatch, texts)) else np.float64
+        for k, texts in enumerate(fields)
+        if None not in map(_number, texts)
+    }
+    if not kinds:
+        return None
+    try:
+        used = [int(k) for k in kinds]
+        rows = np.loadtxt(lines, [*kinds.items()], comments=None, delimiter=delimiter, usecols=used, ndmin=1)
+    except (ValueError, OverflowError):
+        return None
+    values = [np.ascontiguousarray(rows[str(k)]) if str(k) in kinds else None for k in range(width)]
+    kept = [column is None or (column.dtype.kind == "f" and bool((np.abs(column) > EXACT).any())) for column in values]
+    return values, [[line.split(delimiter)[k].strip() for line in lines] if keep else [] for k, keep in enumerate(kept)]
+
+
+def _count(line: str, delimiter: str | None) -> int:
+    return len(line.split()) if delimiter is None else line.count(delimiter) + 1
 
 
 def is_number(text: str) -> bool:
@@ -34,17 +73,18 @@ def vectors(texts: list[str]) -> np.ndarray | None:
 
 def decimal_points(texts: list[str], mark: re.Pattern[str]) -> list[str]:
     """Fields with points for their decimal commas; none where no field has one."""
-    has_one = any("," in text and mark.fullmatch(text) for text in texts)
+    has_one = "," in "".join(texts) and any("," in text and mark.fullmatch(text) for text in texts)
     return [text.replace(",", ".") for text in texts] if has_one else []
 
 
 def numbers(texts: list[str]) -> tuple[np.ndarray, list[str]] | None:
     """Numbers of a column, nan for the few fields that are none, and these; None of texts."""
-    if not any("_" in text for text in texts):
-        try:
-            return np.array(list(map(int, texts)), np.int64), []
-        except (ValueError, OverflowError):
-            pass
+    if "_" not in "".join(texts):
+        for kind in (int, float):
+            try:
+                return np.array(list(map(kind, texts)), np.int64 if kind is int else np.float64), []
+            except (ValueError, OverflowError):
+                pass
     found = [_number(text) for text in texts]
     odd = [text for text, number in zip(texts, found, strict=True) if number is None and text]
     if len(odd) > MOST_ODD * len(texts):

@@ -20,8 +20,8 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
-from ._table_names import TIME_WORDS, split_name, unit_named
-from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers, vector, vectors
+from ._table_names import TIME_WORDS, distinct_names, split_name, unit_named
+from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers, plain_columns, vector, vectors
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
@@ -150,30 +150,22 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     first = next((n for n, line in enumerate(lines) if _is_row(line, delimiter, least)), len(lines))
     stated = filter(None, map(STATED_NUMBER.fullmatch, lines[:first]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
-    rows = _fields(lines[first:], delimiter)
-    ends = {len(row) for row in _fields(lines[:first], delimiter) if row and row[-1].strip()}
-    while rows and len(rows[0]) > 1 and len(rows[0]) not in ends and all(row[-1] == "" for row in rows):
-        rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
-    width = _width(rows, _fields(lines[:first], delimiter))
+    values, fields, width = _columns_of(lines[first:], lines[:first], delimiter, columns)
     names, units = _header(lines[:first], delimiter, width)
-    above = _fields(lines[:first], delimiter)[-1] if first and delimiter is not None else []
-    if names[:1] == ["column 1"] and 1 < len(above) < width and not any(map(is_number, above)):
-        named = ", ".join(above)[:200]
-        said = f"the line above the rows has {len(above)} fields and the rows {width}: it names no column ({named})"
-        is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, above))  # else perhaps a title
-        (columns.remarks.losses if is_header else columns.remarks.notes).append(said)
-    whole = [row for row in rows if len(row) == width]
-    if len(whole) < len(rows):
-        columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
+    _note_unused_header(lines[:first], delimiter, names, columns)
     commas: list[str] = []
     empty: list[str] = []
-    fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
-    join_dates(names, fields)
-    for place, (named, texts) in enumerate(zip(names, fields, strict=True), 1):
+    if (joined := join_dates(names, fields)) is not None:
+        del values[joined]
+    for place, (named, read, texts) in enumerate(zip(names, values, fields, strict=True), 1):
+        name = named or f"column {place}"
+        if read is not None:
+            columns.values[name], columns.units[name] = read, units.get(name, "")
+            columns.texts |= {name: texts} if texts else {}
+            continue
         if not any(texts):
             empty.append(named)
             continue
-        name = named or f"column {place}"
         if pointed := decimal_points(texts, COMMA_NUMBER if delimiter != "," else DECIMAL_COMMA):
             texts[:] = pointed
             commas.append(name)
@@ -182,6 +174,35 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
         columns.remarks.notes.append(f"columns without a value are left out: {left}")
     if commas:
         columns.remarks.notes.append(f"decimal commas are read as points: {', '.join(commas)}")
+
+
+def _columns_of(
+    lines: list[str], above: list[str], delimiter: str | None, columns: Columns
+) -> tuple[list[np.ndarray | None], list[list[str]], int]:
+    """Numbers of columns that are read as such, texts of the others, and how many columns there are."""
+    if (plain := plain_columns(lines, delimiter)) is not None:
+        return *plain, len(plain[0])
+    rows = _fields(lines, delimiter)
+    ends = {len(row) for row in _fields(above, delimiter) if row and row[-1].strip()}
+    while rows and len(rows[0]) > 1 and len(rows[0]) not in ends and all(row[-1] == "" for row in rows):
+        rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
+    width = _width(rows, _fields(above, delimiter))
+    whole = [row for row in rows if len(row) == width]
+    if len(whole) < len(rows):
+        columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
+    fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
+    return [None] * len(fields), fields, width
+
+
+def _note_unused_header(above: list[str], delimiter: str | None, names: list[str], columns: Columns) -> None:
+    """Say of the line above the rows that it names no column, where it seems to."""
+    fields = _fields(above, delimiter)[-1] if above and delimiter is not None else []
+    if names[:1] == ["column 1"] and 1 < len(fields) < len(names) and not any(map(is_number, fields)):
+        said = f"the line above the rows has {len(fields)} fields and the rows {len(names)}: it names no column"
+        is_header = any(
+            re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, fields)
+        )  # else perhaps a title
+        (columns.remarks.losses if is_header else columns.remarks.notes).append(f"{said} ({', '.join(fields)[:200]})")
 
 
 def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
@@ -244,7 +265,7 @@ def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[s
     if len(rows) > 1 and _repeats(names):
         joint, below = _below_groups(rows[-2], names, " " if axes else ".")
         names, units = (names, units) if _repeats(joint) else (joint, units or below)
-    names = _distinct(names)
+    names = distinct_names(names)
     return names, dict(zip(names, units, strict=True)) if units else {}
 
 
@@ -276,20 +297,3 @@ def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:
     if delimiter is not None and any('"' in line for line in lines[:50]):
         return list(csv.reader(lines, delimiter=delimiter))
     return [line.split(delimiter) for line in lines]
-
-
-def _distinct(names: list[str]) -> list[str]:
-    """Names of columns; one that repeats stands below the last that does not, as in a bag's messages written as a table.
-
-    `angular_velocity,x,y,z,linear_acceleration,x,y,z` has `angular_velocity.x`, `linear_acceleration.x`, ....
-    """
-    above, distinct = "", list[str]()
-    for text in names:
-        if names.count(text) > 1:
-            name = f"{above}.{text}" if above else text
-            repeated = sum(re.fullmatch(rf"{re.escape(name)}( \(\d+\))?", other) is not None for other in distinct)
-            distinct.append(f"{name} ({repeated + 1})" if repeated else name)
-        else:
-            above = text
-            distinct.append(text)
-    return distinct

@@ -48,6 +48,7 @@ STEPS = [
     *(("rad/s", np.deg2rad(step)) for step in WHOLE_DEG_S),
     *BNO055_STEPS.items(),
 ]
+MOST_ROWS = 100_000  # of a long table, taken evenly
 MOST_STEPS = 100.0  # from the median, within which a step that is stated to 0.1 % stays in phase
 LEAST_LENGTH = 0.85  # of the mean of the phases, where rounded decimals are a tenth of a step off
 LEAST_SUM = 25.0  # of Rayleigh's statistic on three axes: by chance it is larger 5 times in 10^9
@@ -110,6 +111,7 @@ def _usual(values: Float64[np.ndarray, "*n"], share: float) -> float:
 
 def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
     """Unit of a gyro whose values are steps of a common sensor, and the step; else None."""
+    rates = rates[:: max(1, len(rates) // MOST_ROWS)]
     found = [(unit, step) for unit, step in STEPS if _counts_in(rates, step)]
     return found[0] if len({unit for unit, _ in found}) == 1 else None
 

@@ -1,6 +1,7 @@
-"""A ROS 1 bag with an IMU and images to MCAP: imutool convert beside rosbags-convert, in one run.
+"""A ROS 1 bag with an IMU and images to MCAP: imutool convert beside rosbags-convert, in one run; and a table of text.
 
     python tests/bench/convert.py [--megabytes 2000]
+    python tests/bench/convert.py --rows 1440000       # two hours at 200 Hz, beside a python that reads them with NumPy
 
 Each command runs alone in a process of its own, three times in turn; the least of each figure counts. rosbags-convert writes
 without compression, so imutool does too in a row of its own.
@@ -65,23 +66,42 @@ def measured(command: list[str]) -> tuple[float, float, float]:
     return wall, cpu, memory
 
 
+def write_table(path: Path, rows: int) -> None:
+    """Table of a time, a gyro, an accelerometer and a temperature."""
+    t_s, rng = np.arange(rows) / IMU_HZ, np.random.default_rng(1)
+    gyro = np.stack([0.3 * np.sin(2.0 * np.pi * f * t_s) for f in (0.1, 0.07, 0.05)], axis=1)
+    accel = np.array([0.0, 0.0, 9.81]) + 0.05 * rng.normal(size=(rows, 3))
+    table = np.column_stack([t_s, gyro + 0.002 * rng.normal(size=(rows, 3)), accel, 25.0 + 0.01 * rng.normal(size=rows)])
+    header = ",".join(["time", *(f"gyro_{a} (rad/s)" for a in "xyz"), *(f"acc_{a} (m/s^2)" for a in "xyz"), "temperature"])
+    np.savetxt(path, table, "%.6f", ",", header=header, comments="")
+
+
 def main() -> None:
     """Print a line for each command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--megabytes", type=int, default=2000)
+    parser.add_argument("--rows", type=int, help="of a table of text, instead of a bag")
     parser.add_argument("--folder", type=Path, default=None, help="where bag and logs are written, and removed")
     words = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=words.folder) as folder:
-        bag = Path(folder, "robot.bag")
-        messages = write_bag(bag, words.megabytes)
-        print(f"{bag.stat().st_size / 1e6:.0f} MB, {messages} messages")
-        convert = [sys.executable, "-m", "imutool", "convert", str(bag)]
-        rosbags = str(Path(sys.executable).with_name("rosbags-convert"))
-        commands = {
-            "imutool convert": (convert, "robot.mcap"),
-            "imutool convert --compression none": ([*convert, "--compression", "none"], "plain.mcap"),
-            "rosbags-convert": ([rosbags, "--dst-storage", "mcap", "--src", str(bag), "--dst"], "robot"),
-        }
+        source = Path(folder, "robot.csv" if words.rows else "robot.bag")
+        convert = [sys.executable, "-m", "imutool", "convert", str(source)]
+        if words.rows:
+            write_table(source, words.rows)
+            code = f"import numpy, sys; numpy.save(sys.argv[1], numpy.loadtxt({str(source)!r}, delimiter=',', skiprows=1))"
+            commands = {
+                "imutool convert": (convert, "table.mcap"),
+                "numpy.loadtxt": ([sys.executable, "-c", code], "table.npy"),
+            }
+        else:
+            print(f"{write_bag(source, words.megabytes)} messages")
+            rosbags = str(Path(sys.executable).with_name("rosbags-convert"))
+            commands = {
+                "imutool convert": (convert, "robot.mcap"),
+                "imutool convert --compression none": ([*convert, "--compression", "none"], "plain.mcap"),
+                "rosbags-convert": ([rosbags, "--dst-storage", "mcap", "--src", str(source), "--dst"], "robot"),
+            }
+        print(f"{source.stat().st_size / 1e6:.0f} MB")
         runs: dict[str, list[tuple[float, float, float]]] = {name: [] for name in commands}
         sizes: dict[str, float] = {}
         for number in range(RUNS):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,30 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
         f'gyro = {names[1:4]}\ngyro_unit = "rad/s"\naccel = {names[4:]}\naccel_unit = "m/s^2"\n'
     )
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("start", "step"),
+    [("0", "0.0040000000"), ("1700000000.123456789", "0.004"), ("1700000000123456789", "4000000"), ("7", "4")],
+)
+def test_a_table_of_plain_numbers_and_one_with_quotes_give_the_same(tmp_path, start, step):
+    """The first is read by NumPy; nanoseconds since 1970 stay exact, and columns of whole numbers whole."""
+    header = "time,gx (rad/s),gy (rad/s),gz (rad/s),ax (m/s^2),ay (m/s^2),az (m/s^2),count,pressure"
+    times = [Decimal(start) + n * Decimal(step) for n in range(400)]
+    columns = [GYRO[:400].T, ACCEL[:400].T]
+    numbers = [",".join(f"{value:.9f}" for value in row) for row in np.concatenate(columns).T]
+    rows = [f"{t},{row},{n},{101_325.25 + n}" for n, (t, row) in enumerate(zip(times, numbers, strict=True))]
+    logs = []
+    for quote in ("", '"'):
+        path = tmp_path / f"log{len(logs)}.csv"
+        path.write_text("\n".join([header, *(row.replace(f",{n},", f",{quote}{n}{quote},") for n, row in enumerate(rows))]))
+        logs.append(read(path))
+    plain, quoted = logs
+    assert plain.imus == quoted.imus
+    assert plain.scalars == quoted.scalars
+    assert plain.remarks.notes == quoted.remarks.notes
+    unit = {"7": 1_000_000, "1700000000123456789": 1}.get(start, 10**9)
+    assert plain.imus["/imu0"].t_ns.tolist()[-1] == int(times[-1] * unit)
 
 
 @pytest.mark.parametrize(("program", "start"), [("Excel", 25_569), ("MATLAB", 719_529)])
