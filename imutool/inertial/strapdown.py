@@ -87,6 +87,8 @@ def dead_reckon(
             expected="rates and forces of a moving body",
             fix="Check gyro and accel just before that sample",
         )
+    for column in (p_wb, q_wb, v_w):  # so that the poses need no copy
+        column.flags.writeable = False
     return Poses(imu.t_ns, p_wb, q_wb, v_w)
 
 
