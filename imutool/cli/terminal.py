@@ -145,10 +145,27 @@ def write_json(report: Report | Mapping[str, Any], where: str | None, *, overwri
 
 
 class _Lines(logging.Handler):
-    """Handler that prints log records on stderr, above the progress bar."""
+    """Handler that prints log records on stderr, above the progress bar; what logs in a row have alike in one line more."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._text, self._others = "", list[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
+        log, colon, text = record.getMessage().partition(": ")
+        if colon and text == self._text:
+            self._others.append(log)
+            return
+        self.flush()
+        self._text = text
         say(with_flags(f"{record.levelname.lower()}: {record.getMessage()}"), to=err)
+
+    def flush(self) -> None:
+        """Name the other logs of the last text."""
+        if self._others:
+            more = len(self._others) - 1
+            say(f"warning: {self._others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
+        self._text, self._others = "", []
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:
@@ -181,7 +198,11 @@ def progress(what: str, verbose: bool, quiet: bool) -> Iterator[Callable[[int, i
             if word:
                 logger.info("%s %s", what, word)
 
-        yield tell
+        try:
+            yield tell
+        finally:
+            for handler in logging.getLogger().handlers:
+                handler.flush()
 
 
 def epoch_line(epoch: Epoch) -> tuple[int, int, str]:

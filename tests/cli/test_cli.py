@@ -90,6 +90,18 @@ def test_a_message_of_a_hostile_file_is_cut(capsys: pytest.CaptureFixture[str]) 
     assert said.endswith("xxx). Choose another.\n")
 
 
+def test_what_several_logs_in_a_row_have_alike_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with terminal.progress("Reading", verbose=False, quiet=False):
+        for log, text in zip("abcda", ("one is lost",) * 3 + ("two are lost",) * 2, strict=True):
+            terminal.logger.warning("%s: %s", log, text)
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: a: one is lost",
+        "warning: b and 1 other: the same",
+        "warning: d: two are lost",
+        "warning: a: the same",
+    ]
+
+
 def test_a_question_needs_no_full_stop() -> None:
     assert str(errors.ConfigError("a", fix="Did you mean b?")) == "a. Did you mean b?"
     assert str(errors.ConfigError("a", fix="Do b")) == "a. Do b."
