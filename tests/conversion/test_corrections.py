@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from imutool import registry
 from imutool.api.models import debias as debias_log
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
+from imutool.conversion.common_setup import shared
 from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.run import convert
 from imutool.errors import LogError
@@ -215,6 +216,20 @@ def test_short_logs_are_corrected_as_the_others_of_their_setup_and_a_right_one_s
         turns = [Rotation.from_quat(poses.q_wb_wxyz.copy(), scalar_first=True) for poses in (fixed, true)]
         assert np.degrees((turns[0] * turns[1].inv()).magnitude()).max() < 2.0, name
         np.testing.assert_allclose(fixed.p_wb, true.p_wb, atol=0.05, err_msg=name)
+
+
+def test_logs_share_what_most_of_those_that_show_anything_agree_on() -> None:
+    degrees, turned = np.stack([np.radians(1.0) * np.eye(3), np.eye(3)]), np.stack([P, P])
+    shows, shows_other, shows_nothing = Corrections({"/imu0": degrees}), Corrections({"/imu0": turned}), Corrections()
+    common, lacking = shared({0: shows, 1: shows, 2: shows_nothing, 3: shows_other})
+    np.testing.assert_array_equal(common.imus["/imu0"], degrees)
+    assert lacking == [2, 3]
+    for some in ([shows, shows_nothing], [shows, shows, shows_other, shows_other], [shows_nothing] * 3):
+        common, lacking = shared(dict(enumerate(some)))
+        assert (common.imus, lacking) == ({}, [])
+    late = [Corrections(pose_topic="/p", late_ns=ms * 1_000_000) for ms in (-70, -80, -90, -700)]
+    common, lacking = shared(dict(enumerate([*late, Corrections()])))
+    assert (common.late_ns, lacking) == (-80_000_000, [4])  # of its own delay a log says most
 
 
 def test_a_small_delay_does_not_turn_the_body(tmp_path: Path) -> None:
