@@ -9,6 +9,7 @@ among them, is a table too if it has the name of a sensor (`gyro/t` and `gyro/va
 from __future__ import annotations
 
 import re
+from collections import Counter
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -61,7 +62,11 @@ ENDINGS = (
 def sequences_below(source: Path) -> list[Sequence]:
     """Recordings of tables in a folder and in those below it."""
     found: dict[Path, list[Sequence]] = {}
-    find_folders(source, lambda folder: bool(found.setdefault(folder, _sequences_in(folder))))
+
+    def is_mine(folder: Path) -> bool:
+        return bool(found.setdefault(folder, _sequences_in(folder)))
+
+    find_folders(source, is_mine, lambda folder: found[folder][0].path.is_dir())  # whose folders may be sensors of it
     return [*chain(*found.values())]
 
 
@@ -141,6 +146,8 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     tables = _tables(folder)
     if _groups(tables[:MOST_TABLES]):
         return {"": tables[:MOST_TABLES]}
+    count = Counter(map(_stem, tables))
+    stems = {path: _stem(path) if count[_stem(path)] == 1 else path.name for path in tables}  # imu.csv beside imu.txt
     alike: dict[str, list[Path]] = {}
     for path in tables:
         alike.setdefault(_without_role(_stem(path)), []).append(path)
@@ -148,7 +155,7 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     for shared, paths in alike.items():
         first = _stem(paths[0])
         name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
-        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if look(path).is_imu}
+        found |= {name: paths} if name and _groups(paths) else {stems[path]: [path] for path in paths if look(path).is_imu}
     return found
 
 

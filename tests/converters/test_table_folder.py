@@ -344,3 +344,13 @@ def test_further_tables_of_a_recording_arrive_also_where_they_are_narrow(tmp_pat
     assert len(log.scalars["/Depth_depth"].t_ns) == COUNT
     assert [*log.poses] == (["/ground_truth/pose"] if imu == "beside poses" else [])
     assert log.remarks.losses == []
+
+
+def test_files_of_one_name_and_folders_below_a_table_are_recordings_of_their_own(tmp_path):
+    header = "time,gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s2],acc_y [m/s2],acc_z [m/s2]\n"
+    (tmp_path / "older").mkdir()
+    for number, name in enumerate(("imu.csv", "imu.txt", "older/imu.csv")):
+        (tmp_path / name).write_text(header + rows(T_S + 1000.0 * number, GYRO + number, ACCEL))
+    logs = [table.read_sequence(sequence) for sequence in table.sequences(tmp_path)]
+    assert [log.name for log in logs] == ["imu.csv", "imu.txt", "older"]
+    np.testing.assert_allclose([log.imus["/imu0"].gyro for log in logs], [GYRO, GYRO + 1, GYRO + 2])
