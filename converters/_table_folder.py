@@ -22,6 +22,7 @@ from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape, read_npy
+from ._table_geodetic import add_local
 from ._table_groups import TRUE_GROUPS
 from ._table_look import look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
@@ -106,6 +107,8 @@ def load_split(folder: Path, recording: str = "") -> Columns:
             verb = "are" if group == POSES_GROUP else "is"
             part.remarks.notes.append(f"the {group.replace('_', ' ')} {verb} {path.name}")
         name_columns(part, sensor)
+        if group == TRUTH_GROUP:
+            add_local(part)
         whole.take(group, part, path.name)
     return whole
 

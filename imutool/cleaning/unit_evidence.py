@@ -66,9 +66,9 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool, bool]:
     """Gravity as accel reads it, whether at rest, and whether it may be noise; None if empty.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
-    Without any it is the median length, if that is steady: of a body that spins, gravity is gone from means of a second. Else it
-    is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is less than half of
-    it: then it is motion that the others read, and gravity was taken out.
+    Without any it is the median length, if that is steady: of a body that spins, gravity is gone from means of a second.
+    Else it is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is less
+    than half of it: then it is motion that the others read, and gravity was taken out.
     """
     step, mean = motion.table()
     if not len(step):
