@@ -59,7 +59,10 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
     rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
 )
-SYMBOLS = {"gyro": r"(?P<sensor>)(?P<axis>[pqr])", "accel": r"(?P<sensor>f)_?(?P<axis>[xyz])"}  # of an aircraft; specific force
+SYMBOLS = {  # of an aircraft; specific force, or in the axes of the body, where gravity shows that it is no bias
+    "gyro": r"(?P<sensor>)(?P<axis>[pqr])",
+    "accel": r"(?P<sensor>f|(.*_)?acc(el(eration)?)?_b(ody)?)_?(?P<axis>[xyz])",
+}
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
 AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": "z"}

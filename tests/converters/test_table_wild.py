@@ -133,6 +133,7 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"{a}Rate (deg/s)" for a in "xyz"], [f"{a}Accel (m/s2)" for a in "xyz"]),  # Aceinna
         ([f"gyro_raw_{a} [deg/s]" for a in "xyz"], [f"acc_raw_{a}" for a in "xyz"]),
         ([f"ang_vel_uncal_{a}[deg/s]" for a in "xyz"], [f"acc_uncal_{a}[m/s^2]" for a in "xyz"]),
+        ([f"ang_vel_{a} [deg/s]" for a in "xyz"], [f"acc_b_{a}" for a in "xyz"]),
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
@@ -141,6 +142,16 @@ def test_names_of_other_programs(tmp_path, gyro, accel):
     (imu,) = read(path).imus.values()
     np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_a_bias_in_the_axes_of_the_body_is_no_acceleration(tmp_path):
+    names = ["time_s", *(f"gyro_{a} [deg/s]" for a in "xyz"), *(f"acc_b_{a}" for a in "xyz")]
+    bias = np.tile([0.01, -0.02, 0.03], (COUNT, 1))
+    path = write_csv(tmp_path / "imu.csv", names, [T_S, *COUNTS.T, *bias.T])
+    with pytest.raises(ConfigError):
+        read(path)
+    path = write_csv(tmp_path / "both.csv", [*names, "acc_x", "acc_y", "acc_z"], [T_S, *COUNTS.T, *bias.T, *ACCEL_G.T])
+    np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
 
 
 def test_a_table_of_ulog2csv_is_in_the_units_of_px4(tmp_path):
