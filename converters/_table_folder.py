@@ -28,7 +28,7 @@ from ._table_look import look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
-from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, sensors_among
+from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, plain_among, sensors_among
 from ._table_text import LOOKED_AT, MOSTLY, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
@@ -237,7 +237,8 @@ def _load(path: Path) -> Columns:
 def _groups(tables: list[Path]) -> dict[Path, str]:
     """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or IMUs and poses; else none."""
     sensors, seen = sensors_among(map(_stem, tables)), {path: look(path) for path in tables}
-    groups = sensors if {*sensors.values()} == {*SENSORS} else pairs_among(map(_stem, tables))
+    several = pairs_among(map(_stem, tables)) or plain_among(map(_stem, tables))
+    groups = sensors if {*sensors.values()} == {*SENSORS} else several
     of_sensors = {path: groups[_stem(path)] for path in tables if _stem(path) in groups}
     captured = [path for path in tables if seen[path].is_mocap]
     words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1

@@ -12,14 +12,14 @@ TIME_WORDS = (
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
+    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rad/sec|rps|rad_s|radps|rad(ian)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg(ree)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "ft/s^2": r"(ft|feet|foot)/s(ec)?((\^|\*\*)?2|²|/s(ec)?)|(ft|feet|foot)[ .·]?s\^?-2|fps\^?2|ft_?(per_?)?s_?2",
     "mg": r"mg|milli[ -]?gs?",
-    "g": r"gs?",
+    "g": r"g'?s?",
     "ns": r"ns|nanoseconds?|nsec",
     "us": r"us|µs|microseconds?|usec",
     "ms": r"ms|milliseconds?|msecs?",
@@ -125,7 +125,7 @@ def split_name(column: str) -> tuple[str, str]:
     for words, translated in CHINESE.items():
         text = text.replace(words, translated)
     bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
-    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(p, bracket[1].strip())), "")
+    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(rf"(in )?({p})", bracket[1].strip())), "")
     if bracket:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")

@@ -354,3 +354,16 @@ def test_files_of_one_name_and_folders_below_a_table_are_recordings_of_their_own
     logs = [table.read_sequence(sequence) for sequence in table.sequences(tmp_path)]
     assert [log.name for log in logs] == ["imu.csv", "imu.txt", "older"]
     np.testing.assert_allclose([log.imus["/imu0"].gyro for log in logs], [GYRO, GYRO + 1, GYRO + 2])
+
+
+def test_of_several_accelerometers_the_one_with_no_further_word_is_asked_about(tmp_path):
+    (tmp_path / "gyroscope.csv").write_text("t [s],x (in radians/s),y (in radians/s),z (in radians/s)\n" + rows(T_S, GYRO))
+    for name in ("accelerometer.csv", "new_accelerometer.csv"):
+        (tmp_path / name).write_text("t [s],x (in G's),y (in G's),z (in G's)\n" + rows(T_S, ACCEL / 9.80665))
+    (sequence,) = table.sequences(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(sequence)
+    assert 'accel = ["accel/x", "accel/y", "accel/z"]  # please confirm: these columns?' in str(refused.value.fix)
+    (tmp_path / "new_accelerometer.csv").unlink()
+    (sequence,) = table.sequences(tmp_path)
+    np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].accel, ACCEL, rtol=1e-9)

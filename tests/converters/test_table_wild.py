@@ -133,6 +133,8 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"{a}Rate (deg/s)" for a in "xyz"], [f"{a}Accel (m/s2)" for a in "xyz"]),  # Aceinna
         ([f"gyro_raw_{a} [deg/s]" for a in "xyz"], [f"acc_raw_{a}" for a in "xyz"]),
         ([f"ang_vel_uncal_{a}[deg/s]" for a in "xyz"], [f"acc_uncal_{a}[m/s^2]" for a in "xyz"]),
+        ([f"gyro {a} (in degrees/s)" for a in "xyz"], [f"acc {a} (in m/s^2)" for a in "xyz"]),
+        ([f"gyro {a} [degrees per second]" for a in "xyz"], [f"accel_{a}" for a in "xyz"]),
         ([f"ang_vel_{a} [deg/s]" for a in "xyz"], [f"acc_b_{a}" for a in "xyz"]),
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
