@@ -50,6 +50,10 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is a C3D file of a motion capture",
         "Export it as CSV or TRC, and convert it beside the table of the IMU",
     ),
+    rb"\x80[\x02-\x05].*[()}\].]": (
+        "it is a pickle of Python, which can run any program when it is read",
+        "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
+    ),
     rb"PK\x03\x04|.{257}ustar": (
         "it is an archive without a mav0 folder, a bag or a single table",
         "Unpack it, and convert the folder that is in it",

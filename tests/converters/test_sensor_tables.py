@@ -198,3 +198,11 @@ def test_steps_as_strong_as_gravity_are_not_gravity(convert, tmp_path):
     assert "in a second: gravity was taken out" in done.stderr
     upright = jog | {"Accelerometer.csv": sensor_logger(steps + GRAVITY + MOTION)}
     assert convert(pack(tmp_path / "up.zip", upright), tmp_path / "up.mcap").returncode == 0
+
+
+def test_an_accelerometer_that_runs_much_longer_than_the_gyro_is_doubted(convert, tmp_path):
+    first = phyphox(GYRO, "rad/s").splitlines(keepends=True)[: COUNT // 2]
+    files = PHONES["phyphox"] | {"Gyroscope.csv": "".join(first)}
+    done = convert(pack(tmp_path / "two.zip", files), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "before or after all of the gyro's are left out: are both of one recording?" in done.stderr
