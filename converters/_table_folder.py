@@ -159,7 +159,7 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
         first = _stem(paths[0])
         name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
         found |= {name: paths} if name and _groups(paths) else {stems[path]: [path] for path in paths if look(path).is_imu}
-    return found
+    return found or {stems[path]: [path] for path in tables if look(path).may_be_imu}
 
 
 def _without_role(stem: str) -> str:

@@ -367,3 +367,25 @@ def test_of_several_accelerometers_the_one_with_no_further_word_is_asked_about(t
     (tmp_path / "new_accelerometer.csv").unlink()
     (sequence,) = table.sequences(tmp_path)
     np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].accel, ACCEL, rtol=1e-9)
+
+
+def test_what_one_file_shows_it_shows_in_a_folder(tmp_path):
+    lines = zip(T_S.tolist(), GYRO.tolist(), (ACCEL / 9.80665).tolist(), strict=True)
+    named = "".join(
+        f"acc {t:.3f} {a[0]} {a[1]} {a[2]}\ngyro {t:.3f} {g[0]} {g[1]} {g[2]}\n" for t, g, a in ((t, *gs) for t, *gs in lines)
+    )
+    folders = {
+        "rows that name their sensor": ("walk_1.txt", named),
+        "sentences of VectorNav": (
+            "vn.txt",
+            "".join(f"$VNYMR,1,2,3,.1,.2,.3,{a[0]},{a[1]},{a[2]},.1,.2,{g[2]}*66\n" for a, g in zip(ACCEL, GYRO, strict=True)),
+        ),
+        "more columns without a header": ("log.txt", rows(T_S, GYRO, ACCEL, np.full((COUNT, 1), 31.5))),
+    }
+    for folder, (name, text) in folders.items():
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / name).write_text(text)
+    assert [sequence.path.name for sequence in table.sequences(tmp_path)] == ["log.txt", "walk_1.txt", "vn.txt"]
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(table.sequences(tmp_path)[0])
+    assert '# perhaps accel = ["column 5", "column 6", "column 7"]' in str(refused.value.fix)
