@@ -170,6 +170,8 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
     """
     names = [*table.values]
+    if not names:
+        return
     has_header = not all(re.fullmatch(r"column \d+|time", name) for name in names)  # the time may be that of a clock beside it
     if has_header and not sensor:
         return

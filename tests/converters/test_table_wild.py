@@ -11,6 +11,7 @@ from support.tables import write_csv
 
 from imutool.converters import table
 from imutool.converters._table_headerless import as_table
+from imutool.converters._table_names import split_name
 from imutool.converters._table_units import raw_counts, unit_by_steps
 from imutool.errors import ConfigError
 
@@ -454,3 +455,22 @@ def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path
     names = [name.replace("0.1 deg/s", "deg/s").replace("1e-3 g", "16 g") for name in names]
     path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *ACCEL_G.T])
     np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G)
+
+
+def test_every_unit_at_the_end_of_a_name_has_a_meaning():
+    rates = [
+        f"{angle}{per}{second}"
+        for angle in ("deg", "rad")
+        for per in ("", "_", "_per_", "per")
+        for second in ("s", "sec", "second")
+    ]
+    times = [f"{part}sec{end}" for part in ("", "nano", "micro", "milli") for end in ("", "s", "ond", "onds")]
+    found = [split_name(f"x_{unit}") for unit in (*rates, *times)]
+    assert [name for name, _ in found] == ["x"] * len(found)
+    assert {unit for _, unit in found} == {"deg/s", "rad/s", "s", "ns", "us", "ms"}
+
+
+def test_objects_without_a_number_are_no_table(tmp_path):
+    words = '{"first": [' + ",".join(['{"name": "left"}'] * 9) + '], "second": [' + ",".join(['{"name": "right"}'] * 9) + "]}"
+    (tmp_path / "words.json").write_text(words)
+    assert table.sequences(tmp_path) == []
