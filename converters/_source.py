@@ -214,19 +214,21 @@ def find_files(source: Path, suffixes: Collection[str], is_mine: Callable[[bytes
     return [Sequence(name(source), source)] if is_mine(head(source)) else []
 
 
-def find_folders(source: Path, is_mine: Callable[[Path], bool]) -> list[Sequence]:
-    """Find folders of one kind: the source itself, or those in it."""
+def find_folders(
+    source: Path, is_mine: Callable[[Path], bool], is_whole: Callable[[Path], bool] = lambda _: True
+) -> list[Sequence]:
+    """Find folders of one kind: the source and those below, none below one that is whole."""
     if not source.is_dir():
         return []
-    return [Sequence(path.name, path) for path in _folders(named_folder(source), DEPTH, is_mine)]
+    return [Sequence(path.name, path) for path in _folders(named_folder(source), DEPTH, is_mine, is_whole)]
 
 
-def _folders(folder: Path, depth: int, is_mine: Callable[[Path], bool]) -> Iterator[Path]:
-    if is_mine(folder):
+def _folders(folder: Path, depth: int, is_mine: Callable[[Path], bool], is_whole: Callable[[Path], bool]) -> Iterator[Path]:
+    if is_found := is_mine(folder):
         yield folder
-    elif depth > 0 and not ((folder / ROOT).is_dir() or folder.name == ROOT):
+    if depth > 0 and not (is_found and is_whole(folder)) and not ((folder / ROOT).is_dir() or folder.name == ROOT):
         for child in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
-            yield from _folders(child, depth - 1, is_mine)
+            yield from _folders(child, depth - 1, is_mine, is_whole)
 
 
 def name(path: Path) -> str:

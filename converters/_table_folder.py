@@ -9,6 +9,7 @@ among them, is a table too if it has the name of a sensor (`gyro/t` and `gyro/va
 from __future__ import annotations
 
 import re
+from collections import Counter
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
@@ -21,12 +22,13 @@ from . import Sequence
 from ._archive import refusing
 from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape, read_npy
+from ._table_geodetic import add_local
 from ._table_groups import TRUE_GROUPS
 from ._table_look import look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
-from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, sensors_among
+from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, plain_among, sensors_among
 from ._table_text import LOOKED_AT, MOSTLY, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
@@ -61,7 +63,11 @@ ENDINGS = (
 def sequences_below(source: Path) -> list[Sequence]:
     """Recordings of tables in a folder and in those below it."""
     found: dict[Path, list[Sequence]] = {}
-    find_folders(source, lambda folder: bool(found.setdefault(folder, _sequences_in(folder))))
+
+    def is_mine(folder: Path) -> bool:
+        return bool(found.setdefault(folder, _sequences_in(folder)))
+
+    find_folders(source, is_mine, lambda folder: found[folder][0].path.is_dir())  # whose folders may be sensors of it
     return [*chain(*found.values())]
 
 
@@ -101,6 +107,8 @@ def load_split(folder: Path, recording: str = "") -> Columns:
             verb = "are" if group == POSES_GROUP else "is"
             part.remarks.notes.append(f"the {group.replace('_', ' ')} {verb} {path.name}")
         name_columns(part, sensor)
+        if group == TRUTH_GROUP:
+            add_local(part)
         whole.take(group, part, path.name)
     return whole
 
@@ -141,6 +149,8 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     tables = _tables(folder)
     if _groups(tables[:MOST_TABLES]):
         return {"": tables[:MOST_TABLES]}
+    count = Counter(map(_stem, tables))
+    stems = {path: _stem(path) if count[_stem(path)] == 1 else path.name for path in tables}  # imu.csv beside imu.txt
     alike: dict[str, list[Path]] = {}
     for path in tables:
         alike.setdefault(_without_role(_stem(path)), []).append(path)
@@ -148,8 +158,8 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     for shared, paths in alike.items():
         first = _stem(paths[0])
         name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
-        found |= {name: paths} if name and _groups(paths) else {_stem(path): [path] for path in paths if look(path).is_imu}
-    return found
+        found |= {name: paths} if name and _groups(paths) else {stems[path]: [path] for path in paths if look(path).is_imu}
+    return found or {stems[path]: [path] for path in tables if look(path).may_be_imu}
 
 
 def _without_role(stem: str) -> str:
@@ -227,7 +237,8 @@ def _load(path: Path) -> Columns:
 def _groups(tables: list[Path]) -> dict[Path, str]:
     """Groups of the tables that make a recording: gyro and accel of one or several IMUs, or IMUs and poses; else none."""
     sensors, seen = sensors_among(map(_stem, tables)), {path: look(path) for path in tables}
-    groups = sensors if {*sensors.values()} == {*SENSORS} else pairs_among(map(_stem, tables))
+    several = pairs_among(map(_stem, tables)) or plain_among(map(_stem, tables))
+    groups = sensors if {*sensors.values()} == {*SENSORS} else several
     of_sensors = {path: groups[_stem(path)] for path in tables if _stem(path) in groups}
     captured = [path for path in tables if seen[path].is_mocap]
     words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
+from ._table_geodetic import LOCAL, fits_gravity
 from ._table_map import IMU_TOPIC, Entries, column_named
 from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
@@ -24,10 +25,7 @@ QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
 QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-3])"
 COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
 ANGLES = (
-    (
-        rf"(?!{COMMANDED})(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?",
-        ("roll", "pitch", "yaw"),
-    ),
+    (rf"(?!{COMMANDED})(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?", ("roll", "pitch", "yaw")),
     (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
 )
 GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
@@ -36,7 +34,7 @@ POSITION = r"((t|p|pos|position|translation|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?
 POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
     (POSITION, "xyz"),
     (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
-    (r"(p(os(ition)?)?_?)?(?P<axis>north|east|down)", ("north", "east", "down")),
+    (rf"(p(os(ition)?)?_?|{LOCAL})?(?P<axis>north|east|down)", ("north", "east", "down")),
     (r"p_?(?P<axis>[ned])", "ned"),
 )
 NED = POSITIONS[2:]
@@ -116,9 +114,12 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
     for is_estimate, clock, turns, position in sorted(poses, key=lambda each: (each[0], each[1]))[:1]:
         found |= {"truth_time": clock[0], "truth_time_unit": clock[1], **turns}
         found["pose_kind"] = "estimate" if is_estimate else "truth"
-        if position:
-            stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
-            found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
+        why = fits_gravity(columns, {**entries, **turns}, position, clock) if position else ""
+        if why or not position:
+            reasons += filter(None, [why])
+            continue
+        stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
+        found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
         if named := _position({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
             found["pose_world"] = "ned"
             reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")

@@ -10,9 +10,9 @@ from typing import NamedTuple
 from imutool.errors import ConfigError, DataError
 
 from ._source import head
-from ._table_files import NO_NUMBERS, kind_of, load
+from ._table_files import NO_NUMBERS, kind_of, load, read_text
 from ._table_groups import has_poses
-from ._table_headerless import name_headerless
+from ._table_headerless import perhaps
 from ._table_layouts import known_layout
 from ._table_mocap import is_mocap
 from ._table_packed import text_head
@@ -35,6 +35,7 @@ class Seen(NamedTuple):
     """What the columns of a table show."""
 
     is_imu: bool
+    may_be_imu: bool
     has_poses: bool
     is_mocap: bool
     has_time: bool
@@ -49,9 +50,10 @@ def look(path: Path) -> Seen:
 @lru_cache(maxsize=4096)
 def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a changed file
     columns, start, kind = Columns(), _start(path), kind_of(head(path), path)
-    if start:
+    if start and is_mocap(start):
         read_csv(start, columns, path)
-        name_headerless(columns)
+    elif start:
+        read_text(start, columns, path)
     elif kind not in ("csv", "") and size <= MOST_LOOKED:
         try:
             columns = load(path, kind)
@@ -59,7 +61,8 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
             if not error.what.startswith(NO_NUMBERS):  # of a file of settings, say
                 logger.warning("left out: %s", error)
     if not columns.values:
-        return Seen(False, False, is_mocap(start), False)
+        return Seen(False, False, False, is_mocap(start), False)
     name_columns(columns, "")
     entries = (known_layout(columns) or propose(columns)).entries
-    return Seen(entries.keys() >= {"gyro", "accel"}, has_poses(columns), is_mocap(start), "time" in entries)
+    is_imu = entries.keys() >= {"gyro", "accel"}
+    return Seen(is_imu, bool(start and perhaps(columns)), has_poses(columns), is_mocap(start), "time" in entries)

@@ -12,18 +12,18 @@ TIME_WORDS = (
     r"(_since_?(boot|reboot|start|epoch|1970))?"
 )
 UNITS = {
-    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rad/sec|rps|rad_s|radps|rad[ _]?per[ _]?s(ec(ond)?)?",
-    "deg/s": r"deg ?/ ?s|dps|degs|°/s|deg/sec|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg[ _]?per[ _]?s(ec(ond)?)?",
+    "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rps|rad_s|radps|rad(ian)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?|rad_?sec(ond)?",
+    "deg/s": r"deg ?/ ?s|dps|degs|°/s|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg(ree)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?|deg_?sec(ond)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
     "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "ft/s^2": r"(ft|feet|foot)/s(ec)?((\^|\*\*)?2|²|/s(ec)?)|(ft|feet|foot)[ .·]?s\^?-2|fps\^?2|ft_?(per_?)?s_?2",
     "mg": r"mg|milli[ -]?gs?",
-    "g": r"gs?",
-    "ns": r"ns|nanoseconds?|nsec",
-    "us": r"us|µs|microseconds?|usec",
-    "ms": r"ms|milliseconds?|msecs?",
-    "s": r"s|sec|seconds?",
+    "g": r"g'?s?",
+    "ns": r"ns|(n|nano)sec(ond)?s?",
+    "us": r"us|µs|(u|micro)sec(ond)?s?",
+    "ms": r"ms|(m|milli)sec(ond)?s?",
+    "s": r"s|sec(ond)?s?",
     "min": r"min(ute)?s?",
     "h": r"h|hrs?|hours?",
     "day": r"days?",
@@ -59,7 +59,10 @@ FORMS = (  # names of an axis, by falling preference; one of roll, pitch and yaw
     rf"(?P<sensor>(?:.*_)?(WORDS))_?(?P<place>\d|{PLACES})_?(?P<axis>[xyz]){STATE}",  # acc1_x, acc_chest_x
     rf"(?P<sensor>(?:.*_)?(WORDS))(?P<state>{STATES})_?(?P<axis>[xyz012])",  # acc_raw_x
 )
-SYMBOLS = {"gyro": r"(?P<sensor>)(?P<axis>[pqr])", "accel": r"(?P<sensor>f)_?(?P<axis>[xyz])"}  # of an aircraft; specific force
+SYMBOLS = {  # of an aircraft; specific force, or in the axes of the body, where gravity shows that it is no bias
+    "gyro": r"(?P<sensor>)(?P<axis>[pqr])",
+    "accel": r"(?P<sensor>f|(.*_)?acc(el(eration)?)?_b(ody)?)_?(?P<axis>[xyz])",
+}
 CHINESE = {"加速度": "acc_", "角速度": "gyro_", "时间": "time"}  # of WitMotion's program
 AXES = {"0": "x", "1": "y", "2": "z"}
 TURNS = AXES | {"roll": "x", "pitch": "y", "yaw": "z", "p": "x", "q": "y", "r": "z"}
@@ -122,7 +125,7 @@ def split_name(column: str) -> tuple[str, str]:
     for words, translated in CHINESE.items():
         text = text.replace(words, translated)
     bracket = re.search(r"[\[(]([^\])]*[a-zµ°][^\])]*)[\])]\s*$", text)
-    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(p, bracket[1].strip())), "")
+    unit = next((u for u, p in UNITS.items() if bracket and re.fullmatch(rf"(in )?({p})", bracket[1].strip())), "")
     if bracket:
         text = text[: bracket.start()]
     name = re.sub(r"[^a-z0-9]+", "_", text).strip("_")

@@ -92,12 +92,13 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
     best, is_shown = _way_by_motion(columns, entries, ways, clock)
     if best is None:
         return [], ""
-    gyro, at_s, other = _GyroTurns.of(columns, entries), _seconds(columns, clock), 1 - best
+    gyro, at_s, other = _GyroTurns.of(columns, entries), seconds_of(columns, clock), 1 - best
     pair = ways[best], ways[other] * INVERSE
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         own, inverse = turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in pair]
         if min(own.correlation, inverse.correlation) > SURE:
-            up = [_is_up(columns, entries, way, at_s - delay_s, turn.turn) for way, turn in zip(pair, turns, strict=True)]
+            named = zip(pair, turns, strict=True)
+            up = [up_share(columns, entries, way, at_s - delay_s, turn.turn) > UP for way, turn in named]
             is_own = inverse.same_axes > SURE and _is_clear(inverse.same_axes, own.same_axes)
             if up[1] > up[0] or (up[1] == up[0] and is_own):
                 w, *xyz = (array[axis] for axis in ORDERS[other])
@@ -106,30 +107,30 @@ def order_by_motion(columns: Columns, entries: Entries, array: list[str], clock:
     return [array[axis] for axis in ORDERS[best]], ORDER_NAMES[best] + ("" if is_shown else EITHER_WAY)
 
 
-def _is_up(
+def up_share(
     columns: Columns,
     entries: Entries,
     q_wxyz: Float64[np.ndarray, "n 4"],
     at_s: Float64[np.ndarray, " n"],
     turn: Float64[np.ndarray, "3 3"],
-) -> bool:
-    """Whether the mean specific force points up in the world of poses, whose body is turned against the IMU."""
+) -> float:
+    """Share along +z of the mean specific force in the poses' world; `turn` is of their body."""
     force = columns.side_by_side(entries["accel"])
-    t_s = _seconds(columns, (str(entries["time"]), str(entries["time_unit"])))
+    t_s = seconds_of(columns, (str(entries["time"]), str(entries["time_unit"])))
     if len(t_s) != len(force):
-        return False
+        return 0.0
     known = np.isfinite(t_s) & np.isfinite(force).all(axis=1)
     at_poses = np.stack([np.interp(at_s, t_s[known], axis) for axis in force[known].T], axis=1)
     unit = np.abs(np.linalg.norm(q_wxyz, axis=1) - 1.0) < NOT_UNIT
     mean = quaternion.rotate(q_wxyz[unit], at_poses[unit] @ turn.T).mean(axis=0)
-    return bool(mean[2] > UP * np.linalg.norm(mean))
+    return float(mean[2] / np.linalg.norm(mean))
 
 
 def matrix_by_motion(columns: Columns, entries: Entries, nine: list[str], clock: tuple[str, str]) -> tuple[list[str], bool]:
     """Nine columns of a matrix or its transpose that turns as the gyro; whether it shows which."""
     ways = nine, [nine[place] for place in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
-    rotations = [_rotations(columns, {"rotation_matrix": way}) for way in ways]
-    best, is_shown = _way_by_motion(columns, entries, rotations, clock)
+    turns = [rotations(columns, {"rotation_matrix": way}) for way in ways]
+    best, is_shown = _way_by_motion(columns, entries, turns, clock)
     return ([] if best is None else ways[best]), is_shown
 
 
@@ -141,7 +142,7 @@ def _way_by_motion(
     A quaternion in the other order is the inverse rotation in other frames, as is the transpose of a matrix. Motion about one
     or two axes fits both. Then the reading that turns about the gyro's own axes counts, or else the first.
     """
-    gyro, at_s, fits_both = _GyroTurns.of(columns, entries), _seconds(columns, clock), False
+    gyro, at_s, fits_both = _GyroTurns.of(columns, entries), seconds_of(columns, clock), False
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         turns = [_turns_alike(gyro, way, at_s - delay_s, span_s) for way in ways]
         for found in ([turn.correlation for turn in turns], [turn.same_axes for turn in turns]):
@@ -161,8 +162,8 @@ def angles_by_motion(columns: Columns, entries: Entries, three: list[str], clock
         (unit, yaw): {"roll_pitch_yaw": [*three[:2], yaw + three[2]], "roll_pitch_yaw_unit": unit}
         for unit, yaw in product(_angle_units(columns, three), ("", "-"))
     }
-    turns = {way: _rotations(columns, named) for way, named in ways.items()}
-    gyro, at_s = _GyroTurns.of(columns, entries), _seconds(columns, clock)
+    turns = {way: rotations(columns, named) for way, named in ways.items()}
+    gyro, at_s = _GyroTurns.of(columns, entries), seconds_of(columns, clock)
     size = GYRO_SI.get(str(entries.get("gyro_unit", "")), 0.0)
     for delay_s, span_s in product(_delays(entries, clock), SPANS_S):
         found = {}
@@ -201,8 +202,8 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     """Unit in which the gyro turns as far as the poses; empty where none does."""
     if not entries.keys() & TURNS:
         return ""
-    q_wxyz, gyro = _rotations(columns, entries), _GyroTurns.of(columns, entries)
-    at_s = _seconds(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
+    q_wxyz, gyro = rotations(columns, entries), _GyroTurns.of(columns, entries)
+    at_s = seconds_of(columns, (str(entries["truth_time"]), str(entries["truth_time_unit"])))
     for span_s in (SPAN_S, LONG_SPAN_S):
         turn = _turns_alike(gyro, q_wxyz, at_s, span_s)
         near = [unit for unit, size in GYRO_SI.items() if 1.0 / MOST_OFF < turn.slope / size < MOST_OFF]
@@ -211,7 +212,7 @@ def unit_by_poses(columns: Columns, entries: Entries) -> str:
     return ""
 
 
-def _rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
+def rotations(columns: Columns, entries: Entries) -> Float64[np.ndarray, "n 4"]:
     """Quaternions (wxyz) of the columns that the entries name."""
     if "roll_pitch_yaw" in entries:
         angles = columns.side_by_side(entries["roll_pitch_yaw"])
@@ -285,6 +286,6 @@ def _turns_alike(
     return _Alike(float(correlation), float(correlation * ratio), float(np.trace(product) / size), left * signs @ right)
 
 
-def _seconds(columns: Columns, clock: tuple[str, str]) -> Float64[np.ndarray, " n"]:
+def seconds_of(columns: Columns, clock: tuple[str, str]) -> Float64[np.ndarray, " n"]:
     """Times of a column in s."""
     return np.asarray(columns.values[clock[0]].astype(float) * TIME_NS[clock[1]] * 1e-9)

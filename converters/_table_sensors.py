@@ -52,6 +52,12 @@ def sensors_among(names: Iterable[str]) -> dict[str, str]:
     return {names[0]: sensor for sensor, names in best.items() if len(names) == 1}
 
 
+def plain_among(names: Iterable[str]) -> dict[str, str]:
+    """The gyroscope and the accelerometer, where their names say nothing else; else none."""
+    found = sensors_among(name for name in names if re.fullmatch("|".join(SENSORS.values()), name.lower()))
+    return found if {*found.values()} == {*SENSORS} else {}
+
+
 def pairs_among(names: Iterable[str]) -> dict[str, str]:
     """Groups (`imu0/gyro`) of the names of several IMUs; of one IMU none.
 
@@ -164,6 +170,8 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
     """
     names = [*table.values]
+    if not names:
+        return
     has_header = not all(re.fullmatch(r"column \d+|time", name) for name in names)  # the time may be that of a clock beside it
     if has_header and not sensor:
         return

@@ -2,8 +2,7 @@
 
 Sensor Logger and phyphox record an accelerometer with gravity, or acceleration and gravity apart, in tables of their own.
 Sensor Logger's `Accelerometer`, which has a column `seconds_elapsed`, is without gravity. The
-layouts are those of github.com/tszheichoi/awesome-sensor-logger (UNITS.md, COORDINATES.md) and of phyphox's export. OXTS lies
-in `oxts/data/*.txt`, 30 numbers a file, as the development kit of KITTI raw describes them.
+layouts are those of github.com/tszheichoi/awesome-sensor-logger (UNITS.md, COORDINATES.md) and of phyphox's export.
 """
 
 from __future__ import annotations
@@ -11,22 +10,22 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
-from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars
 from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
-from ._archive import is_zip, list_members, read_bounded, refusing
-from ._source import find_folders, name, with_suffix
+from ._archive import list_members, read_bounded, refusing
+from ._oxts import OXTS, read_oxts
+from ._source import each_path, find_folders, name, named_folder, with_suffix
 from ._table_names import split_name
 from ._table_text import Columns, read_csv
 from ._table_times import begun_at_zero
@@ -37,9 +36,8 @@ IMU_TOPIC = "/imu0"
 GYRO = "gyroscope", "gyroscopeuncalibrated"  # tables by falling preference, names without spaces in lower case
 ACCEL = "totalacceleration", "accelerometeruncalibrated"
 LINEAR = "linearaccelerometer", "linearacceleration"  # of phyphox, without gravity; Sensor Logger's `accelerometer` may be
-OXTS = re.compile(r"(.*/)?oxts/data/\d+\.txt")
-OXTS_TIMES = "oxts/timestamps.txt"
-EARTH_M = 6_378_137.0
+PLACE = r"/?(meta/|oxts/(data/)?)?[^/]+$"  # of a file below the folder of its recording
+HIDDEN = r"(^|/)(__MACOSX/|\.)"
 NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 FIX = "Record the acceleration with gravity, or gravity too"
 LEAST_GRAVITY, MOST_IN_G = 0.5, 2.0  # median lengths, in m/s² of nothing but motion, and of readings in g
@@ -67,10 +65,19 @@ class _Files:
 
 
 def sequences(source: Path) -> list[Sequence]:
-    """The zip, or the folders, with tables of a gyroscope and an accelerometer, or with OXTS."""
-    if source.is_file() and is_zip(source):
-        return [Sequence(name(source), source)] if zipfile.is_zipfile(source) and is_phone(source) else []
-    return find_folders(source, is_phone)
+    """Folders, also of a zip, with tables of gyroscope and accelerometer, or with OXTS."""
+    if not source.is_dir():
+        return _in_zip(source) if zipfile.is_zipfile(source) else []
+    packed = [path for path in each_path(named_folder(source)) if path.suffix.lower() == ".zip" and zipfile.is_zipfile(path)]
+    return [*find_folders(source, is_phone, lambda _: False), *(found for path in packed for found in _in_zip(path))]
+
+
+def _in_zip(path: Path) -> list[Sequence]:
+    """Folders of a zip that have such tables; a zip that cannot be read is none."""
+    with suppress(DataError):
+        folders = sorted({re.sub(PLACE, "", member) for member in list_members(path).sizes if not re.search(HIDDEN, member)})
+        return [Sequence(PurePosixPath(f).name or name(path), path, f) for f in folders if is_phone(path, f)]
+    return []
 
 
 def recognises(sequence: Sequence) -> bool:
@@ -84,9 +91,10 @@ def read_sequence(sequence: Sequence, *, images: bool = True) -> MessageLog:
     Raises:
         DataError: a table is damaged, or the acceleration has no gravity in it.
     """
-    files, remarks = _files(sequence.path), Remarks()
+    files, remarks = _files(sequence.path, sequence.inside), Remarks()
     is_oxts = any(map(OXTS.fullmatch, files.names))
-    imu, poses, scalars = (_oxts if is_oxts else _phone)(files, sequence.path, remarks)
+    where = Path(str(sequence))
+    imu, poses, scalars = read_oxts(files.names, files.text, where, remarks) if is_oxts else _phone(files, where, remarks)
     log = MessageLog(
         sequence.name,
         sequence.path.name,
@@ -105,9 +113,9 @@ def read(source: Path) -> Iterator[MessageLog]:
     return map(read_sequence, sequences(source))
 
 
-def is_phone(path: Path) -> bool:
-    """Whether a folder or zip has a phone app's tables, whose times are named, or OXTS."""
-    files = _files(path)
+def is_phone(path: Path, inside: str = "") -> bool:
+    """Whether a folder, or one of a zip, has a phone app's tables with a time, or OXTS."""
+    files = _files(path, inside)
     tables = files.tables()
     gyro = next((tables[table] for table in GYRO if table in tables), "")
     return any(map(OXTS.fullmatch, files.names)) or (
@@ -117,10 +125,12 @@ def is_phone(path: Path) -> bool:
     )
 
 
-def _files(path: Path) -> _Files:
-    """Files of a zip, or of a folder, in which KITTI's lie two levels deeper."""
+def _files(path: Path, inside: str) -> _Files:
+    """Files of a folder, or of one in a zip; those of KITTI lie two levels deeper."""
     if path.is_file():
-        return _Files([*list_members(path).sizes], partial(_member, path))
+        start = f"{inside}/" if inside else ""
+        below = (member.removeprefix(start) for member in list_members(path).sizes if member.startswith(start))
+        return _Files([file for file in below if not re.sub(PLACE, "", file)], lambda wanted: _member(path, start + wanted))
     found = [*with_suffix(path, ".csv"), *path.glob("meta/*.csv"), *path.glob("oxts/*.txt"), *path.glob("oxts/data/*.txt")]
     return _Files([file.relative_to(path).as_posix() for file in found], lambda wanted: (path / wanted).read_bytes())
 
@@ -141,6 +151,10 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     is_alone = used == ("accelerometer",) and "seconds_elapsed" in files.text(tables["accelerometer"]).partition("\n")[0]
     if level <= LEAST_GRAVITY or (is_alone and abs(level / STANDARD_GRAVITY - 1.0) > GRAVITY_BAND):
         raise DataError(f"the median acceleration is {level:.3g} m/s^2: gravity was taken out", where=where, fix=FIX)
+    if is_alone and (steady := _steady_level(accel_ns, accel)) < STANDARD_GRAVITY / 2.0:
+        raise DataError(
+            f"the acceleration cancels out to {steady:.3g} m/s^2 in a second: gravity was taken out", where=where, fix=FIX
+        )
     if in_g := level < MOST_IN_G:
         accel = accel * STANDARD_GRAVITY
         remarks.notes.append(f"the median acceleration is {level:.3g}: it was taken for g, and is now m/s^2")
@@ -158,6 +172,13 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
         if table not in (gyro_table, *used):
             scalars |= _others(files, path, clock, where, remarks)
     return imu, {}, scalars
+
+
+def _steady_level(t_ns: Int64[np.ndarray, " n"], accel: Float64[np.ndarray, "n 3"]) -> float:
+    """Median length of the acceleration's means over a second, in which steps and shakes cancel out and gravity does not."""
+    starts = np.flatnonzero(np.diff((t_ns - t_ns[0]) // NS["s"], prepend=-1))
+    means = np.add.reduceat(accel, starts) / np.diff(starts, append=len(accel))[:, None]
+    return float(np.median(np.linalg.norm(means, axis=1)))
 
 
 def _acceleration(
@@ -250,37 +271,3 @@ def _others(files: _Files, path: str, clock: list[tuple[float, int]], where: Pat
         if len(kept.t_ns):
             scalars[f"/{folder}/{key}"] = Scalars(kept.t_ns, kept.values, unit)
     return scalars
-
-
-def _oxts(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str, Poses], dict[str, Scalars]]:
-    """IMU of OXTS in the axes of the car (x forward, y left, z up), and its poses by GNSS and INS: east, north, up."""
-    times = next((path for path in files.names if path.endswith(OXTS_TIMES)), None)
-    if times is None:
-        raise DataError("is missing", where=f"{where}/{OXTS_TIMES}", expected="a time for each file of OXTS")
-    texts = [line.strip() for line in files.text(times).splitlines() if line.strip()]
-    paths = sorted(path for path in files.names if OXTS.fullmatch(path))
-    rows = [files.text(path).split() for path in paths]
-    if len(texts) != len(rows) or any(len(row) < 23 for row in rows):
-        raise DataError(f"has {len(texts)} times and {len(rows)} files", where=where, expected="as many, of 30 numbers each")
-    try:
-        t_ns = np.array([text.replace(" ", "T") for text in texts], "datetime64[ns]").astype(np.int64)
-        values = np.array([row[:23] for row in rows], np.float64)
-    except ValueError as error:
-        raise DataError(f"holds no numbers ({error})", where=where) from error
-    kept = in_order(t_ns, values, times)
-    remarks.notes.extend(kept.notes)
-    values = kept.values
-    latitude, longitude = np.deg2rad(values[:, 0]), np.deg2rad(values[:, 1])
-    scale = EARTH_M * np.cos(latitude[0])
-    east, north = scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2))
-    p = np.stack([east - east[0], north - north[0], values[:, 2] - values[0, 2]], axis=1)
-    poses = Poses(kept.t_ns, p, _from_roll_pitch_yaw(values[:, 3:6]))
-    remarks.notes.append("/oxts/pose is an estimate of GNSS and this IMU")
-    return Imu(kept.t_ns, values[:, 17:20], values[:, 11:14]), {"/oxts/pose": poses}, {}
-
-
-def _from_roll_pitch_yaw(angles: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions (wxyz) of Rz(yaw) Ry(pitch) Rx(roll)."""
-    from scipy.spatial.transform import Rotation
-
-    return quaternion.unit(Rotation.from_euler("ZYX", angles[:, ::-1]).as_quat()[:, [3, 0, 1, 2]])

@@ -36,6 +36,7 @@ POSES_APART_NS = 300_000_000
 CALM_STEPS, CALM_SHARE = 10, 0.1  # windows of a second, and the calmest of them
 CALM_SCATTER = 0.03  # of the reading
 LARGEST_SCATTER = 1.0  # of the reading, in the median second: more is no gravity with motion, but noise about zero
+STEADY_SPREAD = 0.15  # between the quartiles, of the median; 0.53 of noise about zero, 0.11 of a phone spun by hand
 GRAVITY_SHARE = 0.5  # of the median reading, that the calmest seconds read at least where gravity is in it
 
 
@@ -65,8 +66,9 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool, bool]:
     """Gravity as accel reads it, whether at rest, and whether it may be noise; None if empty.
 
     Calm are the tenth of the seconds whose means over 0.1 s scatter least, if that is less than 3 % of what they read.
-    Without any it is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is
-    less than half of it: then it is motion that the others read, and gravity was taken out.
+    Without any it is the median length, if that is steady: of a body that spins, gravity is gone from means of a second.
+    Else it is the median of all, means of a second, in which vibration is gone; or what the calmest read, if that is less
+    than half of it: then it is motion that the others read, and gravity was taken out.
     """
     step, mean = motion.table()
     if not len(step):
@@ -81,8 +83,10 @@ def gravity_level(motion: Motion) -> tuple[float | None, bool, bool]:
     calm = calm[scatter[calm] < CALM_SCATTER]
     if len(calm):
         return float(quantile(level[calm], 0.5)), True, False
-    if not whole.any():
-        return float(quantile(np.linalg.norm(mean[:, 3:], axis=1), 0.5)), False, False
+    length = np.linalg.norm(mean[:, 3:], axis=1)
+    least, low, middle, high = (float(quantile(length, share)) for share in (0.05, 0.25, 0.5, 0.75))
+    if not whole.any() or (high - low < STEADY_SPREAD * middle and least > GRAVITY_SHARE * middle):
+        return middle, False, False
     median = float(quantile(level[whole], 0.5))
     calmest = float(quantile(level[np.flatnonzero(whole)[np.argsort((scatter * level)[whole])][:few]], 0.5))
     is_noise = float(quantile(scatter[whole], 0.5)) > LARGEST_SCATTER

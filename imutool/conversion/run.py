@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import Any
 
@@ -188,7 +188,7 @@ def _with_folders(job: Job, source: Path) -> Job:
     inside, folder = job.sequence.inside, source.resolve()
     path = job.sequence.path.parent.resolve() / job.sequence.path.name  # which may be a link out of the folder
     below = path.relative_to(folder).parts if path.is_relative_to(folder) else ()
-    folders = [*below[:-1], *([Path(below[-1]).stem] if below and inside else [])]
+    folders = [*below[:-1], *([Path(below[-1]).stem] if below and inside else []), *PurePosixPath(inside).parts[:-1]]
     return replace(job, sequence=replace(job.sequence, name="_".join([*folders, job.sequence.name])))
 
 

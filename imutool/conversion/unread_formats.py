@@ -26,6 +26,34 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "it is an ASCII log of a NovAtel receiver, whose RAWIMU holds counts of a scale that depends on the IMU",
         "Make a CSV of it in rad/s and m/s^2 with the scale that NovAtel's manual states for the IMU, and convert that",
     ),
+    rb"MD\xfc\x03": (
+        "it is a log of an Axivity sensor",
+        "Export it as raw CSV with OmGUI, or with the tool cwa-convert, and convert that",
+    ),
+    rb"Device Identity\r?\n|GENEA/": (
+        "it is a log of a GENEActiv or GENEA sensor, which has no gyro",
+        "Convert a recording of a sensor with a gyro",
+    ),
+    rb".{8}\.FIT": (
+        "it is a FIT file of a sports watch",
+        "Export its gyroscope_data and accelerometer_data as CSV, and convert that",
+    ),
+    rb".{4}ftyp": (
+        "it is a video",
+        "Extract its telemetry as CSV or JSON, as gopro-telemetry or telemetry-parser do, and convert that",
+    ),
+    rb"(\xef\xbb\xbf)?<\?xml.{0,200}<mvnx": (
+        "it is a motion of Xsens MVN, which holds what its model of the body estimates",
+        "Export what the sensors measured from the .mvn or .mtb as text, and convert that",
+    ),
+    rb"[\x02-\x05]P": (
+        "it is a C3D file of a motion capture",
+        "Export it as CSV or TRC, and convert it beside the table of the IMU",
+    ),
+    rb"\x80[\x02-\x05].*[()}\].]": (
+        "it is a pickle of Python, which can run any program when it is read",
+        "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
+    ),
     rb"PK\x03\x04|.{257}ustar": (
         "it is an archive without a mav0 folder, a bag or a single table",
         "Unpack it, and convert the folder that is in it",

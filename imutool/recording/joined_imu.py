@@ -186,6 +186,7 @@ def _peak(products: Float64[np.ndarray, "k 3"], lags: Int64[np.ndarray, " k"]) -
 
 SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
 LEAST_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
+LONGEST_ALONE_S = 1.0  # of the accelerometer before and after the gyro, as sensors that start one by one have
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
 
 
@@ -252,6 +253,10 @@ def joined(
     )
     if not inside.all():
         notes.append(f"{name}: {int((~inside).sum())} gyro samples have no accelerometer sample near them")
+    alone = (forces.t_ns < rates.t_ns[0]) | (forces.t_ns > rates.t_ns[-1])
+    if (alone_s := alone.sum() / rate_hz[1]) > LONGEST_ALONE_S:
+        said = f"{int(alone.sum())} accelerometer samples ({alone_s:.1f} s) before or after all of the gyro's are left out"
+        notes.append(f"{name}: {said}: are both of one recording?")
     return Imu(rates.t_ns[inside], rates.values[inside], accel_there), notes
 
 

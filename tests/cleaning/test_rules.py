@@ -330,6 +330,15 @@ def test_noise_as_large_as_gravity_is_not_taken_for_a_reading_in_g(made):
     assert (survey.scale[3:] == 1.0).all()
 
 
+def test_gravity_in_a_body_that_spins_within_a_second_is_gravity(made):
+    """As a phone that is spun for the magnetometer: in means of a second gravity is gone."""
+    phase = 2 * np.pi * np.linspace(0.0, 1.0, len(made.accel)) * len(made.accel) / 200.0
+    spun = 9.81 * np.stack([np.sin(phase), np.cos(phase), 0 * phase], axis=1)
+    survey = look(made._replace(accel=spun + 0.5 * np.random.default_rng(1).normal(size=spun.shape)))
+    assert not any("accel" in reason for reason in survey.reasons)
+    assert (survey.scale[3:] == 1.0).all()
+
+
 def test_motion_of_one_metre_per_second_squared_without_gravity_is_not_taken_for_g(made):
     """At rest it reads noise; the median of the rest is 1, as that of a log in g is."""
     phase = 1.5 * np.linspace(0.0, 2 * np.pi * 10, len(made.accel))

@@ -327,6 +327,13 @@ def test_converting_needs_no_torch():
         (bytes.fromhex("00060d058847e8f3fd0900000000"), "telemetry log of MAVLink.*vehicle's own log"),
         (b"\xa3\x95\x80\x027ATT\0fffffffffffff", "sdlog2 log of PX4.*sdlog2_dump.py"),
         (b"\x75\x65\x80\x38", "MicroStrain.*SensorConnect"),
+        (b"MD\xfc\x03\x64\xba", "Axivity sensor.*OmGUI"),
+        (b"Device Identity\r\nDevice Unique Serial Code:1\r\n", "GENEActiv.*with a gyro"),
+        (b"\x0e\x10\x9d\x05\x40\x00\x00\x00.FIT", "FIT file.*gyroscope_data"),
+        (b"\x00\x00\x00\x14ftypmp41", "a video.*telemetry"),
+        (b'<?xml version="1.0" encoding="UTF-8"?>\n<mvnx version="4">', "Xsens MVN.*sensors measured"),
+        (b"\x80\x04\x95\x0f\x00\x00\x00\x00\x00\x00\x00}\x94\x8c\x03acc\x94K\x01s.", "pickle of Python.*numpy.savez"),
+        (b"\x02P,\x00", "C3D file.*beside the table"),
         (b"neither one nor the other", "no sequence found; expected a ROS bag"),
     ],
 )

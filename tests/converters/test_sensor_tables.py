@@ -168,3 +168,41 @@ def test_a_second_recording_beside_the_first_does_not_take_its_place(convert, tm
     assert done.returncode == 0
     assert "Gyroscope_2.csv of further gyroscopes or recordings become numbers and no IMU" in done.stderr
     assert np.array_equal(read(tmp_path / "out.mcap").imu.gyro, GYRO)
+
+
+def test_each_folder_of_a_zip_is_a_recording(convert, tmp_path):
+    files = {f"all/{place}/{name}": text for place in ("a/walk", "b/walk") for name, text in PHONES["phyphox"].items()}
+    done = convert(pack(tmp_path / "all.zip", files | {"__MACOSX/all/a/walk/Gyroscope.csv": ""}), tmp_path / "out/")
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["all_a_walk.mcap", "all_b_walk.mcap"]
+    assert np.array_equal(read(tmp_path / "out" / "all_b_walk.mcap").imu.gyro, GYRO)
+
+
+def test_zips_and_folders_below_a_folder_of_a_recording_are_recordings_too(convert, tmp_path):
+    source = tmp_path / "source"
+    for place in (source, source / "still"):
+        place.mkdir()
+        for name, text in PHONES["sensor logger, android"].items():
+            (place / name).write_text(text)
+    pack(source / "run.zip", PHONES["phyphox"])
+    (source / "broken.zip").write_bytes((source / "run.zip").read_bytes()[:200])
+    done = convert(source, tmp_path / "out/")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["run.mcap", "source.mcap", "still.mcap"], done.stderr
+
+
+def test_steps_as_strong_as_gravity_are_not_gravity(convert, tmp_path):
+    steps = np.column_stack([np.zeros((COUNT, 2)), 10.0 * np.sign(np.sin(2 * np.pi * 2.5 * 0.01 * (np.arange(COUNT) + 0.5)))])
+    jog = {"Gyroscope.csv": sensor_logger(GYRO), "Accelerometer.csv": sensor_logger(steps + MOTION)}
+    done = convert(pack(tmp_path / "jog.zip", jog), tmp_path / "out.mcap")
+    assert done.returncode == 4
+    assert "in a second: gravity was taken out" in done.stderr
+    upright = jog | {"Accelerometer.csv": sensor_logger(steps + GRAVITY + MOTION)}
+    assert convert(pack(tmp_path / "up.zip", upright), tmp_path / "up.mcap").returncode == 0
+
+
+def test_an_accelerometer_that_runs_much_longer_than_the_gyro_is_doubted(convert, tmp_path):
+    first = phyphox(GYRO, "rad/s").splitlines(keepends=True)[: COUNT // 2]
+    files = PHONES["phyphox"] | {"Gyroscope.csv": "".join(first)}
+    done = convert(pack(tmp_path / "two.zip", files), tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "before or after all of the gyro's are left out: are both of one recording?" in done.stderr

@@ -344,3 +344,48 @@ def test_further_tables_of_a_recording_arrive_also_where_they_are_narrow(tmp_pat
     assert len(log.scalars["/Depth_depth"].t_ns) == COUNT
     assert [*log.poses] == (["/ground_truth/pose"] if imu == "beside poses" else [])
     assert log.remarks.losses == []
+
+
+def test_files_of_one_name_and_folders_below_a_table_are_recordings_of_their_own(tmp_path):
+    header = "time,gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s2],acc_y [m/s2],acc_z [m/s2]\n"
+    (tmp_path / "older").mkdir()
+    for number, name in enumerate(("imu.csv", "imu.txt", "older/imu.csv")):
+        (tmp_path / name).write_text(header + rows(T_S + 1000.0 * number, GYRO + number, ACCEL))
+    logs = [table.read_sequence(sequence) for sequence in table.sequences(tmp_path)]
+    assert [log.name for log in logs] == ["imu.csv", "imu.txt", "older"]
+    np.testing.assert_allclose([log.imus["/imu0"].gyro for log in logs], [GYRO, GYRO + 1, GYRO + 2])
+
+
+def test_of_several_accelerometers_the_one_with_no_further_word_is_asked_about(tmp_path):
+    (tmp_path / "gyroscope.csv").write_text("t [s],x (in radians/s),y (in radians/s),z (in radians/s)\n" + rows(T_S, GYRO))
+    for name in ("accelerometer.csv", "new_accelerometer.csv"):
+        (tmp_path / name).write_text("t [s],x (in G's),y (in G's),z (in G's)\n" + rows(T_S, ACCEL / 9.80665))
+    (sequence,) = table.sequences(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(sequence)
+    assert 'accel = ["accel/x", "accel/y", "accel/z"]  # please confirm: these columns?' in str(refused.value.fix)
+    (tmp_path / "new_accelerometer.csv").unlink()
+    (sequence,) = table.sequences(tmp_path)
+    np.testing.assert_allclose(table.read_sequence(sequence).imus["/imu0"].accel, ACCEL, rtol=1e-9)
+
+
+def test_what_one_file_shows_it_shows_in_a_folder(tmp_path):
+    lines = zip(T_S.tolist(), GYRO.tolist(), (ACCEL / 9.80665).tolist(), strict=True)
+    named = "".join(
+        f"acc {t:.3f} {a[0]} {a[1]} {a[2]}\ngyro {t:.3f} {g[0]} {g[1]} {g[2]}\n" for t, g, a in ((t, *gs) for t, *gs in lines)
+    )
+    folders = {
+        "rows that name their sensor": ("walk_1.txt", named),
+        "sentences of VectorNav": (
+            "vn.txt",
+            "".join(f"$VNYMR,1,2,3,.1,.2,.3,{a[0]},{a[1]},{a[2]},.1,.2,{g[2]}*66\n" for a, g in zip(ACCEL, GYRO, strict=True)),
+        ),
+        "more columns without a header": ("log.txt", rows(T_S, GYRO, ACCEL, np.full((COUNT, 1), 31.5))),
+    }
+    for folder, (name, text) in folders.items():
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / name).write_text(text)
+    assert [sequence.path.name for sequence in table.sequences(tmp_path)] == ["log.txt", "walk_1.txt", "vn.txt"]
+    with pytest.raises(ConfigError) as refused:
+        table.read_sequence(table.sequences(tmp_path)[0])
+    assert '# perhaps accel = ["column 5", "column 6", "column 7"]' in str(refused.value.fix)

@@ -11,6 +11,7 @@ from support.tables import write_csv
 
 from imutool.converters import table
 from imutool.converters._table_headerless import as_table
+from imutool.converters._table_names import split_name
 from imutool.converters._table_units import raw_counts, unit_by_steps
 from imutool.errors import ConfigError
 
@@ -133,6 +134,9 @@ def test_a_clock_counts_before_the_unit_in_its_name(tmp_path):
         ([f"{a}Rate (deg/s)" for a in "xyz"], [f"{a}Accel (m/s2)" for a in "xyz"]),  # Aceinna
         ([f"gyro_raw_{a} [deg/s]" for a in "xyz"], [f"acc_raw_{a}" for a in "xyz"]),
         ([f"ang_vel_uncal_{a}[deg/s]" for a in "xyz"], [f"acc_uncal_{a}[m/s^2]" for a in "xyz"]),
+        ([f"gyro {a} (in degrees/s)" for a in "xyz"], [f"acc {a} (in m/s^2)" for a in "xyz"]),
+        ([f"gyro {a} [degrees per second]" for a in "xyz"], [f"accel_{a}" for a in "xyz"]),
+        ([f"ang_vel_{a} [deg/s]" for a in "xyz"], [f"acc_b_{a}" for a in "xyz"]),
         ([f"gyroADC[{k}] (deg/s)" for k in range(3)], [f"accSmooth[{k}] (m/s/s)" for k in range(3)]),  # blackbox_decode
     ],
 )
@@ -141,6 +145,16 @@ def test_names_of_other_programs(tmp_path, gyro, accel):
     (imu,) = read(path).imus.values()
     np.testing.assert_allclose(imu.gyro, np.deg2rad(COUNTS), rtol=1e-12)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-12)
+
+
+def test_a_bias_in_the_axes_of_the_body_is_no_acceleration(tmp_path):
+    names = ["time_s", *(f"gyro_{a} [deg/s]" for a in "xyz"), *(f"acc_b_{a}" for a in "xyz")]
+    bias = np.tile([0.01, -0.02, 0.03], (COUNT, 1))
+    path = write_csv(tmp_path / "imu.csv", names, [T_S, *COUNTS.T, *bias.T])
+    with pytest.raises(ConfigError):
+        read(path)
+    path = write_csv(tmp_path / "both.csv", [*names, "acc_x", "acc_y", "acc_z"], [T_S, *COUNTS.T, *bias.T, *ACCEL_G.T])
+    np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-12)
 
 
 def test_a_table_of_ulog2csv_is_in_the_units_of_px4(tmp_path):
@@ -441,3 +455,22 @@ def test_multiples_of_a_unit_in_a_header_are_applied_and_ranges_are_not(tmp_path
     names = [name.replace("0.1 deg/s", "deg/s").replace("1e-3 g", "16 g") for name in names]
     path = write_csv(tmp_path / "imu.csv", names, [1e3 * T_S, *COUNTS.T, *ACCEL_G.T])
     np.testing.assert_allclose(read(path).imus["/imu0"].accel, 9.80665 * ACCEL_G)
+
+
+def test_every_unit_at_the_end_of_a_name_has_a_meaning():
+    rates = [
+        f"{angle}{per}{second}"
+        for angle in ("deg", "rad")
+        for per in ("", "_", "_per_", "per")
+        for second in ("s", "sec", "second")
+    ]
+    times = [f"{part}sec{end}" for part in ("", "nano", "micro", "milli") for end in ("", "s", "ond", "onds")]
+    found = [split_name(f"x_{unit}") for unit in (*rates, *times)]
+    assert [name for name, _ in found] == ["x"] * len(found)
+    assert {unit for _, unit in found} == {"deg/s", "rad/s", "s", "ns", "us", "ms"}
+
+
+def test_objects_without_a_number_are_no_table(tmp_path):
+    words = '{"first": [' + ",".join(['{"name": "left"}'] * 9) + '], "second": [' + ",".join(['{"name": "right"}'] * 9) + "]}"
+    (tmp_path / "words.json").write_text(words)
+    assert table.sequences(tmp_path) == []

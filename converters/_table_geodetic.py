@@ -1,0 +1,80 @@
+"""Latitude, longitude and height of true poses, as metres north, east and down.
+
+In a plane about the first: north is (M + h) dlat and east (N + h) cos(lat) dlon, with the radii M and N of the ellipsoid there
+(WGS 84; Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, eq. 2.105, 2.106 and 2.111). A
+kilometre to the north, lengths to the east are wrong by 1.6e-4 tan(lat).
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from imutool.array_types import Float64
+
+from ._table_map import Entries
+from ._table_names import name_and_unit, split_name
+from ._table_rotations import UP, rotations, seconds_of, up_share
+from ._table_text import Columns
+from ._table_units import ANGLE_SI, POSITION_SI
+
+SEMI_MAJOR_M, ECCENTRICITY_SQUARED = 6_378_137.0, 6.69437999014e-3  # of WGS 84
+ANGLE = r"(_?(deg|rad)[a-z]*)?"
+GEODETIC = {
+    "latitude": rf"(.*_)?lat(itude)?{ANGLE}",
+    "longitude": rf"(.*_)?(lon|lng|long|longitude){ANGLE}",
+    "height": r"(.*_)?(alt(itude)?|height|hgt|h|elevation)",
+}
+LOCAL = "local_"  # begins the names of the columns that are made
+
+
+def add_local(columns: Columns) -> None:
+    """Add local_north, local_east and local_down to a table of latitude, longitude, height."""
+    names = {column: split_name(column)[0] for column in columns.values}
+    found = [[c for c, each in names.items() if re.fullmatch(form, each)] for form in GEODETIC.values()]
+    if any(len(each) != 1 for each in found):
+        return
+    latitude, longitude, height = (each[0] for each in found)
+    values = columns.side_by_side([latitude, longitude, height])
+    stated = name_and_unit(height, columns.units.get(height, ""))[1] or "m"
+    unit = _unit(columns, [latitude, longitude], values)
+    if unit and stated in POSITION_SI and np.isfinite(values).all(axis=1).any():
+        values[:, :2] *= ANGLE_SI[unit]
+        values[:, 2] *= POSITION_SI[stated]
+        for axis, each in zip(("north", "east", "down"), _plane(values).T, strict=True):
+            columns.values[f"{LOCAL}{axis} [m]"] = each
+        said = f"{LOCAL}north, {LOCAL}east and {LOCAL}down are {latitude}, {longitude} and {height} about their first"
+        columns.remarks.notes.append(f"{said}, in m; the angles are taken for {unit}")
+
+
+def fits_gravity(columns: Columns, entries: Entries, position: list[str], clock: tuple[str, str]) -> str:
+    """Why gravity contradicts positions north, east, down that were made here; else empty."""
+    if not split_name(position[0].rpartition("/")[2])[0].startswith(LOCAL):
+        return ""
+    share = up_share(columns, entries, rotations(columns, entries), seconds_of(columns, clock), np.eye(3))
+    if share < -UP:
+        return ""
+    what = "has +z up" if share > UP else "does not show which way is up"
+    return f"{', '.join(position)} are no positions of the poses: the world of their rotations {what}, and not +z down"
+
+
+def _unit(columns: Columns, angles: list[str], values: Float64[np.ndarray, "n 3"]) -> str:
+    """Unit of latitude and longitude: the stated one, or degrees beyond half a turn; else empty."""
+    texts = [column.lower() + columns.units.get(column, "").lower() for column in angles]
+    for unit, word in (("rad", r"(^|[^a-z])rad"), ("deg", r"(^|[^a-z])deg|°")):
+        if all(re.search(word, text) for text in texts):
+            return unit
+    known = np.abs(values[np.isfinite(values).all(axis=1), :2])
+    return "deg" if (known.max(axis=0, initial=0.0) > [np.pi / 2.0, np.pi]).any() else ""
+
+
+def _plane(values: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """North, east and down (m) of latitude, longitude (rad) and height (m), about the first that is known."""
+    latitude, longitude, height = values[np.isfinite(values).all(axis=1)][0]
+    bend = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
+    east_m = SEMI_MAJOR_M / np.sqrt(bend)
+    north_m = east_m * (1.0 - ECCENTRICITY_SQUARED) / bend
+    about = (values[:, 1] - longitude + np.pi) % (2.0 * np.pi) - np.pi  # past the date line
+    north = (north_m + height) * (values[:, 0] - latitude)
+    return np.stack([north, (east_m + height) * np.cos(latitude) * about, height - values[:, 2]], axis=1)

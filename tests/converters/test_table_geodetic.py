@@ -1,0 +1,77 @@
+"""True latitude, longitude and height beside angles: positions about the first, where gravity shows the world of the angles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from imutool.converters import table
+from imutool.recording.message_log import MessageLog
+
+T_S = np.arange(6000) / 100.0
+EVERY = slice(None, None, 10)
+A_M, F = 6_378_137.0, 1.0 / 298.257223563  # of WGS 84
+LATITUDE, LONGITUDE, HEIGHT_M = np.radians(55.0), np.radians(179.9995), 120.0  # by the date line
+ANGLES = np.stack([0.3 * np.sin(0.9 * T_S), 0.2 * np.sin(1.3 * T_S), 0.4 * np.sin(0.7 * T_S)], axis=1)  # roll, pitch, yaw
+NED = np.stack([80.0 * np.sin(0.1 * T_S), 90.0 * np.sin(0.07 * T_S), 10.0 * np.sin(0.2 * T_S)], axis=1)
+
+
+def ecef(latitude: np.ndarray, longitude: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Cartesian coordinates on the ellipsoid."""
+    n = A_M / np.sqrt(1.0 - F * (2.0 - F) * np.sin(latitude) ** 2)
+    along = (n + height) * np.cos(latitude)
+    z = (n * (1.0 - F) ** 2 + height) * np.sin(latitude)
+    return np.stack([along * np.cos(longitude), along * np.sin(longitude), z], axis=-1)
+
+
+def rows(*values: np.ndarray) -> str:
+    return "".join(",".join(map(repr, row)) + "\n" for row in np.column_stack(values).tolist())
+
+
+def recorded(folder: Path, unit: str, down: float, head: str = "latitude [{0}],longitude [{0}],altitude [m]") -> MessageLog:
+    """Log of an IMU beside true angles; `down` is 1 where the z axis of their world points down."""
+    rotation = Rotation.from_euler("ZYX", ANGLES[:, ::-1])
+    turns = (rotation[:-1].inv() * rotation[1:]).as_rotvec() * 100.0
+    force = rotation.inv().apply([0.0, 0.0, -9.81 * down])
+    latitude, longitude = LATITUDE + NED[:, 0] / 6.37e6, LONGITUDE + NED[:, 1] / (6.39e6 * np.cos(LATITUDE))
+    folder.mkdir()
+    imu = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
+    (folder / "imu.csv").write_text(imu + rows(T_S, np.concatenate([turns, turns[-1:]]), force))
+    size = {"deg": 180.0 / np.pi, "rad": 1.0}[unit]
+    wrapped = (longitude + np.pi) % (2.0 * np.pi) - np.pi
+    truth = [T_S, latitude * size, wrapped * size, HEIGHT_M - NED[:, 2], *ANGLES.T * 180.0 / np.pi]
+    names = f"time [s],{head.format(unit)},roll [deg],pitch [deg],yaw [deg]\n"
+    (folder / "groundtruth.csv").write_text(names + rows(*(column[EVERY] for column in truth)))
+    (sequence,) = table.sequences(folder)
+    return table.read_sequence(sequence)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_latitude_longitude_and_height_are_positions_of_true_angles(tmp_path, unit):
+    poses = recorded(tmp_path / "ship", unit, 1.0).poses["/ground_truth/pose"]
+    latitude, longitude = LATITUDE + NED[:, 0] / 6.37e6, LONGITUDE + NED[:, 1] / (6.39e6 * np.cos(LATITUDE))
+    place = ecef(latitude, longitude, HEIGHT_M - NED[:, 2])[EVERY]
+    sin, cos = np.sin([LATITUDE, LONGITUDE]), np.cos([LATITUDE, LONGITUDE])
+    east, up = [-sin[1], cos[1], 0.0], [cos[0] * cos[1], cos[0] * sin[1], sin[0]]
+    expected = (place - place[0]) @ np.stack([east, np.cross(up, east), up], axis=1)
+    np.testing.assert_allclose(poses.p_wb, expected, atol=5e-3)  # the Earth bends by 1 mm in 100 m
+    force = Rotation.from_quat(poses.q_wb_wxyz[:, [1, 2, 3, 0]]).apply(
+        Rotation.from_euler("ZYX", ANGLES[EVERY, ::-1]).inv().apply([0.0, 0.0, -9.81])
+    )
+    np.testing.assert_allclose(force, np.tile([0.0, 0.0, 9.81], (len(force), 1)), atol=1e-9)
+
+
+def test_angles_in_another_world_keep_no_positions_of_this_one(tmp_path):
+    log = recorded(tmp_path / "car", "deg", -1.0)
+    assert not log.poses["/ground_truth/pose"].p_wb.any()
+    assert any("the world of their rotations has +z up" in note for note in log.remarks.notes)
+    assert "/ground_truth_latitude_deg" in log.scalars
+
+
+def test_small_angles_without_a_unit_are_no_positions(tmp_path):
+    log = recorded(tmp_path / "car", "rad", 1.0, "lat,lon,alt")
+    assert not log.poses["/ground_truth/pose"].p_wb.any()
+    assert not any("local_north" in note for note in log.remarks.notes)
