@@ -17,7 +17,7 @@ from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, Reading, choose, signed_permutations
 from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, read_right
-from imutool.cleaning.position_unit import POSITIONS, position_unit
+from imutool.cleaning.position_unit import POSITIONS, Misfits, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
 from imutool.cleaning.truth import Truth, axis_of_gravity, best_rotation, force_in_world, rotation_deg, turning
 from imutool.cleaning.unit_evidence import RATES
@@ -244,18 +244,13 @@ def _accel_against_poses(
         agreed = np.linalg.det(gyro.axes) * gyro.axes @ relative.axes.T * np.linalg.det(relative.axes)
         every = np.stack([agreed, -agreed])
     readings = [(P, up) for P in every for up in ups]
-    turned = {k: quaternion.rotate(q_wb[use], f @ P.T) for k, P in enumerate(every)}
-    blocks, a_w = (first_s / BLOCKS_S).astype(np.int64), a_w[use]
-
-    def residuals(factor: float, row: int) -> Float64[np.ndarray, "n 3"]:
-        k, which = divmod(row, len(ups))
-        return np.asarray(factor * a_w + GRAVITY_M_S2 * ups[which] - turned[k])
-
-    unit = position_unit(residuals, len(readings), blocks)
-    a_w = POSITIONS[unit] * a_w
-    choice = choose(np.stack([np.linalg.norm(residuals(1.0, row), axis=1) for row in range(len(readings))]), blocks)
+    turned = np.stack([quaternion.rotate(q_wb[use], f @ P.T) for P in every])
+    blocks, misfits = (first_s / BLOCKS_S).astype(np.int64), Misfits(a_w[use], turned, GRAVITY_M_S2 * ups)
+    unit = position_unit(misfits, blocks)
+    misfits = misfits._replace(a_w=POSITIONS[unit] * misfits.a_w)
+    a_w, choice = misfits.a_w, choose(misfits.sizes(1.0), blocks)
     straight = gyro is not None and gyro.as_is and (gyro.sole or gyro.straight)
-    left = np.zeros((0, 3)) if choice is None else residuals(1.0, choice.best)
+    left = np.zeros((0, 3)) if choice is None else misfits.of(1.0, choice.best)
     if straight and is_other_world(f, q_wb[use], a_w, left, blocks):
         return None, None, unit, OTHER_WORLD
     in_mean = axis_of_gravity(quaternion.rotate(q_wb[use], f)) if straight else None

@@ -12,7 +12,7 @@ from support.imu_defects import batch_of
 from imutool.cleaning.conventions import Conventions, judge
 from imutool.cleaning.likelihood import signed_permutations
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, read_right
-from imutool.cleaning.position_unit import POSITIONS
+from imutool.cleaning.position_unit import POSITIONS, Misfits
 from imutool.cleaning.rule import CleaningSettings, TopicSummary
 from imutool.cleaning.rules.axes import LATE_S, TO_Z_UP, Axes
 from imutool.cleaning.samples import Motion, Samples
@@ -416,3 +416,14 @@ def test_gravity_shows_the_world_where_noise_of_positions_hides_the_motion(up: s
     assert said == (
         [] if up == "+z" else [f"{said[0].partition(', not')[0]}, not +z, if the accelerometer counts as it should"]
     )
+
+
+def test_misfits_of_all_readings_at_once_are_those_of_each_and_averages_are_of_the_misfits() -> None:
+    rng = np.random.default_rng(1)
+    misfits = Misfits(rng.normal(size=(30, 3)), rng.normal(size=(4, 30, 3)), rng.normal(size=(6, 3)))
+    triangle = np.array([1.0, 2.0, 1.0]) / 4.0
+    for row, (size, averaged) in enumerate(zip(misfits.sizes(0.1), misfits.averaged(2).sizes(0.1), strict=True)):
+        each = misfits.of(0.1, row)
+        np.testing.assert_array_equal(size, np.linalg.norm(each, axis=1))
+        mean = np.stack([np.convolve(column, triangle, mode="valid") for column in each.T], axis=1)
+        np.testing.assert_allclose(averaged, np.linalg.norm(mean, axis=1), rtol=0, atol=1e-14)

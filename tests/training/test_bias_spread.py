@@ -106,7 +106,6 @@ def test_logs_of_a_vehicle_widen_the_bound_on_speed() -> None:
     ("walk", "truth_noise", "least", "most"),
     [
         (1e-5, 1e-3, 3e-6, 5e-5),  # a quiet sensor
-        (1e-4, 1e-3, 5e-5, 2e-4),
         (1e-5, 6e-3, 3e-5, 1e-4),  # poses that hide the walk: it is as usual, and their noise is none
         (2e-3, 6e-3, 1e-3, 4e-3),
     ],

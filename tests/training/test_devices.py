@@ -224,10 +224,11 @@ def test_a_training_on_a_gpu_is_the_one_on_the_cpu(
     assert model_file.load(out).method == method
 
 
-@pytest.mark.parametrize("name", ["neural_ode", "conv"])
 def test_a_training_is_put_down_on_a_gpu_and_taken_up_there(
-    logs: list[Path], on_the_cpu: Callable[[str], bytes], tmp_path: Path, name: str
+    logs: list[Path], on_the_cpu: Callable[[str], bytes], tmp_path: Path
 ) -> None:
+    """By the method whose checkpoint holds most: batch statistics and the draws of its dropout."""
+    name = "conv"
     method, model = METHODS[name]
     out, chosen = tmp_path / "m.safetensors", settings(method, model)
 
@@ -243,7 +244,7 @@ def test_a_training_is_put_down_on_a_gpu_and_taken_up_there(
     assert out.read_bytes() == on_the_cpu(name)
 
 
-@pytest.mark.parametrize(("solver", "adjoint"), [("rk4", False), ("rk4", True), ("dopri5", False), ("dopri5", True)])
+@pytest.mark.parametrize(("solver", "adjoint"), [("rk4", False), ("dopri5", True)])
 def test_every_way_to_solve_the_drift_stays_on_the_gpu(solver: str, adjoint: bool) -> None:
     """Values and gradients."""
     found = []

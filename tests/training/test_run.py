@@ -351,13 +351,12 @@ def test_a_hybrids_card_says_what_was_found_and_compared(expected_hybrid: bytes,
         assert (getattr(model, name) > 0).all(), name
 
 
-@pytest.mark.parametrize("line", [4, 8])
 def test_an_interrupted_hybrid_goes_on_as_if_nothing_had_been(
-    logs: list[Path], expected_hybrid: bytes, tmp_path: Path, any_ode_helps: None, line: int
+    logs: list[Path], expected_hybrid: bytes, tmp_path: Path, any_ode_helps: None
 ) -> None:
     def stop(epoch: Epoch, seen: list[Epoch] = []) -> None:  # noqa: B006  counts across calls
         seen += [epoch] * (epoch.steps > 0)
-        if len(seen) == line:
+        if len(seen) == 8:  # in the second stage, the accelerometer's
             raise KeyboardInterrupt
 
     out = tmp_path / "m.safetensors"

@@ -65,14 +65,21 @@ class Visit:
         return list(self.page.evaluate(script))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def visit(browser: Any) -> Iterator[Any]:
-    contexts = []
+    """A page in some light and width; each is opened once, and all that it ever said and asked for is kept."""
+    visits: dict[Path, Visit] = {}
 
-    def open_page(path: Path, *, scheme: str = "light", width: int = WIDE) -> Visit:
-        context = browser.new_context(color_scheme=scheme, viewport={"width": width, "height": HEIGHT})
+    def look_at(path: Path, *, scheme: str = "light", width: int = WIDE, media: str = "screen") -> Visit:
+        one = visits.get(path) or visits.setdefault(path, opened(path))
+        one.page.set_viewport_size({"width": width, "height": HEIGHT})
+        one.page.emulate_media(media=media, color_scheme=scheme)
+        one.page.evaluate("document.querySelectorAll('details[data-opened]').forEach(d => d.open = false)")
+        return one
+
+    def opened(path: Path) -> Visit:
+        context = browser.new_context()
         context.set_default_timeout(1e3 * SOON_S)
-        contexts.append(context)
         one = Visit(context.new_page())
         one.page.on("console", lambda message: one.said.append(f"{message.type}: {message.text}"))
         one.page.on("pageerror", lambda error: one.said.append(str(error)))
@@ -80,9 +87,9 @@ def visit(browser: Any) -> Iterator[Any]:
         one.page.goto(path.as_uri(), wait_until="networkidle")
         return one
 
-    yield open_page
-    for context in contexts:
-        context.close()
+    yield look_at
+    for one in visits.values():
+        one.page.context.close()
 
 
 def fits(one: Visit) -> bool:
@@ -121,7 +128,7 @@ def test_its_words_can_be_read_and_every_figure_is_drawn(
     ink, ground = (color(one, prop) for prop in ("color", "backgroundColor"))
     assert darkest <= luminance(ground) <= lightest
     assert contrast(ink, ground) > READABLE
-    one.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    one.page.evaluate("document.querySelectorAll('details:not([open])').forEach(d => { d.open = true; d.dataset.opened = 1 })")
     boxes = one.page.evaluate(
         "[...document.querySelectorAll('svg, img')].map(f => f.getBoundingClientRect())"
         ".map(b => [b.x + scrollX, b.y + scrollY, b.width, b.height])"
@@ -159,8 +166,7 @@ def contrast(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.mark.parametrize("name", PAGES)
 def test_it_prints_on_white_paper_and_nothing_is_cut_off(visit: Any, folder: Path, name: str) -> None:
-    one = visit(folder / f"{name}.html", scheme="dark", width=PAPER)
-    one.page.emulate_media(media="print", color_scheme="dark")
+    one = visit(folder / f"{name}.html", scheme="dark", width=PAPER, media="print")
     assert fits(one)
     assert luminance(color(one, "backgroundColor")) > 0.95
     printed = one.page.pdf(format="A4")
