@@ -448,6 +448,19 @@ def test_an_axis_that_is_clipped_before_its_calibration_is_saturated_and_a_const
     assert marked.sum() > 0.9 * (np.abs(rates) > 0.9999 * limit).sum()
 
 
+def test_a_long_rest_near_the_largest_value_hides_no_plateau_far_above_it(monkeypatch):
+    """As gravity at rest before a flight: too many samples to be held, until a larger value shows what they were."""
+    monkeypatch.setattr(saturation, "MOST_NEAR", 5000)
+    rest = 1.0 + np.random.default_rng(1).normal(0.0, 0.005, 40_000)
+    rates = np.concatenate([rest, turned_on_a_table(5.0)])
+    marked, flight = saturation.at_limit(rates), saturation.at_limit(rates[len(rest) :])
+    assert not marked[: len(rest)].any()
+    assert flight.any()
+    np.testing.assert_array_equal(marked[len(rest) :], flight)
+    monkeypatch.setattr(saturation, "MOST_NEAR", 100)
+    assert not saturation.at_limit(np.abs(turned_on_a_table(5.0))).any()
+
+
 def test_a_clipped_and_calibrated_axis_is_a_finding(made):
     rates = np.resize(turned_on_a_table(5.0), len(made.stamp_ns))
     (one,) = (each for each in look(with_values(made, slice(None), 1, rates)).findings if each.values.get("limit", 0.0) > 0.0)

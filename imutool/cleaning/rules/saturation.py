@@ -31,9 +31,7 @@ RULE = (
     f"{1 - BAND:.0%} of it, change by less than {QUIET:.0%} of the axis' calmest steps: clipped before a calibration"
 )
 KEPT = 3  # values at either end: the last one, and the two it is compared with
-MOST_NEAR = (
-    1_000_000  # samples near an extreme value that are held: an axis with more, as that of gravity at rest, has no plateau
-)
+MOST_NEAR = 1_000_000  # samples near an extreme value that are held: more, as of gravity at rest, are no plateau
 
 
 class Ends:
@@ -83,21 +81,26 @@ class _Near:
     def __init__(self) -> None:
         self._parts: list[tuple[Shaped[np.ndarray, " n"], ...]] = [NONE]
         self._held, self._most = 0, PART
+        self._lost = 0.0  # largest of the samples that were too many
 
     def add(self, least: float, *columns: Shaped[np.ndarray, " n"]) -> None:
-        """Add samples above `least`; too many are not held any more."""
-        if self._held > MOST_NEAR:
+        """Add samples above `least`; too many are lost, until a larger value shows that they were not near the extreme."""
+        if self._lost > least:
+            self._lost = float(np.max(columns[0], initial=self._lost))
             return
         self._parts.append(columns)
         self._held += len(columns[0])
         if self._held > self._most:  # twice as many as were left last: each is moved a few times at most
-            self._held = len(self.above(least)[0])
+            values = self.above(least)[0]
+            self._held = len(values)
             self._most = 2 * self._held + PART
+            if self._held > MOST_NEAR:
+                self._parts, self._held, self._most, self._lost = [NONE], 0, PART, float(values.max())
 
     def above(self, least: float) -> tuple[Shaped[np.ndarray, " n"], ...]:
-        """Samples above `least`; none where they were too many."""
-        if self._held > MOST_NEAR:
-            self._parts = [NONE]
+        """Samples above `least`; none where some of them are lost."""
+        if self._lost > least:
+            return NONE
         whole = [np.concatenate(column) for column in zip(*self._parts, strict=True)]
         kept = whole[0] > least
         self._parts = [tuple(column[kept] for column in whole)]
