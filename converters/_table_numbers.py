@@ -42,8 +42,12 @@ def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndar
     except (ValueError, OverflowError):
         return None
     values = [np.ascontiguousarray(rows[str(k)]) if str(k) in kinds else None for k in range(width)]
-    kept = [column is None or (column.dtype.kind == "f" and bool((np.abs(column) > EXACT).any())) for column in values]
-    return values, [[line.split(delimiter)[k].strip() for line in lines] if keep else [] for k, keep in enumerate(kept)]
+    texts: list[list[str]] = [[] for _ in values]
+    kept = [k for k, c in enumerate(values) if c is None or (c.dtype.kind == "f" and bool((np.abs(c) > EXACT).any()))]
+    for parts in (line.split(delimiter) for line in lines if kept):
+        for k in kept:
+            texts[k].append(parts[k].strip())
+    return values, texts
 
 
 def _count(line: str, delimiter: str | None) -> int:
