@@ -155,10 +155,12 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     for path in tables:
         alike.setdefault(_without_role(_stem(path)), []).append(path)
     found: dict[str, list[Path]] = {}
+    of_imus = {look(path).header for path in tables if look(path).is_imu} - {()}  # one that shows less is a recording, too
     for shared, paths in alike.items():
         first = _stem(paths[0])
         name = first if shared.isdigit() and not first.startswith(shared) else shared  # imuRaw1 beside viconRot1
-        found |= {name: paths} if name and _groups(paths) else {stems[path]: [path] for path in paths if look(path).is_imu}
+        own = {stems[path]: [path] for path in paths if look(path).is_imu or look(path).header in of_imus}
+        found |= {name: paths} if name and _groups(paths) else own
     return found or {stems[path]: [path] for path in tables if look(path).may_be_imu}
 
 

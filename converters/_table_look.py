@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -39,6 +40,7 @@ class Seen(NamedTuple):
     has_poses: bool
     is_mocap: bool
     has_time: bool
+    header: tuple[str, ...] = ()  # names of all columns, if the table states them
 
 
 def look(path: Path) -> Seen:
@@ -62,7 +64,9 @@ def _looked(path: Path, mtime_ns: int, size: int) -> Seen:  # the key notices a 
                 logger.warning("left out: %s", error)
     if not columns.values:
         return Seen(False, False, False, is_mocap(start), False)
+    names = tuple(sorted(columns.values))
     name_columns(columns, "")
     entries = (known_layout(columns) or propose(columns)).entries
     is_imu = entries.keys() >= {"gyro", "accel"}
-    return Seen(is_imu, bool(start and perhaps(columns)), has_poses(columns), is_mocap(start), "time" in entries)
+    header = () if any(re.fullmatch(r"column \d+", name) for name in names) else names
+    return Seen(is_imu, bool(start and perhaps(columns)), has_poses(columns), is_mocap(start), "time" in entries, header)

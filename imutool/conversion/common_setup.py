@@ -6,6 +6,7 @@ unless their motion contradicts it.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -60,21 +61,21 @@ def shared(own: Mapping[int, Corrections]) -> tuple[Corrections, list[int]]:
 def _agreed(logs: Sequence[Corrections]) -> Corrections:
     """What most of the logs that are corrected in a point agree on, point by point."""
     topics = dict.fromkeys(chain.from_iterable(each.imus for each in logs))
-    pose_topic = _most([each.pose_topic for each in logs if each.pose_topic], _equal) or ""
+    pose_topic = most_alike([each.pose_topic for each in logs if each.pose_topic]) or ""
     of_poses = [each for each in logs if each.pose_topic == pose_topic != ""]
     worlds = [each.world for each in of_poses if not _is_identity(each.world)]
     turns = [each.body.turn for each in of_poses if not _is_identity(each.body.turn)]
     late = _group([each.late_ns for each in of_poses if each.late_ns], lambda a, b: abs(a - b) < ALIKE_NS)
-    world = _most(worlds, np.array_equal)
-    found = {topic: _most([each.imus[topic] for each in logs if topic in each.imus], np.allclose) for topic in topics}
+    world = most_alike(worlds, np.array_equal)
+    found = {topic: most_alike([each.imus[topic] for each in logs if topic in each.imus], np.allclose) for topic in topics}
     return Corrections(
         imus={topic: matrices for topic, matrices in found.items() if matrices is not None},
         world=np.eye(3) if world is None else world,
         late_ns=round(median(np.array(late, float))) if late else 0,
         body=Body(_mean(_group(turns, lambda a, b: _angle(a, b) < ALIKE_RAD)), frozenset()),
         pose_topic=pose_topic,
-        unit=_most([each.unit for each in of_poses if each.unit != "m"], _equal) or "m",
-        quaternions=_most([each.quaternions for each in of_poses if each.quaternions], _equal) or "",
+        unit=most_alike([each.unit for each in of_poses if each.unit != "m"]) or "m",
+        quaternions=most_alike([each.quaternions for each in of_poses if each.quaternions]) or "",
     )
 
 
@@ -121,13 +122,10 @@ def _group(values: Sequence[T], alike: Callable[[T, T], bool]) -> Sequence[T]:
     return largest if len(largest) >= FEWEST and 2 * len(largest) > len(values) else []
 
 
-def _most(values: Sequence[T], alike: Callable[[T, T], bool]) -> T | None:
+def most_alike(values: Sequence[T], alike: Callable[[T, T], bool] = operator.eq) -> T | None:
+    """Value that most of the others are like; None without such a majority."""
     group = _group(values, alike)
     return group[0] if group else None
-
-
-def _equal(a: str, b: str) -> bool:
-    return a == b
 
 
 def _is_identity(R: Float64[np.ndarray, "3 3"]) -> bool:

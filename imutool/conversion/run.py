@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path, PurePosixPath
@@ -16,11 +16,10 @@ from typing import Any
 
 from imutool import registry
 from imutool.conversion import Failure
-from imutool.conversion.common_setup import shared
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.unread_formats import ENOUGH, describe_folder, describe_unread
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
-from imutool.conversion.workers import GROUP, Job, Outcome, run_jobs, write_content
+from imutool.conversion.workers import GROUP, Job, Outcome, Progress, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import first_bytes, local
 from imutool.mcap_io.storage.local import removed_if_empty
@@ -30,7 +29,6 @@ from imutool.recording.message_log import MessageLog
 
 AUTO = "auto"
 SUFFIX = ".mcap"
-Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ def convert(
         if len(names) == 1 and source_sequences.errors:
             raise source_sequences.errors[0][1]
         _check_targets(jobs)
-        outcomes = _outcomes(jobs, len(names), _worker_count(workers, len(jobs)), progress)
+        outcomes = run_jobs(jobs, len(names), _worker_count(workers, len(jobs)), progress)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
     if len(names) == 1 and failed:
         raise failed[0][1]
@@ -116,22 +114,6 @@ def convert(
         if outcome.error is None:
             report.add(jobs[number].target, outcome)
     return report
-
-
-def _outcomes(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
-    """Outcomes of jobs by their numbers; what lacks corrections that the other logs share is done once more."""
-    outcomes = dict(_run(jobs, of, workers, progress))
-    common, lacking = shared({n: outcome.corrections for n, outcome in outcomes.items() if outcome.error is None})
-    again = [replace(jobs[number], common=common, overwrite=True) for number in lacking]
-    return outcomes | {lacking[n]: outcome for n, outcome in _run(again, len(again), workers, progress)}
-
-
-def _run(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> Iterator[tuple[int, Outcome]]:
-    """Run jobs; `of` counts also sequences that cannot be read, and are no jobs."""
-    for done, (number, outcome) in enumerate(run_jobs(jobs, min(workers, len(jobs))), start=1):
-        if progress is not None:
-            progress(of - len(jobs) + done, of, jobs[number].sequence.name)
-        yield number, outcome
 
 
 def _find(source: Path, format: str, out: Path) -> _Sequences:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
+from imutool.conversion.common_setup import most_alike, shared
 from imutool.conversion.correction_rounds import write_corrected
 from imutool.conversion.corrections import Corrections
 from imutool.conversion.message_writer import write_log
@@ -23,6 +24,9 @@ from imutool.recording import Recording
 from imutool.recording.message_log import MessageLog
 
 GROUP = "imutool.converters"
+MAP = "imutool/map"  # record of what a table's columns were taken for
+SAME_COLUMNS = "its columns and units are taken for those of the other tables, which show them"
+Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,7 @@ class Job:
     mapping: Path | Mapping[str, Any] | None = None  # what the columns of a table mean
     correct: tuple[str, ...] = ()  # `conventions`, `stamps`
     common: Corrections | None = None  # of the other logs of its setup
+    said: str = ""  # note on the job itself
 
 
 @dataclass(frozen=True)
@@ -49,15 +54,47 @@ class Outcome:
     notes: tuple[str, ...] = ()
     losses: tuple[str, ...] = ()
     corrections: Corrections = field(default_factory=Corrections)  # in one, without stamps
+    mapping: Mapping[str, str] = field(default_factory=dict)  # of a table: what its columns were taken for
 
 
-def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:
+def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
+    """Outcomes of jobs by their numbers.
+
+    `of` counts also sequences that cannot be read, and are no jobs. A log that lacks what most of the others show of their setup is converted once more, with that.
+    """
+    jobs, outcomes = [*jobs], dict(_run(jobs, of, workers, progress))
+    for with_common in (_with_common_map, _with_common_corrections):
+        again = with_common(jobs, outcomes)
+        numbers = [*again]
+        for place, outcome in _run([*again.values()], len(again), workers, progress):
+            if outcome.error is None:
+                jobs[numbers[place]], outcomes[numbers[place]] = again[numbers[place]], outcome
+    return outcomes
+
+
+def _with_common_map(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> dict[int, Job]:
+    """Jobs whose tables leave something open that most of the other tables show alike."""
+    common = most_alike([outcome.mapping for outcome in outcomes.values() if outcome.mapping])
+    if common is None:
+        return {}
+    asking = [n for n, outcome in outcomes.items() if isinstance(outcome.error, ConfigError) and jobs[n].mapping is None]
+    return {n: replace(jobs[n], mapping=common, said=SAME_COLUMNS) for n in asking}
+
+
+def _with_common_corrections(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> dict[int, Job]:
+    """Jobs whose logs lack a correction that most of the others share."""
+    common, lacking = shared({n: outcome.corrections for n, outcome in outcomes.items() if outcome.error is None})
+    return {n: replace(jobs[n], common=common, overwrite=True) for n in lacking}
+
+
+def _run(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> Iterator[tuple[int, Outcome]]:
     """Yield each job's number and outcome, as the jobs end."""
-    if workers <= 1:
-        for number, job in enumerate(jobs):
-            yield number, _convert_one(job)
-    else:
-        yield from _run_in_processes(jobs, workers)
+    each = min(workers, len(jobs))
+    done = ((n, _convert_one(job)) for n, job in enumerate(jobs)) if each <= 1 else _run_in_processes(jobs, each)
+    for count, (number, outcome) in enumerate(done, start=1):
+        if progress is not None:
+            progress(of - len(jobs) + count, of, jobs[number].sequence.name)
+        yield number, outcome
 
 
 def _convert_one(job: Job) -> Outcome:
@@ -98,7 +135,8 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
     write_log(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
     with Log(job.target) as log:
         lacking = () if log.imu_topics else ("no topic is an IMU",)
-    return Outcome(None, (*labelled.remarks.notes, *lacking), tuple(labelled.remarks.losses))
+    notes = *filter(None, [job.said]), *labelled.remarks.notes, *lacking
+    return Outcome(None, notes, tuple(labelled.remarks.losses), mapping=labelled.metadata.get(MAP, {}))
 
 
 def _run_in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]:

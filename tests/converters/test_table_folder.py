@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 from scipy.spatial.transform import Rotation
 
+from imutool.conversion.run import convert
 from imutool.converters import sensor_tables, table
 from imutool.errors import ConfigError, DataError
+from imutool.mcap_io.read import read
 
 COUNT = 400
 T_S = 1_600_000_000.0 + np.arange(COUNT) / 100.0
@@ -389,3 +392,32 @@ def test_what_one_file_shows_it_shows_in_a_folder(tmp_path):
     with pytest.raises(ConfigError) as refused:
         table.read_sequence(table.sequences(tmp_path)[0])
     assert '# perhaps accel = ["column 5", "column 6", "column 7"]' in str(refused.value.fix)
+
+
+def test_a_table_that_shows_less_is_what_the_others_of_its_columns_are(tmp_path):
+    """Six columns `imu`: of a rest no unit of the gyro is seen, and of a run not even which half is gravity's."""
+    t_s = np.arange(2000) / 100.0
+
+    def lively(phase: float) -> np.ndarray:
+        pitch = Rotation.from_rotvec(np.outer(1.2 * np.sin(1.3 * t_s + phase), [0.0, 1.0, 0.0]))
+        turn = Rotation.from_rotvec(np.outer(1.5 * np.sin(0.7 * t_s), [1.0, 0.0, 0.0])) * pitch
+        gyro = (turn[:-1].inv() * turn[1:]).as_rotvec() * 100.0
+        exact = np.hstack([turn.inv().apply([0.0, 0.0, 9.81]), np.vstack([gyro, gyro[-1:]])])
+        return exact + RNG.normal(0.0, 0.01, (2000, 6))
+
+    still = np.array([0.0, 0.0, 9.81, 0.0, 0.0, 0.0]) + RNG.normal(0.0, 0.01, (2000, 6))
+    run = lively(2.0) + np.hstack([RNG.normal(0.0, 12.0, (2000, 3)), RNG.normal(0.0, 4.0, (2000, 3))])
+    logs = {"a": lively(0.0), "b": lively(1.0), "rest": still, "run": run}
+    for name, imu in logs.items():
+        scipy.io.savemat(tmp_path / f"{name}.mat", {"ts": t_s, "imu": imu, "flag": np.ones(2000)})
+    scipy.io.savemat(tmp_path / "notes.mat", {"index": np.arange(30), "step": np.ones((30, 2))})
+    with pytest.raises(ConfigError, match="no unit of the gyro"):
+        convert(tmp_path / "rest.mat", tmp_path / "rest.mcap")
+    report = convert(tmp_path, tmp_path / "out", workers=1)
+    assert (report.failures, len(report.written)) == ([], 4)
+    said = "its columns and units are taken for those of the other tables, which show them"
+    assert [note.partition(":")[0] for note in report.notes if note.endswith(said)] == ["rest.mcap", "run.mcap"]
+    for name, imu in logs.items():
+        read_back = read(tmp_path / "out" / f"{name}.mcap").imu
+        np.testing.assert_array_equal(read_back.accel, imu[:, :3])
+        np.testing.assert_array_equal(read_back.gyro, imu[:, 3:])
