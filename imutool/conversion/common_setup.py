@@ -80,15 +80,27 @@ def _agreed(logs: Sequence[Corrections]) -> Corrections:
 
 
 def _lacks(own: Corrections, common: Corrections) -> bool:
-    """Whether a log lacks a common correction; of its delay its own motion says most."""
-    return (
-        any(topic not in own.imus or not np.allclose(own.imus[topic], matrices) for topic, matrices in common.imus.items())
-        or not (_is_identity(common.world) or np.array_equal(own.world, common.world))
-        or not (_is_identity(common.body.turn) or _angle(own.body.turn, common.body.turn) < SAME_RAD)
-        or (common.unit not in ("m", own.unit))
-        or (common.quaternions not in ("", own.quaternions))
-        or (common.late_ns != 0 and own.late_ns == 0)
-    )
+    """Whether a log lacks a common correction, and shows no other in its place; of its delay its own motion says most."""
+    mine, theirs = _points(own), _points(common)
+    is_turned, are_turned = not _is_identity(own.body.turn), not _is_identity(common.body.turn)
+    apart = _angle(own.body.turn, common.body.turn)
+    if any(not _alike(mine[point], theirs[point]) for point in mine.keys() & theirs.keys()):
+        return False
+    if is_turned and are_turned and apart > ALIKE_RAD:
+        return False
+    return bool(theirs.keys() - mine.keys()) or (are_turned and apart > SAME_RAD) or (common.late_ns != 0 and own.late_ns == 0)
+
+
+def _points(found: Corrections) -> dict[str, str | Float64[np.ndarray, "..."]]:
+    """What is corrected, but for the delay and the rotation of the body, of which two logs show nearly the same."""
+    points: dict[str, str | Float64[np.ndarray, "..."]] = {f"IMU {topic}": matrices for topic, matrices in found.imus.items()}
+    points |= {} if _is_identity(found.world) else {"world": found.world}
+    points |= {"unit": found.unit} if found.unit != "m" else {}
+    return points | ({"quaternions": found.quaternions} if found.quaternions else {})
+
+
+def _alike(a: str | Float64[np.ndarray, "..."], b: str | Float64[np.ndarray, "..."]) -> bool:
+    return a == b if isinstance(a, str) or isinstance(b, str) else bool(np.allclose(a, b))
 
 
 def fitted_to(path: Path, common: Corrections) -> Corrections | None:

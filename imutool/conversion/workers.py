@@ -60,7 +60,8 @@ class Outcome:
 def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
     """Outcomes of jobs by their numbers.
 
-    `of` counts also sequences that cannot be read, and are no jobs. A log that lacks what most of the others show of their setup is converted once more, with that.
+    `of` counts also sequences that cannot be read, and are no jobs. A log that lacks what most of the others show of their
+    setup is converted once more, with that.
     """
     jobs, outcomes = [*jobs], dict(_run(jobs, of, workers, progress))
     for with_common in (_with_common_map, _with_common_corrections):
