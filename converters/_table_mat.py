@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 import zlib
@@ -15,6 +16,7 @@ from imutool.errors import DataError, required
 
 from ._table_text import Columns
 
+LABELS = re.compile("head|label|col|field|channel", re.IGNORECASE)  # in the name of texts that name columns
 LIMIT = 4 << 30  # bytes of numbers in one file
 MAT_HEADER, MAT_COMPRESSED, MAT_STEP = 128, 15, 1 << 20  # bytes before the first element, type of a packed one, bytes at once
 
@@ -99,7 +101,8 @@ def _labels(name: str, value: Any, beside: dict[str, Any]) -> list[str]:
     if np.ndim(value) != 2:
         return []
     own = f"{name}_label"
-    found = map(_texts, [beside[own]] if own in beside else beside.values())
+    named = [beside[own]] if own in beside else [texts for key, texts in beside.items() if LABELS.search(key)]
+    found = map(_texts, named)
     return next((texts for texts in found if len(texts) == value.shape[1] == len(set(texts))), [])
 
 

@@ -199,9 +199,8 @@ def _note_unused_header(above: list[str], delimiter: str | None, names: list[str
     fields = _fields(above, delimiter)[-1] if above and delimiter is not None else []
     if names[:1] == ["column 1"] and 1 < len(fields) < len(names) and not any(map(is_number, fields)):
         said = f"the line above the rows has {len(fields)} fields and the rows {len(names)}: it names no column"
-        is_header = any(
-            re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, fields)
-        )  # else perhaps a title
+        is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, fields))
+        # else it may be a title
         (columns.remarks.losses if is_header else columns.remarks.notes).append(f"{said} ({', '.join(fields)[:200]})")
 
 

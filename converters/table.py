@@ -211,8 +211,8 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
         if len(t_ns) != len(values):
             raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
     imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
-    doubts = [f"{table.topic}: {doubt}" for doubt in unit_doubts(imu, table.gyro_unit, table.accel_unit)]
-    columns.remarks.notes.extend([*notes, *doubts])
+    columns.remarks.notes.extend(notes)
+    columns.remarks.doubt([f"{table.topic}: {each}" for each in unit_doubts(imu, table.gyro_unit, table.accel_unit)])
     return imu
 
 

@@ -149,23 +149,24 @@ class _Lines(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._text, self._others = "", list[str]()
+        self._level, self._text, self._others = "", "", list[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
         log, colon, text = record.getMessage().partition(": ")
-        if colon and text == self._text:
+        level = record.levelname.lower()
+        if colon and (level, text) == (self._level, self._text):
             self._others.append(log)
             return
         self.flush()
-        self._text = text
-        say(with_flags(f"{record.levelname.lower()}: {record.getMessage()}"), to=err)
+        self._level, self._text = level, text
+        say(with_flags(f"{level}: {record.getMessage()}"), to=err)
 
     def flush(self) -> None:
         """Name the other logs of the last text."""
         if self._others:
             more = len(self._others) - 1
-            say(f"warning: {self._others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
-        self._text, self._others = "", []
+            say(f"{self._level}: {self._others[0]}{f' and {more} other' if more else ''}{'s' * (more > 1)}: the same", to=err)
+        self._level, self._text, self._others = "", "", []
 
 
 def log_to_stderr(verbose: bool, quiet: bool) -> None:

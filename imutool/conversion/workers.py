@@ -130,6 +130,8 @@ def write_content(content: Recording | MessageLog, job: Job) -> Outcome:
             notes, found = write_corrected(recorded, job.target, *ways, compression=job.compression, overwrite=job.overwrite)
             return replace(outcome, notes=(*outcome.notes, *notes), corrections=found)
     labelled = job.labels.put_on(content)
+    if job.said and isinstance(labelled, MessageLog) and labelled.remarks.doubts:  # what others show does not hold here
+        raise ConfigError(labelled.remarks.doubts[0], where=str(job.sequence))
     if isinstance(labelled, Recording):
         write(labelled, job.target, compression=job.compression, overwrite=job.overwrite)
         return Outcome()

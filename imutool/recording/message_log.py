@@ -66,10 +66,19 @@ class Table:
 
 @dataclass
 class Remarks:
-    """Sentences about a conversion; `losses` say what of the source is not in the log."""
+    """Sentences about a conversion.
+
+    `losses` say what of the source is not in the log. `doubts` are the notes that ask whether something is stated rightly.
+    """
 
     notes: list[str] = field(default_factory=list)
     losses: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+
+    def doubt(self, sentences: list[str]) -> None:
+        """Enter doubts, which are notes, too."""
+        self.notes += sentences
+        self.doubts += sentences
 
 
 def named_kind(topic: str, schema_name: str) -> str:
