@@ -59,7 +59,10 @@ def main() -> None:
             show()
             sys.exit(0 if words else WRONG_USAGE)
         app = load(() if COMPLETION in os.environ else words)
+        from typer import Exit
+
         from imutool.cli.app import caught
+        from imutool.errors import was_interrupted
     except BaseException as error:  # Ctrl-C before there is anybody who could catch it in style
         from imutool.errors import was_interrupted
 
@@ -68,7 +71,12 @@ def main() -> None:
         print("error: interrupted. Nothing was begun.", file=sys.stderr)
         sys.exit(INTERRUPTED)
     with caught():
-        app()
+        try:
+            app()
+        except SystemExit as end:
+            if isinstance(end.__context__, Exit) and was_interrupted(end.__context__):
+                raise KeyboardInterrupt from end  # before the command began or after its end, where typer ends without a word
+            raise
 
 
 def _unraisable(unraisable: sys.UnraisableHookArgs) -> None:

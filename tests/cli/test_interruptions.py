@@ -20,11 +20,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from support.forked import Forked
 from support.processes import soon
 
+from imutool.cli.app import _Commands
 from imutool.cli.demo import write_asl
 from imutool.errors import ConfigError
 from imutool.mcap_io.log import Log
@@ -253,6 +255,18 @@ def test_ctrl_c_while_modules_are_imported_is_an_interrupt(tmp_path: Path, comma
     words = [text for text in said.splitlines() if not text.startswith("import time:")]
     assert words[-1].startswith("error: interrupted.")
     assert "Traceback" not in said
+
+
+def ctrl_c_in_typer() -> None:
+    """Typer turns one that reaches it into an exit code alone."""
+    setattr(_Commands, "make_context", Mock(side_effect=KeyboardInterrupt))  # noqa: B010
+
+
+def test_ctrl_c_before_a_command_begins(tmp_path: Path) -> None:
+    run = Forked(["info", "nowhere.mcap"], tmp_path, ctrl_c_in_typer)
+    _, stderr = run.communicate(timeout=WAIT_S)
+    assert run.returncode == INTERRUPTED
+    assert stderr.splitlines() == ["error: interrupted. Nothing half-written is left."]
 
 
 # ── a full disk, a locked folder ──
