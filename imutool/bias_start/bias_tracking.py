@@ -82,7 +82,7 @@ class BiasFilter:
     """Bias filter for a stream of samples in batches of any size; batch borders change nothing.
 
     With `ahead`, blocks wait until `OnlineRestDetector` knows whether a stop begins with them, which takes 1.5 s. Samples
-    that look like a stop, at a rate that no bias of the sensor has, are a steady turn.
+    that look like a stop, at a rate that neither a bias of the sensor nor a usual one has, are a steady turn.
     """
 
     def __init__(
@@ -137,8 +137,10 @@ class BiasFilter:
 
     def _pass(self, block: _Block, rests: bool) -> FilteredBlock:
         t, u, s, prior = block.t_s, block.u, self.settings, self._prior
-        most = (MOST_CHANGE + MOST_DEVIATIONS * prior.std)[:3]
-        rests = rests and bool((np.abs(u[:-1, :3].mean(axis=0) - prior.mean[:3]) < most).all())
+        if rests:
+            rate, usual = u[:-1, :3].mean(axis=0), MOST_CHANGE[:3]
+            own = np.abs(rate - prior.mean[:3]) < usual + MOST_DEVIATIONS * prior.std[:3]
+            rests = bool(own.all() or (np.abs(rate) < usual).all())
         if self.state is None:
             std = np.concatenate([prior.std, prior.ground_std])
             self.state = inertial_filter.start(u[:, 3:].mean(axis=0), prior.mean, std, s)

@@ -34,11 +34,11 @@ from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias,
 from imutool.bias_start.prior_width import (
     MOST_CHANGE,
     MOST_DEVIATIONS,
-    TELLING,
     BiasPrior,
     contradicted_start,
     supported_std,
     turned_axes,
+    untold_bias,
 )
 from imutool.bias_start.stretches import GRAVITY_RANGE, unusual_gravity
 from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
@@ -118,9 +118,8 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
         *_other_conditions(model, samples),
         *_other_unit(model, about),
     ]
-    telling = (_shown_std(found, prior) < TELLING / 2.0).any()
-    if not (doubts or telling or confirmed or _same_unit(model, about)):
-        doubts.append("the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor")
+    if not (doubts or confirmed or _same_unit(model, about)) and (untold := untold_bias(prior.mean, _shown_std(found, prior))):
+        doubts.append(untold)
     if doubts:
         return Fitness("doubtful", tuple(doubts))
     agreement = _shown_share(share) if confirmed else _agreement(found, prior, share)

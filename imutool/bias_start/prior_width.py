@@ -145,6 +145,25 @@ def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: V
     return sentences, bool((off - np.abs(shown) > TELLING + MOST_DEVIATIONS * total).any())
 
 
+def untold_bias(mean: Vector6, std: Vector6) -> str:
+    """Sentence on a log that shows its biases to within `std` and agrees with a prior's mean, if that tells no sensor.
+
+    A large bias tells one, if none at all would contradict it. While the log does not show a large bias of the gyro, small
+    ones tell nothing: most sensors have them.
+    """
+    size = np.abs(mean)
+    large, telling = size > TELLING, std < TELLING / 2.0
+    if (large & (std < size / MOST_DEVIATIONS)).any():
+        return ""
+    unseen = np.where(large & ~telling, size, 0.0)[:3]
+    if unseen.any():
+        axis = int(np.argmax(unseen))
+        bias = f"the gyro's bias about {'xyz'[axis]}, {mean[axis]:+.2g} rad/s in the training runs"
+        return f"the log neither shows {bias}, nor names its sensor: on another one, it does harm"
+    nothing = "the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor"
+    return "" if telling.any() else nothing
+
+
 def supported_std(
     std: Vector6,
     least: LeastWidth | None,

@@ -126,8 +126,9 @@ def test_a_steady_turn_is_no_stop() -> None:
     """It looks like one, but no bias of the sensor is that large."""
     rng, n = np.random.default_rng(0), int(10 * RATE_HZ)
     t_s, still = np.arange(n) / RATE_HZ, np.array([0.0, 0.0, 9.81])
-    prior = BiasPrior(np.zeros(6), np.repeat([3e-3, 0.05], 3), np.repeat([1e-4, 0.03], 3))
-    for turn_rad_s, rests in ((0.03, True), (0.17, False)):
+    large = np.array([0.0, 0.0, 0.09, 0.0, 0.0, 0.0])  # another sensor's stop reads nothing
+    for mean, turn_rad_s, rests in ((0.0, 0.03, True), (0.0, 0.17, False), (1.0, 0.0, True), (1.0, -0.1, False)):
+        prior = BiasPrior(mean * large, np.repeat([3e-3, 0.05], 3), np.repeat([1e-4, 0.03], 3))
         gyro = np.array([0.0, 0.0, turn_rad_s]) + 1e-3 * rng.normal(size=(n, 3))
         filter_ = BiasFilter(prior, ahead=True)
         blocks = [*filter_.feed(t_s, gyro, still + 0.01 * rng.normal(size=(n, 3))), *filter_.finish()]

@@ -236,3 +236,23 @@ def test_a_bias_that_a_log_does_not_show_is_doubtful_where_it_may_as_well_be_non
     told = " ".join(found.reasons)
     assert ("neither stops nor gravity shows the gyro's bias about z" in told) == is_doubtful, told
     assert found.verdict == ("doubtful" if is_doubtful else "fits"), told
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_sensor_without_bias_is_not_taken_for_one_with_a_large_bias(stops: bool) -> None:
+    """Steps on a flat floor, which show the accelerometer's bias upwards alone; a stop shows the gyro's, too."""
+    rng, t = np.random.default_rng(5), np.arange(0.0, 40.0, 0.01)
+    moves = np.where(stops & (t < 5.0), 0.0, 1.0)[:, None]
+    gyro = moves * np.stack([0.02 * np.sin(5.0 * t), 0.02 * np.cos(4.0 * t), 0.5 * np.sin(0.4 * t)], axis=1)
+    accel = moves * np.sin(np.outer(t, [6.0, 5.0, 9.0])) * [1.5, 1.0, 2.0] + [0.0, 0.0, GRAVITY_M_S2]
+    statistics = {"prior_mean": np.array([0.0, 0.0, 0.08, 0.0, 0.0, 0.0]), "prior_std": np.array([3e-3] * 3 + [0.05] * 3)}
+    other = linear.Model(linear.Config(), 100.0, statistics)
+    other.card = {"name": "other", "logs": [{"name": "own"}] * 3, **MADE_FOR}
+    imu = Imu(
+        (1e9 * t).astype(np.int64), gyro + 1e-3 * rng.normal(size=(len(t), 3)), accel + 0.01 * rng.normal(size=(len(t), 3))
+    )
+    found = judged(other, imu)
+    told = " ".join(found.reasons)
+    assert found.verdict == ("unfit" if stops else "doubtful"), told
+    assert ("the log neither shows the gyro's bias about z, +0.08 rad/s in the training runs" in told) == (not stops), told
+    assert judged(other, imu, {"sequence": "own"}).verdict == ("unfit" if stops else "fits")
