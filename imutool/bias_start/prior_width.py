@@ -146,13 +146,15 @@ def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: V
 
 
 def untold_bias(mean: Vector6, std: Vector6) -> str:
-    """Sentence on a log that shows its biases to within `std` and agrees with a prior's mean, if that tells no sensor.
+    """Sentence on a log whose agreement with a prior does not tell its sensor.
 
-    A large bias tells one, if none at all would contradict it. While the log does not show a large bias of the gyro, small
-    ones tell nothing: most sensors have them.
+    It agrees with the mean to within `std`.
+
+    A bias tells it that is larger than a switching-on changes, if none at all would contradict it. While the log does not show
+    such a bias of the gyro, small ones tell nothing: most sensors have them.
     """
     size = np.abs(mean)
-    large, telling = size > TELLING, std < TELLING / 2.0
+    large, telling = size > MOST_CHANGE, std < TELLING / 2.0
     if (large & (std < size / MOST_DEVIATIONS)).any():
         return ""
     unseen = np.where(large & ~telling, size, 0.0)[:3]
