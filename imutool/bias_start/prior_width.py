@@ -154,16 +154,13 @@ def untold_bias(mean: Vector6, std: Vector6) -> str:
     such a bias of the gyro, small ones tell nothing: most sensors have them.
     """
     size = np.abs(mean)
-    large, telling = size > MOST_CHANGE, std < TELLING / 2.0
-    if (large & (std < size / MOST_DEVIATIONS)).any():
-        return ""
-    unseen = np.where(large & ~telling, size, 0.0)[:3]
-    if unseen.any():
-        axis = int(np.argmax(unseen))
+    large = size > MOST_CHANGE
+    axis = int(np.argmax(np.where(large, size, 0.0)[:3]))
+    if large[axis] and not (large & (std < size / MOST_DEVIATIONS)).any():
         bias = f"the gyro's bias about {'xyz'[axis]}, {mean[axis]:+.2g} rad/s in the training runs"
         return f"the log neither shows {bias}, nor names its sensor: on another one, it does harm"
     nothing = "the log has neither a stop nor enough slow motion to judge the model by, and does not name its sensor"
-    return "" if telling.any() else nothing
+    return "" if (std < TELLING / 2.0).any() else nothing
 
 
 def supported_std(
