@@ -51,7 +51,7 @@ def kind_of(head: bytes, path: Path) -> str:
             return "npz"
     text = text_head(path) if opener(head) else head
     words = "" if b"\0" in text else text_of(text)
-    if is_json(words) and not as_table(words)[0]:
+    if is_json(words):
         return "json"
     is_table = is_text_table(text) or (words and (as_table(words)[0] or is_mocap(words)))
     return "csv" if is_table else ""
@@ -100,12 +100,14 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
     if sentences := of_vectornav(text, columns):
         read_csv(sentences, columns, path)
         return
-    labelled, left_out = as_table(text)
+    labelled, damaged, others = as_table(text)
     if labelled:
         read_csv(labelled, columns, path)
         columns.remarks.notes.append("its rows name their numbers")
-        if left_out:
-            columns.remarks.losses.append(f"{left_out} lines of other words are left out")
+        if others:
+            columns.remarks.notes.append(f"{others} lines of other words are left out")
+        if damaged:
+            columns.remarks.losses.append(f"{damaged} lines with a part of these names are left out")
     elif not read_rows(text, columns, path):
         read_csv(text, columns, path)
         name_headerless(columns)

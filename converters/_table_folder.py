@@ -24,12 +24,13 @@ from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape, read_npy
 from ._table_geodetic import add_local
 from ._table_groups import TRUE_GROUPS
+from ._table_header import MOSTLY
 from ._table_look import look
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
 from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, plain_among, sensors_among
-from ._table_text import LOOKED_AT, MOSTLY, Columns, is_text_table, read_csv, text_of
+from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
 
@@ -39,7 +40,10 @@ DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
-ROLE = "|".join(["imu|inertial|ground|truth|poses?|raw|rots?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
+REFERENCE = r"(.*[ _-])?ref(erence)?([ _-].*)?"  # of poses; of rates it is an ideal sensor
+ROLE = "|".join(
+    ["imu|inertial|ground|truth|poses?|raw|rots?|ref|reference", TRUE_GROUPS, *SENSORS.values()]
+)  # a word in the name of a file
 ENDINGS = (
     ".csv",
     ".txt",
@@ -245,6 +249,7 @@ def _groups(tables: list[Path]) -> dict[Path, str]:
     captured = [path for path in tables if seen[path].is_mocap]
     words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1
     true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
+    true = true or [p for p in tables if re.fullmatch(REFERENCE, words[p]) and seen[p].has_poses and not seen[p].is_imu]
     if of_sensors:
         return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
     shown = [path for path in tables if seen[path].is_imu and path not in true]

@@ -12,11 +12,11 @@ from imutool.errors import ConfigError, DataError
 
 from ._source import head
 from ._table_files import NO_NUMBERS, kind_of, load, read_text
-from ._table_groups import has_poses
 from ._table_headerless import perhaps
 from ._table_layouts import known_layout
 from ._table_mocap import is_mocap
 from ._table_packed import text_head
+from ._table_pose_names import has_poses
 from ._table_propose import propose
 from ._table_sensors import name_columns
 from ._table_text import Columns, read_csv, text_of

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 
 import numpy as np
@@ -52,6 +53,13 @@ def plain_columns(lines: list[str], delimiter: str | None) -> tuple[list[np.ndar
 
 def _count(line: str, delimiter: str | None) -> int:
     return len(line.split()) if delimiter is None else line.count(delimiter) + 1
+
+
+def fields_of(lines: list[str], delimiter: str | None) -> list[list[str]]:
+    """Fields of each line; in quotes the delimiter is text."""
+    if delimiter is not None and any('"' in line for line in lines[:50]):
+        return list(csv.reader(lines, delimiter=delimiter))
+    return [line.split(delimiter) for line in lines]
 
 
 def is_number(text: str) -> bool:

@@ -424,3 +424,13 @@ def test_a_table_that_shows_less_is_what_the_others_of_its_columns_are(tmp_path)
         read_back = read(tmp_path / "out" / f"{name}.mcap").imu
         np.testing.assert_array_equal(read_back.accel, imu[:, :3])
         np.testing.assert_array_equal(read_back.gyro, imu[:, 3:])
+
+
+def test_a_time_that_was_set_back_is_no_axis_of_its_sensor(tmp_path):
+    """Without a header the first column that does not rise was the x axis."""
+    times = np.concatenate([T_S[:300], T_S[300:] - 2.5])
+    (tmp_path / "gyro.csv").write_text(rows(times, GYRO))
+    (tmp_path / "acc.csv").write_text(rows(times, ACCEL))
+    (sequence,) = table.sequences(tmp_path)
+    imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel[:300], ACCEL[:300])
