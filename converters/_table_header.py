@@ -17,9 +17,9 @@ UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]
 def header_of(lines: list[str], delimiter: str | None, width: int, first: list[str]) -> tuple[list[str], dict[str, str]]:
     """Names of the columns, with the units of a row of their own below them.
 
-    Without a header they are numbers. In a row of units texts repeat, and in the row of names above it none does. A row of names
-    that repeat stands below a row of their groups. A first column without a name may have no field in the header, as in what R
-    writes; `first` are its texts.
+    Without a header they are numbers. In a row of units texts repeat, and in the row of names above it none does. A row of
+    names that repeat stands below a row of their groups. A first column without a name may have no field in the header, as in
+    what R writes; `first` are its texts.
     """
     rows = [[text.strip().strip('"') for text in row] for row in fields_of([line.lstrip("#% ") for line in lines], delimiter)]
     while len(rows) > 1 and sum(map(is_number, rows[-1])) > sum(map(bool, rows[-1])) / 2:

@@ -533,3 +533,21 @@ def test_gravity_in_feet_is_proposed_and_asked(tmp_path):
         read(path)
     log = table.read_sequence(table.sequences(path)[0], mapping={"accel_unit": "ft/s^2"})
     np.testing.assert_allclose(log.imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-5)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_messages_that_ros_printed_are_rows(tmp_path, version):
+    """`rostopic echo /imu > imu.txt`, and a last message that was cut."""
+    sec, nanosec, space = ("secs", "nsecs", " ") if version == 1 else ("sec", "nanosec", "")
+    covariance = "[0.1, 0.0, 0.1]" if version == 1 else "\n- 0.1\n- 0.0\n- 0.1"
+    axes = f"{space}\n  x: {{}}\n  y: {{}}\n  z: {{}}\n"
+    form = f"header:{space}\n  stamp:{space}\n    {sec}: 1700000000\n    {nanosec}: {{:9d}}\n  frame_id: imu\n"
+    form += f"angular_velocity:{axes}angular_velocity_covariance: {covariance}\nlinear_acceleration:{axes}---\n"
+    gyro, accel = COUNTS * 0.001, 9.80665 * ACCEL_G
+    parts = [form.format(2_000_000 * n, *g, *a) for n, (g, a) in enumerate(zip(gyro.tolist(), accel.tolist(), strict=True))]
+    (tmp_path / "imu.txt").write_text("".join(parts) + parts[0][:150])
+    log = read(tmp_path / "imu.txt")
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([gyro, accel]))
+    assert np.array_equal(imu.t_ns, 1_700_000_000 * 10**9 + 2_000_000 * np.arange(COUNT))
+    assert log.remarks.losses == ["1 messages without all fields of the first are left out"]
