@@ -26,7 +26,7 @@ def header_of(lines: list[str], delimiter: str | None, width: int, first: list[s
         rows.pop()  # a row with too few numbers for one of the table
     if rows and len(rows[-1]) == width - 1 > 1 and _lacks_first(rows[-1], first):
         rows[-1] = ["", *rows[-1]]
-    rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
+    rows = [row[:width] for row in rows if len(row) >= width and not any(row[width:])]
     rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) <= max(MOSTLY * width, 1)]  # CAL, CAL
     if len(rows) > 2 and _are_units(rows[-2]) and len({*rows[-1]} - {""}) < len(rows[-1]) / 2:
         rows.pop()  # below the units RaceChrono writes the device of each column

@@ -32,6 +32,7 @@ SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
 ANDROID, ANDROIDS = r"TYPE_[A-Z_]+", {"gyro": "rad/s", "accel": "m/s^2"}  # constants of Android, which states these units
 MOST_NAMES, LEAST_ROWS = 60, 20
 LOOKED_AT = 200_000  # first characters of a text, which show whether its rows name sensors
+EPOCH, ELAPSED = r"(?i)epoch?\b", r"(?i)(.*[ _])?elapsed\b"
 NEAR_ONE = 0.01
 ALWAYS = 0.99  # share of the steps of a time that lead up
 PLACES = 3  # first fields of a row, of which one may name its sensor
@@ -169,7 +170,8 @@ def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
 def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     """Name the time and the axes of a sensor, and the columns of a pose without a header.
 
-    The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
+    The time is the last column that rises before the axes: the sensor's own stands behind that of the program. One that counts
+    from the first row of its file is not that of another sensor's file: MetaWear writes `epoc (ms)` and `elapsed (s)`.
     """
     names = [*table.values]
     if not names:
@@ -187,6 +189,7 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
         if len(axes) < 3:
             return
         clocks = [name for name in names[: names.index(next(iter(axes)))] if _ascends(table.values[name])]
+        clocks = [c for c in clocks if re.match(EPOCH, c)] or [c for c in clocks if not re.match(ELAPSED, c)] or clocks
         for clock in clocks[-1:]:
             table.units[clock] = table.units.get(clock) or split_name(clock)[1]
         new = {**axes, **dict.fromkeys(clocks[-1:], "time")}

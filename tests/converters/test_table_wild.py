@@ -551,3 +551,10 @@ def test_messages_that_ros_printed_are_rows(tmp_path, version):
     np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([gyro, accel]))
     assert np.array_equal(imu.t_ns, 1_700_000_000 * 10**9 + 2_000_000 * np.arange(COUNT))
     assert log.remarks.losses == ["1 messages without all fields of the first are left out"]
+
+
+def test_commas_behind_a_header_and_its_rows_hide_no_name(tmp_path):
+    """A spreadsheet writes them for columns that were emptied."""
+    path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T])
+    path.write_text("".join(f"{line},,,\n" for line in path.read_text().splitlines()))
+    assert len(read(path).imus["/imu0"]) == COUNT
