@@ -24,6 +24,7 @@ from ._table_sensors import name_columns, read_rows, sensors_among
 from ._table_text import Columns, read_csv
 
 START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,))')
+NEXT = re.compile(rb"\}\s*\{")  # an object behind another, without a comma
 LEAST_ROWS = 5  # objects of an array that is a table
 MOST_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix does
 MOST_DAMAGED = 0.1  # share of the lines that a logger cut off or garbled
@@ -77,6 +78,8 @@ def _decoded(path: Path, columns: Columns) -> Any:
     try:
         return msgspec.json.decode(raw)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            return msgspec.json.decode(b"[" + NEXT.sub(b"},{", raw) + b"]")
         lines = [line.strip().rstrip(b",") for line in raw.splitlines() if line.strip()]
         values = []
         for line in lines:

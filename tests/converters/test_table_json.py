@@ -159,3 +159,9 @@ def test_lines_of_several_devices_are_several_imus(tmp_path, devices):
     assert [len(imu) for imu in log.imus.values()] == [COUNT, COUNT]
     assert all(np.array_equal(imu.gyro, GYRO) for imu in log.imus.values())
     assert log.remarks.losses == [f"1 of {len(lines) + 1} lines are no JSON and are left out"]
+
+
+@pytest.mark.parametrize("indent", [None, 2])
+def test_objects_behind_one_another_are_rows(tmp_path, indent):
+    imu = read(tmp_path / "stream.txt", "".join(json.dumps(row, indent=indent) for row in FLAT)).imus["/imu0"]
+    assert np.array_equal(imu.gyro, GYRO)
