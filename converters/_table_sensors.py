@@ -204,7 +204,7 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
 
 def _ascends(values: np.ndarray) -> bool:
     """Whether a column is a time, even one that was set back once, and not a component of a vector."""
-    return rises(values) or float(np.mean(np.diff(values.astype(float)) > 0)) > ALWAYS
+    return rises(values) or (len(values) > 1 and float(np.mean(np.diff(values.astype(float)) > 0)) > ALWAYS)
 
 
 def _turns(table: Columns, names: list[str]) -> bool:
