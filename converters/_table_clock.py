@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from ._table_groups import shared_group
+from ._table_groups import TRUE_GROUPS, shared_group
 from ._table_map import Entries, Proposal, column_named
 from ._table_names import TIME_WORDS, XSENS_TIME, name_and_unit, spaced_name, unit_named
 from ._table_text import Columns
@@ -27,6 +27,7 @@ from ._table_times import (
 from ._table_units import TIME_NS
 
 MOST_APART, WHOLE_NS = 0.1, 2e9  # between the spans of two times of a table, of which one may count whole seconds
+SENSOR_TIME = r"(sensor|event|hardware|hw)_?(event_?)?(time|t_|ts|stamp)"  # Android's, beside the time of the program
 OWN_TIME = {"gyro": r"gyro(scope)?_t", "accel": r"accel(erometer)?_t"}  # names of a sensor's own stamps begin so
 
 
@@ -53,18 +54,14 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
     if gyro:
         found.sort(key=lambda c: (_table_of(c) != _table_of(gyro[0]), -shared_group(c, gyro[0])))
         found.sort(key=lambda c: not re.match(OWN_TIME["gyro"], spelled[c][1]))
+    found.sort(key=lambda c: re.match(rf"{TRUE_GROUPS}_", names[c][0]) is not None)
+    found = _steadiest_first(found, spelled, columns, proposal)
     found.sort(key=lambda c: not (names[c][0].endswith("header_stamp") and columns.values[c].dtype.kind in "iu"))
     shown = (proposal.unsigned("accel", columns) or [*names])[:1]
     counters = counters_of(columns, length or len(columns.values[shown[0]]) if shown else 0)
-    measured = {*counters, *gyro, *proposal.unsigned("accel", columns)}
     if not found:
-        # of each table, without a count of rows; further columns may rise as a temperature does
-        firsts = {_table_of(c): c for c in reversed(names) if c not in counters}.values()
-        fits = [c for c in names if c not in measured and length in (None, len(columns.values[c])) and rises(columns.values[c])]
-        clocks = [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS]
-        rising = [c for c in fits if c in firsts]
-        found = clocks if len(clocks) == 1 else rising if len(rising) == 1 else []
-        why = "alone rises in a unit of time" if len(clocks) == 1 else "is the first column and rises"
+        measured = {*counters, *gyro, *proposal.unsigned("accel", columns)}
+        why, found = _unnamed_time(names, columns, counters, [c for c in names if c not in measured], length)
         proposal.reasons += [f"{column!r} {why}: it counts as the time" for column in found]
     if not found:
         proposal.reasons += [f"{c!r} rises and has {len(columns.values[c])} rows, and the gyro {length}" for c in others]
@@ -84,6 +81,43 @@ def propose_time(proposal: Proposal, names: dict[str, tuple[str, str]], columns:
         proposal.hints.append(
             f"rate_hz = 100.0 and counter = {column!r}  # in place of time and time_unit, if it counts samples"
         )
+
+
+def _unnamed_time(
+    names: dict[str, tuple[str, str]], columns: Columns, counters: list[str], others: list[str], length: int | None
+) -> tuple[str, list[str]]:
+    """Why a column counts as the time that no name shows, and that column; none where several may.
+
+    Of each table it is the first column without a count of rows; further columns may rise as a temperature does.
+    """
+    firsts = {_table_of(c): c for c in reversed(names) if c not in counters}.values()
+    fits = [c for c in others if length in (None, len(columns.values[c])) and rises(columns.values[c])]
+    tries = {
+        "alone rises in a unit of time": [c for c in fits if (unit_named(columns.units.get(c, "")) or names[c][1]) in TIME_NS],
+        "rises and is the first column that holds no count": [c for c in fits if c in firsts],
+        "alone rises as a time since 1970 does": [c for c in fits if _is_of_this_century(columns.values[c].astype(float))],
+    }
+    return next(((why, each) for why, each in tries.items() if len(each) == 1), ("", []))
+
+
+def _steadiest_first(found: list[str], spelled: dict[str, tuple[str, str]], columns: Columns, proposal: Proposal) -> list[str]:
+    """Times of the samples, a sensor's own before a program's that is less even."""
+    own = [c for c in found[1:] if re.match(SENSOR_TIME, spelled[c][1]) and not _table_of(c)]
+    if not own or _unevenness(columns.values[own[0]]) >= _unevenness(columns.values[found[0]]):
+        return found
+    proposal.reasons.append(f"{own[0]!r} is the sensor's own time and steadier than {found[0]!r}: it counts as the time")
+    return [own[0], *(c for c in found if c != own[0])]
+
+
+def _unevenness(values: np.ndarray) -> float:
+    """Standard deviation of the steps over their mean."""
+    steps = np.diff(values.astype(float))
+    return float(np.nanstd(steps) / np.nanmean(steps))
+
+
+def _is_of_this_century(values: np.ndarray) -> bool:
+    """Whether a column counts from 1970 in a unit of time."""
+    return any(1e18 < values[0] * TIME_NS[unit] < 4e18 for unit in units_of_time(values[0], float(np.median(np.diff(values)))))
 
 
 def _table_of(column: str) -> str:

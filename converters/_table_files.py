@@ -13,6 +13,7 @@ import numpy as np
 from imutool.errors import DataError, required
 
 from ._archive import refusing
+from ._table_echo import of_echo
 from ._table_headerless import as_table, name_headerless
 from ._table_json import is_json, load_json
 from ._table_mat import check_size, load_mat
@@ -51,9 +52,9 @@ def kind_of(head: bytes, path: Path) -> str:
             return "npz"
     text = text_head(path) if opener(head) else head
     words = "" if b"\0" in text else text_of(text)
-    if is_json(words) and not as_table(words)[0]:
+    if is_json(words):
         return "json"
-    is_table = is_text_table(text) or (words and (as_table(words)[0] or is_mocap(words)))
+    is_table = is_text_table(text) or (words and (as_table(words)[0] or is_mocap(words) or of_echo(words)[0]))
     return "csv" if is_table else ""
 
 
@@ -97,15 +98,19 @@ def read_text(text: str, columns: Columns, path: Path) -> None:
     """Add the columns of a table of text, whatever program wrote it."""
     if read_mocap(text, columns, path):
         return
-    if sentences := of_vectornav(text, columns):
-        read_csv(sentences, columns, path)
+    echoed, cut = of_echo(text)
+    if table := echoed or of_vectornav(text, columns):
+        read_csv(table, columns, path)
+        columns.remarks.losses.extend([f"{cut} messages without all fields of the first are left out"] if cut else [])
         return
-    labelled, left_out = as_table(text)
+    labelled, damaged, others = as_table(text)
     if labelled:
         read_csv(labelled, columns, path)
         columns.remarks.notes.append("its rows name their numbers")
-        if left_out:
-            columns.remarks.losses.append(f"{left_out} lines of other words are left out")
+        if others:
+            columns.remarks.notes.append(f"{others} lines of other words are left out")
+        if damaged:
+            columns.remarks.losses.append(f"{damaged} lines with a part of these names are left out")
     elif not read_rows(text, columns, path):
         read_csv(text, columns, path)
         name_headerless(columns)

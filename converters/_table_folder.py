@@ -24,12 +24,13 @@ from ._source import find_folders, head
 from ._table_files import kind_of, load, npy_shape, read_npy
 from ._table_geodetic import add_local
 from ._table_groups import TRUE_GROUPS
-from ._table_look import look
+from ._table_header import MOSTLY
+from ._table_look import look, span_ns
 from ._table_map import IMU_GROUP, POSES_GROUP, TRUTH_GROUP
 from ._table_names import TIME_WORDS, name_and_unit, split_name
 from ._table_packed import read_bytes, table_name
 from ._table_sensors import SENSORS, SPACED, WORD, name_columns, pairs_among, plain_among, sensors_among
-from ._table_text import LOOKED_AT, MOSTLY, Columns, is_text_table, read_csv, text_of
+from ._table_text import LOOKED_AT, Columns, is_text_table, read_csv, text_of
 from ._table_times import rises
 from .sensor_tables import is_phone
 
@@ -39,7 +40,10 @@ DATA_FILE = "data.hdf5"  # of RoNIN
 IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of UZH-FPV's imu.txt; else its columns show it
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
-ROLE = "|".join(["imu|inertial|ground|truth|poses?|raw|rots?", TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
+REFERENCE = r"(.*[ _-])?ref(erence)?([ _-].*)?"  # of poses; of rates it is an ideal sensor
+ROLE = "|".join(
+    ["imu|inertial|ground|truth|poses?|raw|rots?|ref|reference", TRUE_GROUPS, *SENSORS.values()]
+)  # a word in the name of a file
 ENDINGS = (
     ".csv",
     ".txt",
@@ -147,8 +151,11 @@ def _is_time(path: Path) -> bool:
 def _recordings(folder: Path) -> dict[str, list[Path]]:
     """Tables of each recording of a folder, by its name; the name is empty where all tables are one recording."""
     tables = _tables(folder)
-    if _groups(tables[:MOST_TABLES]):
-        return {"": tables[:MOST_TABLES]}
+    if groups := _groups(tables[:MOST_TABLES]):
+        parts = _apart_in_time(groups) if groups.keys() == {*tables} else []
+        return (
+            {_without_role(_stem(min(part))): sorted(part) for part in parts} if len(parts) > 1 else {"": tables[:MOST_TABLES]}
+        )
     count = Counter(map(_stem, tables))
     stems = {path: _stem(path) if count[_stem(path)] == 1 else path.name for path in tables}  # imu.csv beside imu.txt
     alike: dict[str, list[Path]] = {}
@@ -162,6 +169,24 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
         own = {stems[path]: [path] for path in paths if look(path).is_imu or look(path).header in of_imus}
         found |= {name: paths} if name and _groups(paths) else own
     return found or {stems[path]: [path] for path in tables if look(path).may_be_imu}
+
+
+def _apart_in_time(groups: dict[Path, str]) -> list[list[Path]]:
+    """Tables of IMUs, those together that were recorded at one time; none where a table does not show its time."""
+    pairs: dict[str, list[Path]] = {}
+    for path, group in groups.items():
+        pairs.setdefault(group.rpartition("/")[0], []).append(path)
+    spans = {path: span_ns(path) for path in groups if path.is_file()} if len(pairs) > 1 else {}
+    known = {path: span for path, span in spans.items() if span}
+    if not known or known.keys() != groups.keys():
+        return []
+    parts, end = list[list[Path]](), 0
+    for pair in sorted(pairs.values(), key=lambda each: min(known[path] for path in each)):
+        if min(known[path][0] for path in pair) > end:
+            parts.append([])
+        parts[-1] += pair
+        end = max(end, *(known[path][1] for path in pair))
+    return parts
 
 
 def _without_role(stem: str) -> str:
@@ -245,6 +270,7 @@ def _groups(tables: list[Path]) -> dict[Path, str]:
     captured = [path for path in tables if seen[path].is_mocap]
     words = {path: re.sub(SPACED, "_", _stem(path)).lower() for path in tables}  # viconRot1
     true = captured or [path for path in tables if re.fullmatch(POSES, words[path])]
+    true = true or [p for p in tables if re.fullmatch(REFERENCE, words[p]) and seen[p].has_poses and not seen[p].is_imu]
     if of_sensors:
         return of_sensors | {path: TRUTH_GROUP for path in true if len(true) == 1 and path not in of_sensors}
     shown = [path for path in tables if seen[path].is_imu and path not in true]

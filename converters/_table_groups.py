@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
 
-from ._table_geodetic import LOCAL, fits_gravity
+from ._table_geodetic import fits_gravity
 from ._table_map import IMU_TOPIC, Entries, column_named
-from ._table_names import DIGITS, ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
+from ._table_names import ESTIMATED, TIME_WORDS, name_and_unit, spaced_name, split_name, triples
+from ._table_pose_names import NED, NUMBERS, QUATERNION, QUATERNION_ARRAY, angles_of, axes_of, bodies_of, matrix_of, position_of
 from ._table_rotations import EITHER_WAY, TURNS, angles_by_motion, matrix_by_motion, order_by_motion
 from ._table_text import Columns, matrix_columns
 from ._table_times import goes_on
@@ -19,33 +20,6 @@ Axes = dict[str, str]  # columns by x, y, z
 MOST_CONSTANTS = 16  # values of an array that has no time and is kept as metadata: a bias, a matrix
 LEAST_OVERLAP = 0.01  # of two spans of time in the same unit; another unit is a factor of 1000 away
 MOST_LONGER = 10.0  # is a span of time than another in the same unit
-FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
-ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
-QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
-QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-3])"
-COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
-ANGLES = (
-    (rf"(?!{COMMANDED})(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?", ("roll", "pitch", "yaw")),
-    (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
-)
-GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
-HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
-POSITION = r"((t|p|pos|position|translation|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
-POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
-    (POSITION, "xyz"),
-    (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
-    (rf"(p(os(ition)?)?_?|{LOCAL})?(?P<axis>north|east|down)", ("north", "east", "down")),
-    (r"p_?(?P<axis>[ned])", "ned"),
-)
-NED = POSITIONS[2:]
-MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
-OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
-    rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
-    r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
-    rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
-)
-INDICES = [[f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1)]
-NUMBERS = "012345678", "123456789"
 TRUE_GROUPS = (
     r"(data_?)?(mocap|motion_?capture|vicon|opti_?track|opt|optical|omc|qualisys|leica|ground_?truth|truth|gt)(_?data)?\d*"
 )
@@ -100,10 +74,11 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             name = re.sub(rf"^{TRUE_GROUPS}_", "", leaf)
             groups.setdefault((beside, is_true(column) or name != leaf), {})[name] = column
     poses = []
-    for (clock, named_true), leaves in groups.items():
-        bodies = _bodies(leaves)
+    for (shared, named_true), leaves in groups.items():
+        clock = (named_true and shared[0] == time and _own_time(columns, leaves, time, unit)) or shared
+        bodies = bodies_of(leaves)
         for body in (leaves, *bodies):
-            position = _position(body)
+            position = position_of(body)
             turns = _turns(columns, entries, body, clock, reasons) if position or named_true or clock[0] != time else {}
             if turns:
                 break
@@ -120,10 +95,17 @@ def group_entries(columns: Columns, entries: Entries, reasons: list[str]) -> Ent
             continue
         stated = name_and_unit(position[0], columns.units.get(position[0], ""))[1]
         found |= {"position": position, "position_unit": stated if stated in POSITION_SI else "m"}
-        if named := _position({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
+        if named := position_of({split_name(c.removeprefix(group_of(c)))[0]: c for c in position}, NED):
             found["pose_world"] = "ned"
             reasons.append(f"{', '.join(named)} are north, east and down: the poses are turned to east, north, up")
     return found
+
+
+def _own_time(columns: Columns, leaves: dict[str, str], time: str, unit: str) -> tuple[str, str] | None:
+    """Time of true poses among the columns of the IMU's table, as `truth_t`, and its unit."""
+    own = (c for leaf, c in leaves.items() if c != time and re.fullmatch(TIME_WORDS, leaf) and goes_on(columns.values[c]))
+    other = next(own, None)
+    return _with_unit(columns, other, time, unit, apart=True) if other else None
 
 
 def turned(columns: Columns, entries: Entries) -> Entries:
@@ -154,19 +136,12 @@ def pose_clock(columns: Columns, entries: Entries) -> Entries:
     return {"truth_time": time, "truth_time_unit": unit}
 
 
-def has_poses(columns: Columns) -> bool:
-    """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
-    leaves = {split_name(column)[0]: column for column in columns.values}
-    turns = _axes(QUATERNION, leaves, "wxyz") or _axes(QUATERNION_ARRAY, leaves, "0123") or _matrix(leaves) or _angles(leaves)
-    return bool(turns and _position(leaves))
-
-
 def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tuple[str, str], reasons: list[str]) -> Entries:
     """Entries of the rotations of a group: quaternions, or angles that turn as the gyro does."""
     arrays = {m[1][int(m[2])]: c for leaf, c in leaves.items() if (m := re.fullmatch(r".*(wxyz|xyzw)_([0-3])", leaf))}
-    q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else _axes(QUATERNION, leaves, "wxyz")
-    nine = _matrix(leaves)
-    if not q and not nine and (four := _axes(QUATERNION_ARRAY, leaves, "0123")):
+    q = [arrays[axis] for axis in "wxyz"] if len(arrays) == 4 else axes_of(QUATERNION, leaves, "wxyz")
+    nine = matrix_of(leaves)
+    if not q and not nine and (four := axes_of(QUATERNION_ARRAY, leaves, "0123")):
         q, order = order_by_motion(columns, entries, four, clock)
         if q:
             reasons.append(f"{', '.join(four)} turn as the gyro does in the order {order}")
@@ -174,11 +149,11 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
         return {"quaternion_wxyz": q}
     if nine:
         rows, is_shown = matrix_by_motion(columns, entries, nine, clock)
-        if rows and (is_shown or nine != _matrix(leaves, NUMBERS)):  # the order of numbers is no convention
+        if rows and (is_shown or nine != matrix_of(leaves, NUMBERS)):  # the order of numbers is no convention
             way = "" if rows == nine else ", transposed"
             reasons.append(f"the matrices {nine[0]}, ... turn as the gyro does{way}{'' if is_shown else EITHER_WAY}")
             return {"rotation_matrix": rows}
-    if found := next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in _angles(leaves))), {}):
+    if found := next(filter(None, (angles_by_motion(columns, entries, three, clock) for three in angles_of(leaves))), {}):
         reasons.append(f"{', '.join(found['roll_pitch_yaw'])} turn as the gyro does, as roll, pitch and yaw")
     return found
 
@@ -186,66 +161,20 @@ def _turns(columns: Columns, entries: Entries, leaves: dict[str, str], clock: tu
 def _why_no_turns(columns: Columns, leaves: dict[str, str], bodies: list[dict[str, str]]) -> list[str]:
     """Reasons why the rotations of a group make no poses."""
     array = next((c[:-3] for c in leaves.values() if c.endswith("[3]") and f"{c[:-3]}[4]" not in columns.values), "")
-    named = [array] if array else next(filter(None, (_axes(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
+    named = [array] if array else next(filter(None, (axes_of(QUATERNION_ARRAY, body, "0123") for body in bodies)), [])
     if named:
         return [f"{', '.join(named)} has four columns of no certain order; `quaternion_wxyz` of a map makes poses of them"]
-    if nine := _matrix(leaves):
+    if nine := matrix_of(leaves):
         said = "do not turn as the gyro does, or so do their transposes"
         return [f"the matrices {nine[0]}, ... {said}; `rotation_matrix` of a map, row by row, makes poses of them"]
-    if three := next(iter(_angles(leaves)), []):
+    if three := next(iter(angles_of(leaves)), []):
         said = "do not turn as the gyro does, as Rz(yaw) Ry(pitch) Rx(roll)"
         return [f"{', '.join(three)} {said}; `roll_pitch_yaw` of a map makes poses of them"]
     return []
 
 
-def _bodies(leaves: dict[str, str]) -> list[dict[str, str]]:
-    """Columns of each body that has a position and quaternions in its own name, without that name."""
-    bodies: dict[str, dict[str, str]] = {}
-    for leaf, column in leaves.items():
-        if match := next(filter(None, (re.fullmatch(form, leaf) for form in OWNED)), None):
-            bodies.setdefault(match["body"], {})[match["leaf"]] = column
-    return [body for body in bodies.values() if len(body) >= 7 and _position(body)]
-
-
-def _matrix(leaves: dict[str, str], forms: Iterable[Sequence[str]] = (*INDICES, *NUMBERS)) -> list[str]:
-    """Columns of a matrix, row by row, whose indices or numbers count from 0 or from 1."""
-    found = {re.sub(r"_(?=\d$)", "", leaf): column for leaf, column in leaves.items()}
-    return next(filter(None, (_axes(MATRIX, found, axes) for axes in forms)), [])
-
-
-def _position(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
-    """Columns x, y, z of a position, or east, north, up, or north, east, down."""
-    return next(filter(None, (_axes(pattern, leaves, axes) for pattern, axes in forms)), [])
-
-
-def _angles(leaves: dict[str, str]) -> list[list[str]]:
-    """Columns of each roll, pitch and yaw."""
-    yaws = {re.sub(HEADING, "yaw", leaf): column for leaf, column in leaves.items()}
-    yaws |= {re.sub(rf"(^|.*_){letter}", rf"\1{axis}", leaf): c for leaf, c in leaves.items() for letter, axis in GREEK.items()}
-    return [three for pattern, axes in ANGLES for three in _every(pattern, yaws | leaves, axes)]
-
-
-def _axes(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[str]:
-    """Columns of all axes of the first name that has them; `leaves` are columns by their names."""
-    return next(iter(_every(pattern, leaves, axes)), [])
-
-
-def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[list[str]]:
-    """Columns of all axes of each name that has them."""
-    found: dict[str, dict[str, str]] = {}
-    for leaf, column in leaves.items():
-        if match := re.fullmatch(pattern, leaf):
-            axis = match["axis"].translate(DIGITS) if "x" in axes else match["axis"]
-            found.setdefault(leaf[: match.start("axis")], {})[axis] = column
-    return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
-
-
 def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: bool = False) -> tuple[str, str] | None:
-    """Time in the group of a column or in one around it, if that is not the IMU's, and its unit.
-
-    A unit that is not stated is the one in which it covers the IMU's time best; of a clock `apart` from the IMU's the one in
-    which it lasts about as long.
-    """
+    """Time in the group of a column or in one around it, if not the IMU's, and its unit."""
     length = len(columns.values[column])
     if "/" not in column and not columns.has_structures and length == len(columns.values[time]):
         return None
@@ -255,8 +184,15 @@ def time_beside(columns: Columns, column: str, time: str, unit: str, *, apart: b
         found = [c for c, values in long.items() if is_time(c) and goes_on(values)]
         other = time if time in found else next(iter(found), "")
         group = group_of(group)
-    if other in ("", time):
-        return None
+    return _with_unit(columns, other, time, unit, apart=apart) if other not in ("", time) else None
+
+
+def _with_unit(columns: Columns, other: str, time: str, unit: str, *, apart: bool) -> tuple[str, str] | None:
+    """A time beside the IMU's, and its unit.
+
+    A unit that is not stated is the one in which it covers the IMU's time best; of a clock `apart` from the IMU's the one in
+    which it lasts about as long.
+    """
     stated = name_and_unit(other, columns.units.get(other, ""))[1]
     if stated in TIME_NS:
         return other, stated

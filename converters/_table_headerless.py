@@ -145,15 +145,21 @@ def name_headerless(columns: Columns) -> None:
     columns.remarks.notes.append(why)
 
 
-def as_table(text: str) -> tuple[str, int]:
-    """The text as a table, and the number of lines left out; empty without such rows."""
+def as_table(text: str) -> tuple[str, int, int]:
+    """The text as a table, and how many lines are left out: damaged rows, and others.
+
+    Without such rows the table is empty.
+    """
     lines = [line for line in text.splitlines() if line.strip()]
     counts = Counter(words for line in lines[:LOOKED_AT] if (words := _words(line)))
     words, count = max(counts.items(), key=lambda each: each[1], default=((), 0))
     if count < max(LEAST_ROWS, LEAST_SHARE * len(lines[:LOOKED_AT])):
-        return "", 0
+        return "", 0, 0
     rows = ["\t".join(match[1] for match in NUMBER.finditer(line)) for line in lines if _words(line) == words]
-    return "\n".join(["\t".join(_names(words)), *rows]) + "\n", len(lines) - len(rows)
+    labels = {match[0].strip() for text in words if (match := LABEL.search(text[-LONGEST_LABEL:]))}
+    row = re.compile("|".join(rf"(?<!\w){re.escape(label)}" for label in labels))
+    damaged = sum(_words(line) != words and row.search(line) is not None for line in lines)
+    return "\n".join(["\t".join(_names(words)), *rows]) + "\n", damaged, len(lines) - len(rows) - damaged
 
 
 def _words(line: str) -> tuple[str, ...]:

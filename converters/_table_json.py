@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ from ._table_sensors import name_columns, read_rows, sensors_among
 from ._table_text import Columns, read_csv
 
 START = re.compile(r'\s*(\{\s*"|\[\s*(\{\s*"|\[|-?\d+(\.\d+)?([eE][-+]?\d+)?\s*,))')
+NEXT = re.compile(rb"\}\s*\{")  # an object behind another, without a comma
 LEAST_ROWS = 5  # objects of an array that is a table
 MOST_NUMBERS = 9  # or words, in an array that belongs to one sample, as a matrix does
+MOST_DAMAGED = 0.1  # share of the lines that a logger cut off or garbled
 LEAST_SHARE = 0.05  # of the rows that have the same fields, if they are of a kind of their own
 FAR = 2**1000  # beyond which an integer is no float64
 Row = dict[str, Any]
@@ -42,7 +45,7 @@ def load_json(path: Path, columns: Columns) -> None:
         DataError: no JSON.
     """
     tables: dict[str, list[Row]] = {}
-    for name, node in _nodes(_decoded(path), ""):
+    for name, node in _nodes(_decoded(path, columns), ""):
         if isinstance(node, list) and isinstance(node[0], dict):
             for kind, rows in _kinds(node).items():
                 tables["/".join(filter(None, (name, kind)))] = rows
@@ -70,17 +73,25 @@ def load_json(path: Path, columns: Columns) -> None:
             columns.take(group, part, name)
 
 
-def _decoded(path: Path) -> Any:
+def _decoded(path: Path, columns: Columns) -> Any:
     raw = read_bytes(path)
     try:
         return msgspec.json.decode(raw)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            return msgspec.json.decode(b"[" + NEXT.sub(b"},{", raw) + b"]")
         lines = [line.strip().rstrip(b",") for line in raw.splitlines() if line.strip()]
-        try:
-            return [msgspec.json.decode(line) for line in lines]
-        except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+        values = []
+        for line in lines:
+            with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+                values.append(msgspec.json.decode(line))
+        damaged = len(lines) - len(values)
+        if len(values) < LEAST_ROWS or damaged > MOST_DAMAGED * len(lines):
             what = f"begins as JSON and cannot be read ({error})"
             raise DataError(what, where=path, expected="one JSON document, or one JSON value a line") from error
+        if damaged:
+            columns.remarks.losses.append(f"{damaged} of {len(lines)} lines are no JSON and are left out")
+        return values
 
 
 def _nodes(node: Any, name: str) -> Iterator[tuple[str, Any]]:

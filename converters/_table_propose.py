@@ -26,6 +26,7 @@ from ._table_units import (
     ACCEL_SI,
     COUNTS_A_DPS,
     GYRO_SI,
+    STANDARD_GRAVITY,
     TIME_NS,
     are_unsigned_counts,
     gravity_units,
@@ -34,6 +35,7 @@ from ._table_units import (
 )
 
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros
+NEAR_FEET = 0.05  # share by which an acceleration may differ from gravity in ft/s^2, as one of 3.3 g in m/s^2 does
 MOST_SHOWN = 12  # triples of columns in a message
 NOTHING: Entries = {}
 
@@ -172,6 +174,8 @@ def _propose_unit(proposal: Proposal, sensor: str, columns: Columns) -> None:
             ]
         if near:
             proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in {' or '.join(near)}")
+        elif abs(level * ACCEL_SI["ft/s^2"] / STANDARD_GRAVITY - 1.0) < NEAR_FEET:
+            proposal.reasons.append(f"the median acceleration is {level:.4g}: gravity in ft/s^2?")
         if raw := raw_counts(columns.side_by_side(proposal.entries[sensor])):
             said = f"±{raw[0]} g ({raw[1]} counts a g)"
             proposal.reasons.append(

@@ -32,7 +32,9 @@ SPACED = r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # UncalGyroXRadPerSec
 ANDROID, ANDROIDS = r"TYPE_[A-Z_]+", {"gyro": "rad/s", "accel": "m/s^2"}  # constants of Android, which states these units
 MOST_NAMES, LEAST_ROWS = 60, 20
 LOOKED_AT = 200_000  # first characters of a text, which show whether its rows name sensors
+EPOCH, ELAPSED = r"(?i)epoch?\b", r"(?i)(.*[ _])?elapsed\b"
 NEAR_ONE = 0.01
+ALWAYS = 0.99  # share of the steps of a time that lead up
 PLACES = 3  # first fields of a row, of which one may name its sensor
 KIND = r"[@$%/]?[A-Za-z][\w/.:-]*|/[\w/.:-]+"  # a word that names the kind of a row, or the device that it is of
 FLAGS = r"(?i)true|false|yes|no|on|off|ok|none|nan|[a-z]"  # words that a device writes of its state
@@ -132,7 +134,8 @@ def _rows_of_kinds(start: str) -> tuple[str, int, dict[str, str]] | None:
     """
     mark, rows = _split_rows(start)
     header = rows.pop(0) if rows and not any(map(is_number, rows[0])) else []
-    for place in range(PLACES):
+    behind = [place for place, name in enumerate(header) if place >= PLACES and re.fullmatch(DEVICE, name.strip())]
+    for place in [*range(PLACES), *behind]:
         long = [row for row in rows if len(row) > place]
         kinds = [row[place].strip().strip('"') for row in long]
         counts = Counter(kinds)
@@ -167,7 +170,8 @@ def _sensor_rows(start: str) -> tuple[str, int, dict[str, str]] | None:
 def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     """Name the time and the axes of a sensor, and the columns of a pose without a header.
 
-    The time is the last column that rises before the axes: the sensor's own stands behind that of the program.
+    The time is the last column that rises before the axes: the sensor's own stands behind that of the program. One that counts
+    from the first row of its file is not that of another sensor's file: MetaWear writes `epoc (ms)` and `elapsed (s)`.
     """
     names = [*table.values]
     if not names:
@@ -179,12 +183,13 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
         pose = POSE if len(names) == len(POSE) and _turns(table, names[-4:]) else POSE[:1]
         new = dict(zip(names, pose, strict=False)) if rises(table.values[names[0]]) else {}
     else:
-        first = next((n for n, name in enumerate(names) if not rises(table.values[name])), len(names))
+        first = next((n for n, name in enumerate(names) if not _ascends(table.values[name])), len(names))
         first = min(first, len(names) - 3)  # in place of a header: where the axes begin
         axes = _axes(names) if has_header else dict(zip(names[first:], "xyz", strict=False))
         if len(axes) < 3:
             return
-        clocks = [name for name in names[: names.index(next(iter(axes)))] if rises(table.values[name])]
+        clocks = [name for name in names[: names.index(next(iter(axes)))] if _ascends(table.values[name])]
+        clocks = [c for c in clocks if re.match(EPOCH, c)] or [c for c in clocks if not re.match(ELAPSED, c)] or clocks
         for clock in clocks[-1:]:
             table.units[clock] = table.units.get(clock) or split_name(clock)[1]
         new = {**axes, **dict.fromkeys(clocks[-1:], "time")}
@@ -195,6 +200,11 @@ def name_columns(table: Columns, sensor: str, unit: str = "") -> None:
     table.values = {order[name]: values for name, values in table.values.items()}
     table.texts = {order[name]: texts for name, texts in table.texts.items()}
     table.units = {order[name]: each for name, each in table.units.items() if name in order}
+
+
+def _ascends(values: np.ndarray) -> bool:
+    """Whether a column is a time, even one that was set back once, and not a component of a vector."""
+    return rises(values) or (len(values) > 1 and float(np.mean(np.diff(values.astype(float)) > 0)) > ALWAYS)
 
 
 def _turns(table: Columns, names: list[str]) -> bool:

@@ -5,7 +5,6 @@ A matrix of three columns `gyro` becomes the columns `gyro[0]`, `gyro[1]`, `gyro
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -20,18 +19,27 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Remarks
 
 from ._table_dates import calendar_times, damaged_times, join_dates
-from ._table_names import TIME_WORDS, distinct_names, split_name, unit_named
-from ._table_numbers import COMMA_NUMBER, DECIMAL_COMMA, decimal_points, is_number, numbers, plain_columns, vector, vectors
+from ._table_header import header_of, note_unused_header
+from ._table_numbers import (
+    COMMA_NUMBER,
+    DECIMAL_COMMA,
+    decimal_points,
+    fields_of,
+    is_number,
+    numbers,
+    plain_columns,
+    vector,
+    vectors,
+)
 
 UTF16 = b"\xff\xfe", b"\xfe\xff"
 WIDEST = 64  # columns of a matrix; wider ones are images
 MAX_LINE = 65_536
 LEAST_NUMBERS = 4  # in a row: a time and a vector
-MOSTLY = 0.8  # share of columns above which a text says nothing of a column
 LEAST_NAMED = 0.1  # share of the rows that have as many fields as the header, if it is theirs
 LOOKED_AT = 200  # first lines, which show whether text is a table
+FIRSTS = 50  # rows that show what a column without a name counts
 COMMENTS = "#", "%", "//"
-UNIT_TEXT = re.compile(r"[\[(]?(\W*|[a-zµ°]+([ /*^²\d-]+[a-z\d²-]*)*|-)[\])]?", re.IGNORECASE)
 STATED_NUMBER = re.compile(  # above a table: `// Update Rate: 100.0Hz`
     r"\W*(?P<name>[a-z][\w ]{,40}?) *[:=,;\t] *(?P<value>\d{1,9}(\.\d{,15})?) *(?P<unit>k?hz|m?s)?\W*", re.IGNORECASE
 )
@@ -130,7 +138,7 @@ def _is_row(line: str, delimiter: str | None, least: int) -> bool:
     """Whether a line has `least` numbers."""
     fields = [] if line.startswith(COMMENTS) else line.split(delimiter)
     if any(mark in line for mark in "[(") and delimiter is not None:
-        (fields,) = _fields([line], delimiter)
+        (fields,) = fields_of([line], delimiter)
         fields = [number for field in fields for number in vector(field) or [field]]
     return sum(map(is_number, fields)) >= least
 
@@ -151,8 +159,9 @@ def read_csv(text: str, columns: Columns, path: Path, least: int = LEAST_NUMBERS
     stated = filter(None, map(STATED_NUMBER.fullmatch, lines[:first]))
     columns.numbers |= {f"{match['name']} {match['unit'] or ''}".strip(): float(match["value"]) for match in stated}
     values, fields, width = _columns_of(lines[first:], lines[:first], delimiter, columns)
-    names, units = _header(lines[:first], delimiter, width)
-    _note_unused_header(lines[:first], delimiter, names, columns)
+    firsts = [row[0].strip().strip('"') for row in fields_of(lines[first : first + FIRSTS], delimiter) if len(row) == width]
+    names, units = header_of(lines[:first], delimiter, width, firsts)
+    note_unused_header(lines[:first], delimiter, names, columns.remarks)
     commas: list[str] = []
     empty: list[str] = []
     if (joined := join_dates(names, fields)) is not None:
@@ -182,26 +191,19 @@ def _columns_of(
     """Numbers of columns that are read as such, texts of the others, and how many columns there are."""
     if (plain := plain_columns(lines, delimiter)) is not None:
         return *plain, len(plain[0])
-    rows = _fields(lines, delimiter)
-    ends = {len(row) for row in _fields(above, delimiter) if row and row[-1].strip()}
+    rows = fields_of(lines, delimiter)
+    ends = {len(row) for row in fields_of(above, delimiter) if row and row[-1].strip()}
     while rows and len(rows[0]) > 1 and len(rows[0]) not in ends and all(row[-1] == "" for row in rows):
         rows = [row[:-1] for row in rows]  # delimiters end each row, in the header perhaps none
-    width = _width(rows, _fields(above, delimiter))
-    whole = [row for row in rows if len(row) == width]
-    if len(whole) < len(rows):
-        columns.remarks.losses.append(f"{len(rows) - len(whole)} rows do not have {width} fields and are left out")
+    width = _width(rows, fields_of(above, delimiter))
+    whole, others = ([row for row in rows if (len(row) == width) is fits] for fits in (True, False))
+    words = sum(row[0].startswith(COMMENTS) or not any(map(is_number, row)) for row in others)
+    if words:
+        columns.remarks.notes.append(f"{words} lines of words between the rows are left out")
+    if len(others) > words:
+        columns.remarks.losses.append(f"{len(others) - words} rows do not have {width} fields and are left out")
     fields = [[text.strip().strip('"') for text in column] for column in zip(*whole, strict=True)]
     return [None] * len(fields), fields, width
-
-
-def _note_unused_header(above: list[str], delimiter: str | None, names: list[str], columns: Columns) -> None:
-    """Say of the line above the rows that it names no column, where it seems to."""
-    fields = _fields(above, delimiter)[-1] if above and delimiter is not None else []
-    if names[:1] == ["column 1"] and 1 < len(fields) < len(names) and not any(map(is_number, fields)):
-        said = f"the line above the rows has {len(fields)} fields and the rows {len(names)}: it names no column"
-        is_header = any(re.fullmatch(TIME_WORDS, name) or unit for name, unit in map(split_name, fields))
-        # else it may be a title
-        (columns.remarks.losses if is_header else columns.remarks.notes).append(f"{said} ({', '.join(fields)[:200]})")
 
 
 def _add_fields(columns: Columns, name: str, texts: list[str], unit: str) -> None:
@@ -237,62 +239,3 @@ def _width(rows: list[list[str]], above: list[list[str]]) -> int:
     counts = Counter(map(len, rows))
     named = {len(row) for row in above} & {width for width, count in counts.items() if count > LEAST_NAMED * len(rows)}
     return max(named or counts, key=lambda width: (counts[width], width), default=0)
-
-
-def _header(lines: list[str], delimiter: str | None, width: int) -> tuple[list[str], dict[str, str]]:
-    """Names of the columns, with the units of a row of their own below them; numbers where there is no header.
-
-    In a row of units texts repeat, and in the row of names above it none does. A row of names that repeat stands below a row of
-    their groups.
-    """
-    rows = [[text.strip().strip('"') for text in row] for row in _fields([line.lstrip("#% ") for line in lines], delimiter)]
-    rows = [row[:width] for row in rows if len(row) == width or (len(row) == width + 1 and row[-1] == "")]
-    rows = [row for row in rows if any(map(unit_named, row)) or max(map(row.count, row)) <= max(MOSTLY * width, 1)]  # CAL, CAL
-    if len(rows) > 2 and _are_units(rows[-2]) and len({*rows[-1]} - {""}) < len(rows[-1]) / 2:
-        rows.pop()  # below the units RaceChrono writes the device of each column
-    units: list[str] = []
-    axes = bool(rows) and {"x", "y", "z"} <= {text.lower() for text in rows[-1]}
-    if (len(rows) > 1 and not axes) and (
-        sum(bool(UNIT_TEXT.fullmatch(text)) for text in rows[-1]) >= width - 1
-        or sum(bool(unit_named(text)) for text in rows[-1]) >= width / 2
-        or (_repeats(rows[-1]) and len({*rows[-2]} - {""}) >= width - 1)
-    ):
-        units = [re.sub(r"^[\[(](.*)[\])]$", r"\1", text) for text in rows.pop()]
-    if not rows:
-        return [f"column {number}" for number in range(1, width + 1)], {}
-    names = rows[-1]
-    if len(rows) > 1 and _repeats(names):
-        joint, below = _below_groups(rows[-2], names, " " if axes else ".")
-        names, units = (names, units) if _repeats(joint) else (joint, units or below)
-    names = distinct_names(names)
-    return names, dict(zip(names, units, strict=True)) if units else {}
-
-
-def _are_units(texts: list[str]) -> bool:
-    """Whether a row states units: what repeats in it is short, and some are known."""
-    known = sum(bool(unit_named(text)) for text in texts)
-    return known > len(texts) / 5 and all(UNIT_TEXT.fullmatch(text) for text in texts)
-
-
-def _below_groups(groups: list[str], names: list[str], between: str) -> tuple[list[str], list[str]]:
-    """Names of columns joined to those of their groups, and the units that stand below a group of one column.
-
-    A group's name stands above the first of its columns, or above each.
-    """
-    group, joint, units = "", list[str](), list[str]()
-    for above, text, following in zip(groups, names, [*groups[1:], "end"], strict=True):
-        group = above or group
-        units.append(text if above and following and unit_named(text) else "")
-        joint.append(group if units[-1] else between.join(filter(None, (group, text))))
-    return joint, units
-
-
-def _repeats(texts: list[str]) -> bool:
-    return len({*texts} - {""}) < len(texts) - texts.count("")
-
-
-def _fields(lines: list[str], delimiter: str | None) -> list[list[str]]:
-    """Fields of each line; in quotes the delimiter is text."""
-    if delimiter is not None and any('"' in line for line in lines[:50]):
-        return list(csv.reader(lines, delimiter=delimiter))
-    return [line.split(delimiter) for line in lines]

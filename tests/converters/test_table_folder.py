@@ -424,3 +424,43 @@ def test_a_table_that_shows_less_is_what_the_others_of_its_columns_are(tmp_path)
         read_back = read(tmp_path / "out" / f"{name}.mcap").imu
         np.testing.assert_array_equal(read_back.accel, imu[:, :3])
         np.testing.assert_array_equal(read_back.gyro, imu[:, 3:])
+
+
+def test_a_time_that_was_set_back_is_no_axis_of_its_sensor(tmp_path):
+    """Without a header the first column that does not rise was the x axis."""
+    times = np.concatenate([T_S[:300], T_S[300:] - 2.5])
+    (tmp_path / "gyro.csv").write_text(rows(times, GYRO))
+    (tmp_path / "acc.csv").write_text(rows(times, ACCEL))
+    (sequence,) = table.sequences(tmp_path)
+    imu = table.read_sequence(sequence, mapping={"gyro_unit": "rad/s"}).imus["/imu0"]
+    np.testing.assert_allclose(imu.accel[:300], ACCEL[:300])
+
+
+@pytest.mark.parametrize("later_s", [0.0, 1000.0])
+def test_pairs_of_tables_from_other_times_are_recordings_of_their_own(tmp_path, later_s):
+    """Of one time they are IMUs of one recording: a left foot and a right one."""
+    for name, late in (("walk_1_20210713", 0.0), ("walk_2_20210716", later_s)):
+        (tmp_path / f"{name}_GYR.csv").write_text("time [s],x [rad/s],y [rad/s],z [rad/s]\n" + rows(T_S + late, GYRO))
+        (tmp_path / f"{name}_ACC.csv").write_text("time [s],x [m/s^2],y [m/s^2],z [m/s^2]\n" + rows(T_S + late, ACCEL))
+    logs = [table.read_sequence(sequence) for sequence in table.sequences(tmp_path)]
+    assert [len(log.imus) for log in logs] == ([1, 1] if later_s else [2])
+    assert all(len(imu) == COUNT for log in logs for imu in log.imus.values())
+
+
+def test_sensors_of_two_files_share_the_time_since_1970_and_not_the_one_since_their_first_rows(tmp_path):
+    """As MetaWear writes them, whose gyro begins before its accelerometer."""
+    for name, unit, late, values in (("GYR", "rad/s", 0.0, GYRO), ("ACC", "m/s^2", 0.035, ACCEL)):
+        t_ms = np.rint(1e3 * (T_S + late)).astype(int)
+        head = f"epoc (ms),timestamp (-0400),elapsed (s),x-axis ({unit}),y-axis ({unit}),z-axis ({unit})\n"
+        lines = [
+            f"{t},2020-09-13T08.26.{(t // 1000) % 60:02d}.{t % 1000:03d},{(t - t_ms[0]) / 1e3:.3f}," + ",".join(map(repr, row))
+            for t, row in zip(t_ms.tolist(), values.tolist(), strict=True)
+        ]
+        (tmp_path / f"walk_{name}.csv").write_text(head + "\n".join(lines) + "\n")
+    imu = table.read_sequence(table.sequences(tmp_path)[0]).imus["/imu0"]
+    assert imu.t_ns[0] == 1_600_000_000_040_000_000
+    np.testing.assert_allclose(
+        imu.accel,
+        9.80665 * np.stack([np.sin(turn := np.interp(imu.t_ns * 1e-9, T_S + 0.035, TURN)), 0.0 * turn, np.cos(turn)], axis=1),
+        atol=1e-3,
+    )

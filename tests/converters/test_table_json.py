@@ -149,3 +149,19 @@ def test_vectors_in_texts_are_vectors(tmp_path, form, printed):
     imu = read(tmp_path / "log.json", text).imus["/imu0"]
     np.testing.assert_allclose(imu.gyro, GYRO, atol=1e-8)
     np.testing.assert_allclose(imu.accel, ACCEL)
+
+
+@pytest.mark.parametrize("devices", [(1, 2), ("C4:01", "C4:02")])
+def test_lines_of_several_devices_are_several_imus(tmp_path, devices):
+    """A line that the logger cut off hides none."""
+    lines = [json.dumps({"device_id": device, **row}) for row in FLAT for device in devices]
+    log = read(tmp_path / "walk.jsonl", "\n".join([*lines, '{"device_id": 1, "t_']))
+    assert [len(imu) for imu in log.imus.values()] == [COUNT, COUNT]
+    assert all(np.array_equal(imu.gyro, GYRO) for imu in log.imus.values())
+    assert log.remarks.losses == [f"1 of {len(lines) + 1} lines are no JSON and are left out"]
+
+
+@pytest.mark.parametrize("indent", [None, 2])
+def test_objects_behind_one_another_are_rows(tmp_path, indent):
+    imu = read(tmp_path / "stream.txt", "".join(json.dumps(row, indent=indent) for row in FLAT)).imus["/imu0"]
+    assert np.array_equal(imu.gyro, GYRO)

@@ -366,3 +366,21 @@ def test_a_folder_may_hold_packed_tables(tmp_path):
     (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(imu_text().encode()))
     (tmp_path / "groundtruth.txt.gz").write_bytes(gzip.compress(rows(T_S, P_M, XYZW, mark=" ").encode()))
     np.testing.assert_allclose(read(tmp_path).poses["/ground_truth/pose"].p_wb, P_M, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ref.csv", "reference.csv", "robot_reference.csv"])
+def test_poses_in_a_file_named_as_the_reference_are_true(tmp_path, name):
+    (tmp_path / "imu.csv").write_text(imu_text())
+    (tmp_path / name).write_text("time [s],px,py,pz,qx,qy,qz,qw\n" + rows(T_S, P_M, XYZW))
+    assert read(tmp_path).kinds == {"/ground_truth/pose": "truth"}
+
+
+@pytest.mark.parametrize("first", ["IMU", "truth"])
+def test_true_poses_in_the_imus_table_may_have_a_time_of_their_own(tmp_path, first):
+    imu, true = imu_text().splitlines(), ["truth_t [s],truth_px,truth_py,truth_pz,truth_qx,truth_qy,truth_qz,truth_qw"]
+    true += rows(T_S + 0.023, P_M, XYZW).splitlines()
+    pairs = zip(imu, true, strict=True) if first == "IMU" else zip(true, imu, strict=True)
+    (tmp_path / "log.csv").write_text("\n".join(map(",".join, pairs)) + "\n")
+    log = read(tmp_path)
+    assert np.array_equal(log.imus["/imu0"].t_ns, 10_000_000 * np.arange(COUNT))
+    np.testing.assert_allclose(log.poses["/ground_truth/pose"].t_ns, 1e9 * (T_S + 0.023), atol=1e3)

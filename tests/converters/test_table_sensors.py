@@ -83,6 +83,8 @@ def test_rows_of_several_devices_are_several_imus(tmp_path):
     imus = read(tmp_path / "two.csv", lines).imus
     assert {topic: len(imu) for topic, imu in imus.items()} == {"/left_foot/imu": COUNT, "/right_foot/imu": COUNT}
     assert imus["/right_foot/imu"].t_ns[0] == 3_000_000
+    last = [",".join([first, *rest, device]) for first, device, *rest in (line.split(",") for line in lines)]
+    assert read(tmp_path / "last.csv", last).imus.keys() == imus.keys()
     numbered = [line.replace("left_foot", "1").replace("right_foot", "2") for line in lines]
     assert [len(imu) for imu in read(tmp_path / "two.csv", numbered).imus.values()] == [COUNT, COUNT]
 

@@ -436,3 +436,22 @@ def test_the_damaged_field_of_a_column_of_times_is_named(tmp_path, form, damaged
     (tmp_path / "log.csv").write_text("\n".join(["time,gx,gy,gz,ax,ay,az", *lines]) + "\n")
     with pytest.raises(ConfigError, match=rf"time is left out: 1 of its fields are no .* in row {row + 1}: {texts[row]!r}"):
         read(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("names", [("system_time_ms", "sensor_timestamp_ns"), ("timestamp", "event_timestamp")])
+def test_a_sensors_own_time_counts_and_not_the_uneven_one_of_the_program(tmp_path, names):
+    program = 1_700_000_000_000 + np.rint(1e3 * T_S).astype(int) + np.abs(np.rint(RNG.normal(0.0, 1.5, COUNT))).astype(int)
+    own = 50_000_000_000_000 + NEXT_NS * np.arange(COUNT)
+    axes = [*(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    log = read(write_csv(tmp_path / "phone.csv", [*names, *axes], [program, own, *GYRO.T, *ACCEL.T]))
+    assert np.array_equal(log.imus["/imu0"].t_ns, own)
+    assert any(f"{names[1]!r} is the sensor's own time and steadier" in note for note in log.remarks.notes)
+
+
+def test_a_time_in_the_last_column_is_one_by_its_century(tmp_path):
+    path = write_csv(
+        tmp_path / "imu.txt", ["1"] * 9, [GYRO[:, 0] * 0.0, GYRO[:, 0] * 0.0, *GYRO.T, *ACCEL.T, 1_700_000_000.0 + T_S]
+    )
+    path.write_text(path.read_text().split("\n", 1)[1])
+    with pytest.raises(ConfigError, match="'column 9' alone rises as a time since 1970 does: it counts as the time"):
+        read(path)

@@ -268,7 +268,8 @@ def test_rows_that_name_their_numbers(tmp_path, row):
     np.testing.assert_allclose(imu.gyro, np.deg2rad(gyro), rtol=1e-9)
     np.testing.assert_allclose(imu.accel, 9.80665 * ACCEL_G, rtol=1e-9)
     assert np.array_equal(np.diff(imu.t_ns), np.full(COUNT - 1, 10_000_000))
-    assert "1 lines of other words are left out" in log.remarks.losses
+    assert "1 lines of other words are left out" in log.remarks.notes
+    assert not log.remarks.losses
 
 
 def test_rows_that_name_padded_numbers_between_lines_of_the_state(tmp_path):
@@ -278,7 +279,8 @@ def test_rows_that_name_padded_numbers_between_lines_of_the_state(tmp_path):
     (tmp_path / "serial.log").write_text("ready\n" + "".join(rows))
     log = read(tmp_path / "serial.log")
     np.testing.assert_allclose(log.imus["/imu0"].gyro, np.deg2rad(gyro), rtol=1e-9)
-    assert log.remarks.losses == [f"{COUNT + 1} lines of other words are left out"]
+    assert f"{COUNT + 1} lines of other words are left out" in log.remarks.notes
+    assert not log.remarks.losses
 
 
 def test_a_header_that_is_shorter_than_its_rows_is_named(tmp_path):
@@ -289,7 +291,7 @@ def test_a_header_that_is_shorter_than_its_rows_is_named(tmp_path):
 
 @pytest.mark.parametrize("row", ["a: 1 b: - 2 c: 3 d: 4 e: 5", "1.5,2.5,3.5,x: left,4.5", "level: 1, 2"])
 def test_other_rows_name_no_numbers(row):
-    assert as_table("\n".join([row] * 20)) == ("", 0)
+    assert as_table("\n".join([row] * 20)) == ("", 0, 0)
 
 
 @pytest.mark.parametrize("name", ["mag_y", "temperature"])
@@ -381,7 +383,7 @@ def test_tables_of_a_folder_may_name_their_sensor_in_each_row(tmp_path):
 )
 def test_long_lines_are_no_rows_that_name_their_numbers(text):
     """The search for labels costs the square of their length: it would take hours."""
-    assert as_table(text) == ("", 0)
+    assert as_table(text) == ("", 0, 0)
 
 
 def test_numbers_in_a_header_between_tabs_are_no_fields(tmp_path):
@@ -474,3 +476,85 @@ def test_objects_without_a_number_are_no_table(tmp_path):
     words = '{"first": [' + ",".join(['{"name": "left"}'] * 9) + '], "second": [' + ",".join(['{"name": "right"}'] * 9) + "]}"
     (tmp_path / "words.json").write_text(words)
     assert table.sequences(tmp_path) == []
+
+
+def test_a_row_that_was_cut_is_a_loss_and_a_line_of_the_state_is_none(tmp_path):
+    gyro = np.round(COUNTS * 0.07, 2).tolist()
+    lines = [
+        "t={} ax={} ay={} az={} gx={} gy={} gz={}".format(10 * n, *a, *g)
+        for n, (a, g) in enumerate(zip(ACCEL_G.tolist(), gyro, strict=True))
+    ]
+    lines[50:50] = ["OK", "# battery 87", "t=505 ax=0.1"]
+    (tmp_path / "serial.log").write_text("\n".join(lines) + "\n")
+    log = read(tmp_path / "serial.log")
+    assert len(log.imus["/imu0"]) == COUNT
+    assert "2 lines of other words are left out" in log.remarks.notes
+    assert log.remarks.losses == ["1 lines with a part of these names are left out"]
+
+
+def test_lines_of_words_between_the_rows_of_a_table_are_no_loss(tmp_path):
+    path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T])
+    lines = path.read_text().splitlines()
+    lines[60:60] = ["sensor ready", "# battery, 12"]
+    path.write_text("\n".join(lines) + "\n")
+    log = read(path)
+    assert len(log.imus["/imu0"]) == COUNT
+    assert not log.remarks.losses
+    assert "2 lines of words between the rows are left out" in log.remarks.notes
+    lines[60] = "0.595,0.1,"
+    path.write_text("\n".join(lines) + "\n")
+    assert read(path).remarks.losses == ["1 rows do not have 7 fields and are left out"]
+
+
+@pytest.mark.parametrize("first", ["rows", "times"])
+def test_a_header_without_a_name_for_the_first_column(tmp_path, first):
+    """R's write.table gives none to the numbers of rows."""
+    columns, names = [*ACCEL_G.T, *(COUNTS * 0.07).round(2).T, np.full(COUNT, 21.5)], [*NAMES[1:], "temperature"]
+    if first == "rows":
+        columns, names = [np.arange(1, COUNT + 1), T_S, *columns], ["t", *names]
+    else:
+        columns = [T_S, *columns]
+    log = read(write_csv(tmp_path / "imu.csv", names, columns))
+    np.testing.assert_allclose(log.imus["/imu0"].accel, 9.80665 * ACCEL_G)
+    assert np.array_equal(log.imus["/imu0"].t_ns, np.rint(T_S * 1e9))
+    assert "/temperature" in log.scalars
+
+
+def test_rows_that_lack_numbers_hide_no_header(tmp_path):
+    path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T])
+    header, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([header, "-0.02,0.1,,,,,0.07", "-0.01,0.1,0.2,,,,", *lines]) + "\n")
+    assert len(read(path).imus["/imu0"]) == COUNT
+
+
+def test_gravity_in_feet_is_proposed_and_asked(tmp_path):
+    path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *(32.17405 * ACCEL_G).T, *(COUNTS * 0.07).round(2).T])
+    with pytest.raises(ConfigError, match=r"the median acceleration is 32.03: gravity in ft/s\^2\?"):
+        read(path)
+    log = table.read_sequence(table.sequences(path)[0], mapping={"accel_unit": "ft/s^2"})
+    np.testing.assert_allclose(log.imus["/imu0"].accel, 9.80665 * ACCEL_G, rtol=1e-5)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_messages_that_ros_printed_are_rows(tmp_path, version):
+    """`rostopic echo /imu > imu.txt`, and a last message that was cut."""
+    sec, nanosec, space = ("secs", "nsecs", " ") if version == 1 else ("sec", "nanosec", "")
+    covariance = "[0.1, 0.0, 0.1]" if version == 1 else "\n- 0.1\n- 0.0\n- 0.1"
+    axes = f"{space}\n  x: {{}}\n  y: {{}}\n  z: {{}}\n"
+    form = f"header:{space}\n  stamp:{space}\n    {sec}: 1700000000\n    {nanosec}: {{:9d}}\n  frame_id: imu\n"
+    form += f"angular_velocity:{axes}angular_velocity_covariance: {covariance}\nlinear_acceleration:{axes}---\n"
+    gyro, accel = COUNTS * 0.001, 9.80665 * ACCEL_G
+    parts = [form.format(2_000_000 * n, *g, *a) for n, (g, a) in enumerate(zip(gyro.tolist(), accel.tolist(), strict=True))]
+    (tmp_path / "imu.txt").write_text("".join(parts) + parts[0][:150])
+    log = read(tmp_path / "imu.txt")
+    imu = log.imus["/imu0"]
+    np.testing.assert_allclose(np.hstack([imu.gyro, imu.accel]), np.hstack([gyro, accel]))
+    assert np.array_equal(imu.t_ns, 1_700_000_000 * 10**9 + 2_000_000 * np.arange(COUNT))
+    assert log.remarks.losses == ["1 messages without all fields of the first are left out"]
+
+
+def test_commas_behind_a_header_and_its_rows_hide_no_name(tmp_path):
+    """A spreadsheet writes them for columns that were emptied."""
+    path = write_csv(tmp_path / "imu.csv", NAMES, [T_S, *ACCEL_G.T, *(COUNTS * 0.07).round(2).T])
+    path.write_text("".join(f"{line},,,\n" for line in path.read_text().splitlines()))
+    assert len(read(path).imus["/imu0"]) == COUNT

@@ -1,0 +1,92 @@
+"""Names of columns that are poses: quaternions, matrices, angles, positions."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+from ._table_geodetic import LOCAL
+from ._table_names import DIGITS, split_name
+from ._table_text import Columns
+
+FRAMES = r"(_[a-z]{2})?"  # of a rotation or a position, as in q_wb, R_wb, p_wb
+ROTATION = rf"(q|quat|quaternion|orientation|rotation|attitude|ori|rot){FRAMES}_?"
+QUATERNION = rf"{ROTATION}(?P<axis>[wxyz])"
+QUATERNION_ARRAY = rf"(.*_)?{ROTATION}(?P<axis>[0-3])"
+COMMANDED = r"(.*_)?(des|desired|sp|set_?point|cmd|command|target|ref|reference|demand|err|error)_"
+ANGLES = (
+    (rf"(?!{COMMANDED})(.*_)?(?P<axis>roll|pitch|yaw)(_?angle)?(_?(deg|rad)[a-z]*)?", ("roll", "pitch", "yaw")),
+    (r"(.*_)?(euler|rpy|angles?)_?(angles?_?)?(?P<axis>[xyz012])(_?(deg|rad)[a-z]*)?", "xyz"),
+)
+GREEK = {"phi": "roll", "theta": "pitch", "psi": "yaw"}
+HEADING = r"((compass|true|magnetic)_)?(heading|azimuth)"  # a yaw
+POSITION = r"((t|p|pos|position|translation|trans|[pr]_[a-z]{2}(_[a-z]{1,2})?)_?)?(?P<axis>[xyz012])"
+POSITIONS: tuple[tuple[str, Sequence[str]], ...] = (
+    (POSITION, "xyz"),
+    (r"(p(os(ition)?)?_?)?(?P<axis>east|north|up)", ("east", "north", "up")),
+    (rf"(p(os(ition)?)?_?|{LOCAL})?(?P<axis>north|east|down)", ("north", "east", "down")),
+    (r"p_?(?P<axis>[ned])", "ned"),
+)
+NED = POSITIONS[2:]
+MATRIX = rf"(.*_)?(mat|matrix|matrices|rots?|rotations?|rotmats?|dcms?|r|c){FRAMES}_?(?P<axis>[0-3][0-3]|\d)"  # or Rot[8]
+OWNED = (  # columns of a body's poses: ABBquaternion[0], robot_qw, tool_x
+    rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+?)_?"
+    r"(?P<leaf>(quat|quaternion|orientation|rotation|attitude|pos|position|translation)_?[wxyz0-3])",
+    rf"(?!{COMMANDED})(?P<body>[a-z0-9_]+)_(?P<leaf>((q|t|p|ori|rot|trans)_?)?[wxyz0-3])",
+)
+INDICES = [[f"{row + first}{column + first}" for row in range(3) for column in range(3)] for first in (0, 1)]
+NUMBERS = "012345678", "123456789"
+
+
+def has_poses(columns: Columns) -> bool:
+    """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
+    leaves = {split_name(column)[0]: column for column in columns.values}
+    turns = (
+        axes_of(QUATERNION, leaves, "wxyz")
+        or axes_of(QUATERNION_ARRAY, leaves, "0123")
+        or matrix_of(leaves)
+        or angles_of(leaves)
+    )
+    return bool(turns and position_of(leaves))
+
+
+def bodies_of(leaves: dict[str, str]) -> list[dict[str, str]]:
+    """Columns of each body with a position and quaternions in its own name, without it."""
+    bodies: dict[str, dict[str, str]] = {}
+    for leaf, column in leaves.items():
+        if match := next(filter(None, (re.fullmatch(form, leaf) for form in OWNED)), None):
+            bodies.setdefault(match["body"], {})[match["leaf"]] = column
+    return [body for body in bodies.values() if len(body) >= 7 and position_of(body)]
+
+
+def matrix_of(leaves: dict[str, str], forms: Iterable[Sequence[str]] = (*INDICES, *NUMBERS)) -> list[str]:
+    """Columns of a matrix, row by row, whose indices or numbers count from 0 or from 1."""
+    found = {re.sub(r"_(?=\d$)", "", leaf): column for leaf, column in leaves.items()}
+    return next(filter(None, (axes_of(MATRIX, found, axes) for axes in forms)), [])
+
+
+def position_of(leaves: dict[str, str], forms: Sequence[tuple[str, Sequence[str]]] = POSITIONS) -> list[str]:
+    """Columns x, y, z of a position, or east, north, up, or north, east, down."""
+    return next(filter(None, (axes_of(pattern, leaves, axes) for pattern, axes in forms)), [])
+
+
+def angles_of(leaves: dict[str, str]) -> list[list[str]]:
+    """Columns of each roll, pitch and yaw."""
+    yaws = {re.sub(HEADING, "yaw", leaf): column for leaf, column in leaves.items()}
+    yaws |= {re.sub(rf"(^|.*_){letter}", rf"\1{axis}", leaf): c for leaf, c in leaves.items() for letter, axis in GREEK.items()}
+    return [three for pattern, axes in ANGLES for three in _every(pattern, yaws | leaves, axes)]
+
+
+def axes_of(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[str]:
+    """Columns of all axes of the first name that has them; `leaves` are columns by their names."""
+    return next(iter(_every(pattern, leaves, axes)), [])
+
+
+def _every(pattern: str, leaves: dict[str, str], axes: Sequence[str]) -> list[list[str]]:
+    """Columns of all axes of each name that has them."""
+    found: dict[str, dict[str, str]] = {}
+    for leaf, column in leaves.items():
+        if match := re.fullmatch(pattern, leaf):
+            axis = match["axis"].translate(DIGITS) if "x" in axes else match["axis"]
+            found.setdefault(leaf[: match.start("axis")], {})[axis] = column
+    return [[columns[axis] for axis in axes] for columns in found.values() if {*columns} == {*axes}]
