@@ -147,6 +147,9 @@ def diagnose(
     refuse(folder, overwrite=overwrite)
     given = local(sim, "close") if close and sim is not None else None
     was = None if metric is None or given is None else figure(metric, given)
+    if find_spec("matplotlib") is not None:
+        import matplotlib.figure  # noqa: F401  once, and not in each of the processes that draw
+
     drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
     diagnosis = search()
     if tell is not None:
@@ -238,14 +241,14 @@ def _make(
             remarks.append(f"{LOG} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
             report.end()
             report = Forked(partial(_report, d, None))
-    if seen:
-        from imutool.viewing.html.report import write_page
-
-        write_page(seen, folder / LOG, drawn=(drawn.ready() if drawn is not None else None) or {})
     if VIEW not in missing:
         from imutool.viewing.rerun.diagnosis import save
 
         save(d, folder / VIEW)
+    if seen:
+        from imutool.viewing.html.report import write_page
+
+        write_page(seen, folder / LOG, drawn=(drawn.ready() if drawn is not None else None) or {})
     if REPORT not in missing:
         (folder / REPORT).write_text(report.result(), encoding="utf-8")
     for name in (LOG, REPORT, VIEW):
