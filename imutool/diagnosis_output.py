@@ -147,9 +147,6 @@ def diagnose(
     refuse(folder, overwrite=overwrite)
     given = local(sim, "close") if close and sim is not None else None
     was = None if metric is None or given is None else figure(metric, given)
-    if find_spec("matplotlib") is not None:
-        import matplotlib.figure  # noqa: F401  once, and not in each of the processes that draw
-
     drawn = Forked(partial(_drawings, look), idle=True)  # of the logs, while they are diagnosed, where time is left
     diagnosis = search()
     if tell is not None:
