@@ -238,14 +238,14 @@ def _make(
             remarks.append(f"{LOG} is left out: {error}")  # for a picture of the logs no diagnosis is thrown away
             report.end()
             report = Forked(partial(_report, d, None))
-    if seen:
-        from imutool.viewing.html.report import write_page
-
-        write_page(seen, folder / LOG, drawn=(drawn.ready() if drawn is not None else None) or {})
     if VIEW not in missing:
         from imutool.viewing.rerun.diagnosis import save
 
         save(d, folder / VIEW)
+    if seen:
+        from imutool.viewing.html.report import write_page
+
+        write_page(seen, folder / LOG, drawn=(drawn.ready() if drawn is not None else None) or {})
     if REPORT not in missing:
         (folder / REPORT).write_text(report.result(), encoding="utf-8")
     for name in (LOG, REPORT, VIEW):

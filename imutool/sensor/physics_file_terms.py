@@ -106,7 +106,7 @@ def driven(signal: Sensor, channel: str) -> Effect:
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         c = _channel(samples, channel)
         delayed = np.interp(samples.stamp_s - theta[3], samples.stamp_s, c)
-        return samples.with_added(signal, np.outer(delayed - c.mean(), theta[:3]))
+        return samples.with_added(signal, np.outer(theta[:3], delayed - c.mean()).T)
 
     gains = (Parameter(axis, f"{UNITS[signal]} per unit of {channel}", 1.0) for axis in AXES)
     parameters = (*gains, Parameter("lag", "s", 0.2))
@@ -133,7 +133,7 @@ def product(label: str, signal: Sensor, text: str, value: Sequence[float]) -> Ef
         return None
 
     def forward(samples: SensorSamples, _: Theta) -> SensorSamples:
-        return samples.with_added(signal, np.outer(function(samples), value))
+        return samples.with_added(signal, np.outer(value, function(samples)).T)
 
     return Effect(f"{UNKNOWN}[{label}]", Stage.SENSOR, (signal,), f"{signal} += c {text}", (), "it varies", forward)
 

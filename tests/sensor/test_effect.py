@@ -141,6 +141,16 @@ def test_it_acts_keeps_shapes_and_leaves_what_it_is_given_alone(one: Effect) -> 
     assert sensors == set(one.sensors) or one.stage == Stage.CLOCK
 
 
+@pytest.mark.parametrize("name", ["gravity", "earth_rotation", "gyro_bias_step", "accel_bias_step"])
+def test_columns_that_lie_in_one_piece_of_memory_stay_so(name: str) -> None:
+    """Else each effect behind it takes several times as long."""
+    felt = lively()
+    felt = replace(felt, gyro=np.asfortranarray(felt.gyro), accel=np.asfortranarray(felt.accel))
+    after = only(name).forward(ideal(only(name), felt), some_theta(only(name)))
+    assert after.gyro.flags.f_contiguous
+    assert after.accel.flags.f_contiguous
+
+
 @pytest.mark.parametrize("one", [p for p in ALL if p.values[0].linear])
 def test_a_linear_one_adds_in_proportion(one: Effect) -> None:
     felt = lively()

@@ -28,7 +28,7 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     latitude, heading = theta.tolist()
     if math.isinf(latitude):
         return motion
-    turning = np.einsum("nji,j->in", attitude_of(motion, "earth_rotation"), omega_w(latitude, heading)).T
+    turning = np.einsum("nji,j->in", attitude_of(motion, "earth_rotation"), omega_w(latitude, heading), order="C").T
     return replace(motion, gyro=motion.gyro + turning)
 
 

@@ -20,7 +20,7 @@ def _forward(motion: IdealMotion, theta: Theta) -> IdealMotion:
     dg, tilt_x, tilt_y = theta.tolist()
     up = Rotation.from_rotvec([tilt_x, tilt_y, 0.0]).apply([0.0, 0.0, 1.0])
     more_w = (GRAVITY_M_S2 + dg) * up - np.array([0.0, 0.0, GRAVITY_M_S2])
-    return replace(motion, accel=motion.accel + np.einsum("nji,j->in", attitude_of(motion, "gravity"), more_w).T)
+    return replace(motion, accel=motion.accel + np.einsum("nji,j->in", attitude_of(motion, "gravity"), more_w, order="C").T)
 
 
 EFFECT = Effect(

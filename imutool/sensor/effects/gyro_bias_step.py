@@ -23,7 +23,7 @@ def bias_step(sensor: Sensor, unit: str, plausible: float) -> Effect:
     """Step of either sensor: A, then the time of the step (s from the log's start)."""
 
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
-        return samples.with_added(sensor, np.outer(samples.stamp_s >= theta[3], theta[:3]))
+        return samples.with_added(sensor, np.outer(theta[:3], samples.stamp_s >= theta[3]).T)
 
     def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
         error = residual(motion, samples)[0 if sensor == "gyro" else 1]
