@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -73,9 +72,6 @@ def diagnose(
     from imutool.processes.forked import forking
 
     settings = load_settings(DiagnoseSettings, config, set_ or ())
-    if folder is not None and find_spec("matplotlib") is not None:
-        import matplotlib.figure  # noqa: F401  once, and not in each of the processes that draw
-
     with forking(), common.progress("Diagnosing") as tell:
         diagnosis, remarks = diagnosis_output.diagnose(
             reals,
