@@ -75,6 +75,12 @@ class TableMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     pose_kind: str = "truth"
     pose_world: str = ""  # "ned": poses in north, east, down, which become east, north, up
 
+    def described(self) -> dict[str, str]:
+        """Entries that say something; columns as `a, b, c`."""
+        blank = msgspec.structs.asdict(TableMap())
+        said = {key: value for key, value in msgspec.structs.asdict(self).items() if value != blank[key] or key == "topic"}
+        return {key: ", ".join(map(str, value)) if isinstance(value, list) else str(value) for key, value in said.items()}
+
 
 def read_map(mapping: Path | Mapping[str, Any]) -> Entries:
     """Entries that a TOML file or a program states; a text `a,b,c` is a list, too.

@@ -19,7 +19,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Scalars
-from imutool.recording.joined_imu import in_order, joined
+from imutool.recording.joined_imu import in_order, joined, lost_to_set_back
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
@@ -252,6 +252,7 @@ def _vector(
         raise DataError("has no three columns x, y, z", where=f"{where}/{path}", expected=", ".join(columns))
     kept = in_order(t_ns, np.stack([found[0] for found in axes], axis=1), path)
     remarks.notes.extend(kept.notes)
+    remarks.losses.extend(lost_to_set_back(t_ns, path))
     return kept.t_ns, kept.values
 
 

@@ -17,7 +17,7 @@ from imutool.array_types import Float64, Int64
 from imutool.errors import ConfigError, DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses, Scalars, unit_quaternions
-from imutool.recording.joined_imu import in_order, joined
+from imutool.recording.joined_imu import in_order, joined, lost_to_set_back
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
@@ -110,7 +110,7 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
         scalars=scalars,
         metadata={
             "imutool": {"format": "table", "sequence": sequence.name},
-            **{f"imutool/map{each.topic if len(tables) > 1 else ''}": _described(each) for each in tables},
+            **{f"imutool/map{each.topic if len(tables) > 1 else ''}": each.described() for each in tables},
             **({"imutool/constants": constants} if constants else {}),
         },
         remarks=remarks,
@@ -212,15 +212,9 @@ def _imu(columns: Columns, table: TableMap, place: Path) -> Imu:
             raise ConfigError(f"the {label} has {len(values)} rows and its time {len(t_ns)}", where=place, expected="as many")
     imu, notes = joined(gyro_ns, gyro, accel_ns, accel, table.topic)
     columns.remarks.notes.extend(notes)
+    columns.remarks.losses.extend(lost_to_set_back(gyro_ns, table.topic))
     columns.remarks.doubt([f"{table.topic}: {each}" for each in unit_doubts(imu, table.gyro_unit, table.accel_unit)])
     return imu
-
-
-def _described(table: TableMap) -> dict[str, str]:
-    """Entries of a map that say something; columns as `a, b, c`."""
-    stated, blank = msgspec.structs.asdict(table), msgspec.structs.asdict(TableMap())
-    said = {key: value for key, value in stated.items() if value != blank[key] or key == "topic"}
-    return {key: ", ".join(map(str, value)) if isinstance(value, list) else str(value) for key, value in said.items()}
 
 
 def _truth(columns: Columns, table: TableMap, path: Path, where: Path, remarks: Remarks) -> dict[str, Poses]:

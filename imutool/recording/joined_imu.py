@@ -188,6 +188,7 @@ SHOWN_STDS = 3.0  # standard deviations from which on a delay is told from none
 LEAST_COMMON = 0.9  # share of the stamps that sensors on one clock have in common
 LONGEST_ALONE_S = 1.0  # of the accelerometer before and after the gyro, as sensors that start one by one have
 MAX_GAP_PERIODS = 4.0  # of the accelerometer, across which nothing is interpolated
+MOST_SET_BACK = 0.01  # share of samples that a clock which was set back may cost; of more they are several recordings
 
 
 @dataclass
@@ -213,6 +214,15 @@ def in_order(t_ns: Int64[np.ndarray, " n"], values: Float64[np.ndarray, "n k"], 
         notes.append(f"{name}: the clock was set back by {sum(back_s):.6g} s: that much of the motion is missing there")
     keep = finite & fresh
     return Cleaned(t_ns[keep], values[keep], notes)
+
+
+def lost_to_set_back(t_ns: Int64[np.ndarray, " n"], name: str) -> list[str]:
+    """Sentence on samples that have the times of others before them, where these are many."""
+    lost = int((t_ns[1:] <= np.maximum.accumulate(t_ns)[:-1]).sum())
+    if lost <= MOST_SET_BACK * len(t_ns) or all(step_s > 0.0 for _, step_s in clock_jumps(t_ns)):
+        return []
+    what = f"{name}: {lost} of {len(t_ns)} samples are left out, as their time goes back to that of samples before them"
+    return [f"{what}: of several recordings give each a table of its own"]
 
 
 def joined(

@@ -48,6 +48,16 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
 
 
+@pytest.mark.parametrize(("back_s", "is_lost"), [(T_S[COUNT // 2], True), (2.0, False)])
+def test_recordings_one_behind_another_are_a_loss_and_a_clock_that_was_set_a_little_a_note(tmp_path, back_s, is_lost):
+    times = T_S.copy()
+    times[COUNT // 2 if is_lost else -20 :] -= back_s
+    names = ["time [s]", *(f"gyro_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz")]
+    remarks = read(write_csv(tmp_path / "log.csv", names, [times, *GYRO.T, *ACCEL.T])).remarks
+    assert any("the clock was set back" in note for note in remarks.notes)
+    assert any("give each a table of its own" in loss for loss in remarks.losses) == is_lost
+
+
 @pytest.mark.parametrize(
     ("start", "step"),
     [("0", "0.0040000000"), ("1700000000.123456789", "0.004"), ("1700000000123456789", "4000000"), ("7", "4")],
