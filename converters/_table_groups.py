@@ -40,7 +40,8 @@ def imus_apart(columns: Columns) -> dict[str, Columns]:
         beside = {c for c in columns.values if group_of(c) in others and not is_time(c)}  # an orientation of theirs
         taken = set().union(*of.values(), beside) - own
         values = {c: v for c, v in columns.values.items() if c not in taken}
-        apart[f"/{owner}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
+        named = owner if owner[:1].isalpha() else f"imu_{owner}"  # a part of a ROS topic begins with a letter
+        apart[f"/{named}/imu" if owner else IMU_TOPIC] = replace(columns, values=values)
     return apart
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,7 @@ def test_lines_of_several_devices_are_several_imus(tmp_path, devices):
     lines = [json.dumps({"device_id": device, **row}) for row in FLAT for device in devices]
     log = read(tmp_path / "walk.jsonl", "\n".join([*lines, '{"device_id": 1, "t_']))
     assert [len(imu) for imu in log.imus.values()] == [COUNT, COUNT]
+    assert all(re.fullmatch(r"(/[a-z]\w*)+", topic) for topic in log.imus), "names that ROS allows"
     assert all(np.array_equal(imu.gyro, GYRO) for imu in log.imus.values())
     assert log.remarks.losses == [f"1 of {len(lines) + 1} lines are no JSON and are left out"]
 
