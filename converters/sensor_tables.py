@@ -11,7 +11,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -19,7 +19,7 @@ import numpy as np
 from imutool.array_types import Float64, Int64
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Scalars
-from imutool.recording.joined_imu import in_order, joined, lost_to_set_back
+from imutool.recording.joined_imu import in_order, joined, lost_to_set_back, unit_by_gravity
 from imutool.recording.message_log import MessageLog, Remarks
 
 from . import Sequence
@@ -29,7 +29,7 @@ from ._source import each_path, find_folders, name, named_folder, with_suffix
 from ._table_names import split_name
 from ._table_text import Columns, read_csv
 from ._table_times import begun_at_zero
-from ._table_units import GRAVITY_BAND, STANDARD_GRAVITY
+from ._table_units import GRAVITY_BAND, GYRO_SI, STANDARD_GRAVITY, unit_doubts
 
 GENERAL = True
 IMU_TOPIC = "/imu0"
@@ -164,6 +164,7 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
     remarks.notes.append(f"gyro from {tables[gyro_table]}, accel from {' + '.join(tables[table] for table in used)}")
     imu, notes = joined(gyro_ns, gyro, accel_ns, accel, IMU_TOPIC)
     remarks.notes.extend(notes)
+    imu = _in_rad_s(imu, _stated_unit(files, tables[gyro_table]), remarks)
     scalars: dict[str, Scalars] = {}
     if others := [path for table, path in tables.items() if re.fullmatch(rf"({'|'.join(GYRO)})\d+", table)]:
         said = f"{', '.join(others)} of further gyroscopes or recordings become numbers and no IMU"
@@ -172,6 +173,23 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
         if table not in (gyro_table, *used):
             scalars |= _others(files, path, clock, where, remarks)
     return imu, {}, scalars
+
+
+def _stated_unit(files: _Files, path: str) -> str:
+    """Unit of a gyro in the header of its table; empty without one."""
+    fields = (field.strip(' "\r') for field in files.text(path).partition("\n")[0].split(","))
+    return next((unit for _, unit in map(split_name, fields) if unit in GYRO_SI), "")
+
+
+def _in_rad_s(imu: Imu, stated: str, remarks: Remarks) -> Imu:
+    """The IMU with its rates in rad/s: they are in the stated unit, else in that by which gravity turns, else they are."""
+    shown = None if stated else unit_by_gravity(imu.t_ns, imu.gyro, imu.accel, GYRO_SI)
+    unit = stated or (shown[0] if shown else "rad/s")
+    if unit != "rad/s":
+        remarks.notes.append(f"the gyro is in {unit}, as {'its header says' if stated else 'gravity turns'}, and now in rad/s")
+        imu = replace(imu, gyro=imu.gyro * GYRO_SI[unit])
+    remarks.doubt(unit_doubts(imu, unit, "m/s^2"))
+    return imu
 
 
 def _steady_level(t_ns: Int64[np.ndarray, " n"], accel: Float64[np.ndarray, "n 3"]) -> float:

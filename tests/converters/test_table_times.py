@@ -14,7 +14,7 @@ import scipy.io
 from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
-from imutool.converters import table
+from imutool.converters import sensor_tables, table
 from imutool.errors import ConfigError, DataError
 
 RATE_HZ = 250.0
@@ -46,6 +46,24 @@ def test_a_time_in_minutes_or_hours_is_no_time_in_seconds(tmp_path, unit, size_s
         f'gyro = {names[1:4]}\ngyro_unit = "rad/s"\naccel = {names[4:]}\naccel_unit = "m/s^2"\n'
     )
     assert np.abs(read(path, tmp_path / "map.toml").imus["/imu0"].t_ns - NEXT_NS * np.arange(COUNT)).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("unit", "size", "said"),
+    [
+        (" (rad/s)", 1.0, "gyro from"),
+        (" (deg/s)", np.degrees(1.0), "the gyro is in deg/s, as its header says"),
+        ("", np.degrees(1.0), "the gyro is in deg/s, as gravity turns"),
+        (" (deg/s)", 1.0, "gravity turns in the accelerometer as a gyro in rad/s says"),
+    ],
+)
+def test_the_gyro_of_a_phones_folder_is_in_the_unit_of_its_header_or_by_which_gravity_turns(tmp_path, unit, size, said):
+    write_csv(tmp_path / "Gyroscope.csv", ["Time (s)", *(f"{a}{unit}" for a in "XYZ")], [T_S, *(GYRO.T * size)])
+    write_csv(tmp_path / "Accelerometer.csv", ["Time (s)", *(f"{a} (m/s^2)" for a in "XYZ")], [T_S, *ACCEL.T])
+    log = sensor_tables.read_sequence(sensor_tables.sequences(tmp_path)[0])
+    assert said in " ".join(log.remarks.notes)
+    right = GYRO if "gravity turns in" not in said else np.radians(GYRO)
+    np.testing.assert_allclose(log.imus["/imu0"].gyro, right, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("back_s", "is_lost"), [(T_S[COUNT // 2], True), (2.0, False)])
