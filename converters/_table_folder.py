@@ -41,9 +41,8 @@ IMU = r"(.*[ _-])?(imu|inertial)\d*([ _-].*)?"  # in the name of a file, as of U
 IMUS = r"(imu|inertial)[ _-]?\w{1,20}"  # of several beside one file of poses: imu_1, imu_left
 POSES = rf"(.*[ _-])?({TRUE_GROUPS}|ground[ _-]truth)([ _-].*)?"  # groundtruth.txt, stamped_groundtruth_imu.txt
 REFERENCE = r"(.*[ _-])?ref(erence)?([ _-].*)?"  # of poses; of rates it is an ideal sensor
-ROLE = "|".join(
-    ["imu|inertial|ground|truth|poses?|raw|rots?|ref|reference", TRUE_GROUPS, *SENSORS.values()]
-)  # a word in the name of a file
+ROLES = "imu|inertial|ground|truth|poses?|raw|rots?|ref|reference"
+ROLE = "|".join([ROLES, TRUE_GROUPS, *SENSORS.values()])  # a word in the name of a file
 ENDINGS = (
     ".csv",
     ".txt",
@@ -153,9 +152,9 @@ def _recordings(folder: Path) -> dict[str, list[Path]]:
     tables = _tables(folder)
     if groups := _groups(tables[:MOST_TABLES]):
         parts = _apart_in_time(groups) if groups.keys() == {*tables} else []
-        return (
-            {_without_role(_stem(min(part))): sorted(part) for part in parts} if len(parts) > 1 else {"": tables[:MOST_TABLES]}
-        )
+        if len(parts) > 1:
+            return {_without_role(_stem(min(part))): sorted(part) for part in parts}
+        return {"": tables[:MOST_TABLES]}
     count = Counter(map(_stem, tables))
     stems = {path: _stem(path) if count[_stem(path)] == 1 else path.name for path in tables}  # imu.csv beside imu.txt
     alike: dict[str, list[Path]] = {}

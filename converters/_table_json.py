@@ -78,14 +78,15 @@ def _decoded(path: Path, columns: Columns) -> Any:
     try:
         return msgspec.json.decode(raw)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-            return msgspec.json.decode(b"[" + NEXT.sub(b"},{", raw) + b"]")
         lines = [line.strip().rstrip(b",") for line in raw.splitlines() if line.strip()]
         values = []
         for line in lines:
             with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
                 values.append(msgspec.json.decode(line))
         damaged = len(lines) - len(values)
+        with suppress(msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+            if damaged:
+                return msgspec.json.decode(b"[" + NEXT.sub(b"},{", raw) + b"]")
         if len(values) < LEAST_ROWS or damaged > MOST_DAMAGED * len(lines):
             what = f"begins as JSON and cannot be read ({error})"
             raise DataError(what, where=path, expected="one JSON document, or one JSON value a line") from error

@@ -176,13 +176,17 @@ def _phone(files: _Files, where: Path, remarks: Remarks) -> tuple[Imu, dict[str,
 
 
 def _stated_unit(files: _Files, path: str) -> str:
-    """Unit of a gyro in the header of its table; empty without one."""
-    fields = (field.strip(' "\r') for field in files.text(path).partition("\n")[0].split(","))
-    return next((unit for _, unit in map(split_name, fields) if unit in GYRO_SI), "")
+    """Unit of a gyro in the header of its table, or that which Sensor Logger documents; else empty."""
+    header = files.text(path).partition("\n")[0]
+    units = (split_name(field.strip(' "\r'))[1] for field in header.split(","))
+    return next((unit for unit in units if unit in GYRO_SI), "rad/s" if "seconds_elapsed" in header else "")
 
 
 def _in_rad_s(imu: Imu, stated: str, remarks: Remarks) -> Imu:
-    """The IMU with its rates in rad/s: they are in the stated unit, else in that by which gravity turns, else they are."""
+    """The IMU with its rates in rad/s.
+
+    They are in the stated unit. Without one they are in that by which gravity turns, or in rad/s where it does not turn enough.
+    """
     shown = None if stated else unit_by_gravity(imu.t_ns, imu.gyro, imu.accel, GYRO_SI)
     unit = stated or (shown[0] if shown else "rad/s")
     if unit != "rad/s":

@@ -146,12 +146,10 @@ def contradicted_start(rest: Vector6, std: Vector6, shown: Vector6, shown_std: V
 
 
 def untold_bias(mean: Vector6, std: Vector6) -> str:
-    """Sentence on a log whose agreement with a prior does not tell its sensor.
+    """Sentence on a log that agrees with a prior to within `std`, but may be another sensor's.
 
-    It agrees with the mean to within `std`.
-
-    A bias tells it that is larger than a switching-on changes, if none at all would contradict it. While the log does not show
-    such a bias of the gyro, small ones tell nothing: most sensors have them.
+    A bias that is larger than a switching-on changes tells the sensor, where no bias at all would contradict it. While the log
+    does not show such a bias of the gyro, its small biases tell nothing: most sensors have them.
     """
     size = np.abs(mean)
     large = size > MOST_CHANGE

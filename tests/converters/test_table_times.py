@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from support.tables import write_csv
 
 from imutool.converters import sensor_tables, table
+from imutool.converters._table_numbers import plain_columns
 from imutool.errors import ConfigError, DataError
 
 RATE_HZ = 250.0
@@ -64,6 +65,13 @@ def test_the_gyro_of_a_phones_folder_is_in_the_unit_of_its_header_or_by_which_gr
     assert said in " ".join(log.remarks.notes)
     right = GYRO if "gravity turns in" not in said else np.radians(GYRO)
     np.testing.assert_allclose(log.imus["/imu0"].gyro, right, rtol=1e-9)
+
+
+def test_quotes_that_hold_a_delimiter_leave_the_row_to_the_reader_of_quotes():
+    """Behind the first rows, in a row that lacks a field, too."""
+    rows = [f'{t},"ok",{value}' for t, value in enumerate(GYRO[:300, 0].tolist())]
+    assert plain_columns(rows, ",") is not None
+    assert plain_columns([*rows[:250], '250,"lost, again"', *rows[251:]], ",") is None
 
 
 @pytest.mark.parametrize(("back_s", "is_lost"), [(T_S[COUNT // 2], True), (2.0, False)])
