@@ -26,7 +26,16 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
-from imutool.inertial.strapdown import Drift, StartPose, along_truth, drift_windows, gaps_crossed, window_drift
+from imutool.inertial.strapdown import (
+    StartPose,
+    along_truth,
+    dead_reckon,
+    drift_windows,
+    gaps_crossed,
+    stretch_with_truth,
+    window_drift,
+    with_velocity,
+)
 from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
@@ -44,6 +53,8 @@ DELAY = "pose_delay_s", "pose_delay_std_s", "aoe_without_delay_deg", "drift_orie
 DEG = 180.0 / np.pi
 PURE, AIDED = "integration", "aided"
 Refused = Callable[[str, ImutoolError], None]
+Mask = Bool[np.ndarray, " n"]
+Figures = dict[str, float | None]
 
 
 def evaluate(
@@ -101,24 +112,24 @@ def _evaluated(
     """Results of one stretch of a log."""
     (whole,) = warn_of_recordings([recording])
     wrong = contradictions(whole)
+    truth = recording.truth
     if (whole.world != np.eye(3)).any() or whole.position_unit != "m" or whole.quaternions:
         logger.warning("%s: until then its positions and velocities are not scored", recording.name)
-        orientations = replace(recording.truth, p_wb=np.zeros_like(recording.truth.p_wb), v_w=None)
-        recording = replace(recording, truths={next(iter(recording.truths)): orientations})
+        truth = replace(truth, p_wb=np.zeros_like(truth.p_wb), v_w=None)
+    recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
+    rows, true, valid = stretch_with_truth(recording.imu.t_ns, recording.truth, recording.name)
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
-        found, std = _corrected(recording.imu, model, start, with_std=aids is not None)
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
-        integrated, true, valid = along_truth(found.imu, recording.truth, recording.name)
-        means = _trapezoidal(found.imu)
-        scored = along_truth(means, recording.truth, recording.name)
-        drifted = _drift(scored, model, start, recording.imu)
-        drifted |= _without_delay(means, scored, recording) if model else dict.fromkeys(DELAY)
-        if name == RAW and (gaps := gaps_crossed(integrated, GAP_S, int(recording.imu.t_ns[0]))):
+        found, std = _corrected(recording.imu, model, start, with_std=aids is not None)
+        corrected = found.imu
+        del found  # no array as long as the log stays when it is no longer needed
+        drifted = _drifts(corrected, (rows, true, valid), recording, model, start)
+        estimates = {PURE: dead_reckon(corrected.rows(rows), StartPose.of(true))}
+        if name == RAW and (gaps := gaps_crossed(estimates[PURE], GAP_S, int(recording.imu.t_ns[0]))):
             logger.warning("%s: %s", recording.name, gaps)
-        estimates = {PURE: integrated}
         if aids is not None:
-            estimates[AIDED] = aided_path(_over(found.imu, true), StartPose.of(true), residual_prior(start, std), aids)
+            estimates[AIDED] = aided_path(corrected.rows(rows), StartPose.of(true), residual_prior(start, std), aids)
         for kind, estimate in estimates.items():
             results.append(
                 {
@@ -139,10 +150,25 @@ def _evaluated(
             if trajectories is not None:
                 label = name if kind == PURE else f"{name}_{kind}"
                 _write(trajectories, recording.name, label, estimate, true, valid, overwrite=overwrite)
+        del corrected, estimates, estimate
     return results
 
 
-Scored = tuple[Poses, Poses, Bool[np.ndarray, " n"]]  # estimate, truth, and rows with truth, as of `along_truth`
+def _drifts(
+    corrected: Imu,
+    truth: tuple[slice, Poses, Mask],
+    recording: Recording,
+    model: BiasModel | None,
+    start: InitialBias | None,
+) -> Figures:
+    """Drift of windows that start from the truth, what the bias covariance expects, and a delay of the poses."""
+    means = _trapezoidal(corrected)
+    rows, true, valid = truth
+    path = dead_reckon(means.rows(rows), StartPose.of(true))
+    drifted = _drift(path, true, valid, model, start, recording.imu)
+    delay = metrics.pose_delay(path, true, drift_windows(path, valid, DELAY_WINDOW_S)) if model else None
+    del path
+    return drifted | _without_delay(delay, means, recording, drifted[DRIFTS[0]])
 
 
 def _trapezoidal(imu: Imu) -> Imu:
@@ -154,53 +180,40 @@ def _trapezoidal(imu: Imu) -> Imu:
     return Imu(imu.t_ns, gyro, accel)
 
 
-def _drift(scored: Scored, model: BiasModel | None, start: InitialBias | None, imu: Imu) -> dict[str, float | None]:
+def _drift(path: Poses, true: Poses, valid: Mask, model: BiasModel | None, start: InitialBias | None, imu: Imu) -> Figures:
     """Root mean squares of the drift of windows that start from the truth, and of what the bias covariance expects.
 
     None if no window fits.
     """
-    path, truth, valid = scored
     windows = drift_windows(path, valid, DRIFT_S)
-    found = window_drift(path, truth, *windows.T)
+    found = window_drift(path, true, *windows.T)
     squares = {"drift_orientation_deg": found.orientation_rad**2, "drift_velocity_m_s": found.velocity_m_s**2}
     if model is not None and start is not None:
         variances = expected_drift(model, start, imu, path, windows).diagonal(axis1=1, axis2=2)
         squares["drift_orientation_std_deg"] = variances[:, :3].sum(axis=1)
         squares["drift_velocity_std_m_s"] = variances[:, 3:].sum(axis=1)
-    out: dict[str, float | None] = {"drift_window_s": DRIFT_S}
+    out: Figures = {"drift_window_s": DRIFT_S}
     for name in DRIFTS:
         is_angle = name.endswith("deg")
-        known = name in squares and len(windows) > 0 and (is_angle or truth.has_positions)
+        known = name in squares and len(windows) > 0 and (is_angle or true.has_positions)
         out[name] = float(np.sqrt(squares[name].mean())) * (DEG if is_angle else 1.0) if known else None
     return out
 
 
-def _without_delay(imu: Imu, before: Scored, recording: Recording) -> dict[str, float | None]:
+def _without_delay(found: tuple[float, float] | None, imu: Imu, recording: Recording, drift_deg: float | None) -> Figures:
     """Delay of the poses against the debiased gyro, and the scores without it; None where it is not clear."""
-    nothing = dict[str, float | None].fromkeys(DELAY)
-    found = metrics.pose_delay(*before[:2], drift_windows(before[0], before[2], DELAY_WINDOW_S))
-    if found is None or abs(found[0]) < CLEAR_STDS * found[1]:
+    nothing = Figures.fromkeys(DELAY)
+    if found is None or drift_deg is None or abs(found[0]) < CLEAR_STDS * found[1]:
         return nothing
     moved = replace(recording.truth, t_ns=recording.truth.t_ns - nanoseconds(found[0]))
     try:
-        after = along_truth(imu, moved, recording.name)
+        path, true, valid = along_truth(imu, moved, recording.name)
     except DataError:
         return nothing
-    drifts = [_rms(window_drift(p, true, *drift_windows(p, valid, DRIFT_S).T)) for p, true, valid in (before, after)]
-    if not drifts[1] < MOST_DRIFT_LEFT * drifts[0]:
+    left_deg = _drift(path, true, valid, None, None, imu)[DRIFTS[0]]
+    if left_deg is None or not left_deg < MOST_DRIFT_LEFT * drift_deg:
         return nothing
-    return dict(zip(DELAY, (*found, metrics.absolute(*after)["aoe_deg"], DEG * drifts[1]), strict=True))
-
-
-def _rms(drifted: Drift) -> float:
-    """Root mean square of the drift of the orientation (rad)."""
-    return float(np.sqrt(np.mean(drifted.orientation_rad**2))) if len(drifted.orientation_rad) else float("nan")
-
-
-def _over(imu: Imu, true: Poses) -> Imu:
-    """The samples of the stretch that is scored."""
-    rows: Imu = imu.between(int(true.t_ns[0]), int(true.t_ns[-1]))
-    return rows
+    return dict(zip(DELAY, (*found, metrics.absolute(path, true, valid)["aoe_deg"], left_deg), strict=True))
 
 
 def _corrected(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from imutool.bias_start.prior_width import BiasPrior
 from imutool.conversion.run import convert
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.evaluation import evaluate, runs
+from imutool.geometry import quaternion
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids
 from imutool.inertial.metrics import DISTANCES_M
@@ -229,6 +231,26 @@ def test_a_start_in_motion_is_the_truth_of_that_moment(rate_hz: float) -> None:
         estimate, true, valid = along_truth(moving, made.truth, made.name)
         assert len(estimate) >= len(moving) - 2 * 200 / rate_hz
         assert metrics.evaluate(estimate, true, valid)["aoe_deg"] < 0.6
+
+
+def test_a_long_log_costs_what_its_samples_and_paths_do(tmp_path: Path) -> None:
+    """Memory grows with the samples, and by little for each: the arrays of one path at a time."""
+    peaks, samples = [], (20_000, 120_000)
+    for count in samples:
+        turned = np.sin(np.arange(count) / 300.0)
+        gyro = np.stack([np.zeros(count), np.zeros(count), np.gradient(turned, 0.005)], axis=1) + 0.001
+        t_ns = np.arange(count, dtype=np.int64) * 5_000_000
+        q_wb = quaternion.exp(np.stack([0 * turned, 0 * turned, turned], axis=1))
+        gyro[:2000], q_wb[:2000] = 0.001, [1.0, 0.0, 0.0, 0.0]
+        poses = Poses(t_ns[::2], np.zeros((count, 3))[::2], q_wb[::2])
+        imu = Imu(t_ns, gyro, np.tile([0.0, 0.0, 9.81], (count, 1)))
+        write(Recording("long", imu, truths={"/ground_truth/pose": poses}), tmp_path / f"{count}.mcap")
+        evaluate(tmp_path / f"{samples[0]}.mcap", models=["static"])  # imports
+        tracemalloc.start()
+        evaluate(tmp_path / f"{count}.mcap", models=["static"])
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert (peaks[1] - peaks[0]) / (samples[1] - samples[0]) < 700  # bytes a sample; a path with its truth has 176
 
 
 def test_taking_off_the_true_bias_helps(log: Path, recording: Recording) -> None:

@@ -104,7 +104,7 @@ def expected_drift(
     count, nor does the noise of the samples: vibration is no white noise, and the noise at rest is much less than the bias.
     """
     estimator, good = BiasEstimator(model, start), measured(imu.gyro, imu.accel)
-    t_ns, samples = imu.t_ns[good], model_samples(model, imu)
+    t_ns, accel, samples = imu.t_ns[good], imu.accel[good], model_samples(model, imu)
     out, done = np.zeros((len(windows), 6, 6)), 0
     for k, (first_ns, last_ns) in enumerate(path.t_ns[windows]):
         a, b = int(np.searchsorted(t_ns, first_ns)), int(np.searchsorted(t_ns, last_ns, side="right")) - 1
@@ -116,8 +116,9 @@ def expected_drift(
         if model.log_drift is not None:
             rest = rest + model.log_drift.covariance(t_ns[a:b])
         rows = np.searchsorted(path.t_ns, t_ns[a : b + 1])
-        q_wb, force = path.q_wb_wxyz[rows], imu.accel[good][a : b + 1]
-        by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb, quaternion.rotate(q_wb, force))[:-1]
+        q_wb = path.q_wb_wxyz[rows]
+        force_w = quaternion.rotate(q_wb, accel[a : b + 1])
+        by_bias = drift_by_bias(seconds(t_ns[a : b + 1], int(first_ns)), q_wb, force_w)[:-1]
         constant, moving = by_bias.sum(axis=0), np.einsum("nij,njp->ip", by_bias, stacked(roots, b - a))
         out[k] = constant @ rest.mean(axis=0) @ constant.T + moving @ moving.T
     return out

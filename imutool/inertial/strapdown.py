@@ -26,16 +26,16 @@ GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
 VELOCITY_ORDER = 3
 COMPARED_S, LEAST_SPEED_M_S, MOST_OFF = 1.0, 0.05, 0.5  # of velocities and positions: over a second, in motion, by the median
+WINDOWS_AT_ONCE = 1 << 12  # of poses: they fit a core's cache
 SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
 Vectors = Float64[np.ndarray, "n 3"]
+Indices = Int64[np.ndarray, " m"]
+Column = Float64[np.ndarray, "m 1"]
 
 
 class StartPose(NamedTuple):
-    """Start pose of an integration.
-
-    Orientation (body to world), position in m, world velocity in m/s.
-    """
+    """Start of an integration: orientation (body to world), position (m), world velocity (m/s)."""
 
     q_wb_wxyz: Float64[np.ndarray, "4"]
     p_wb: Float64[np.ndarray, "3"]
@@ -133,20 +133,15 @@ def stretch_with_truth(t_ns: Times, truth: Poses, where: str) -> tuple[slice, Po
 
 
 class Drift(NamedTuple):
-    """Drift of integrations that start from the truth.
-
-    Orientation (rad), velocity (m/s), position (m).
-    """
+    """Drift of integrations from the truth: orientation (rad), velocity (m/s), position (m)."""
 
     orientation_rad: Float64[np.ndarray, " m"]
     velocity_m_s: Float64[np.ndarray, " m"]
     position_m: Float64[np.ndarray, " m"]
 
 
-def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last: Int64[np.ndarray, " m"] | slice) -> Drift:
+def window_drift(path: Poses, truth: Poses, first: Indices, last: Indices | slice) -> Drift:
     """Drift at rows `last` of integrations from the truth at rows `first`.
-
-    All of them come from a single integration.
 
     `path` is the integration of the same samples from any start, on the stamps of `truth`. An integration from the truth at row
     s equals `path` rotated by C = R_true,s R_s^T from there on, so nothing is integrated again::
@@ -160,14 +155,24 @@ def window_drift(path: Poses, truth: Poses, first: Int64[np.ndarray, " m"], last
     Raises:
         DataError: one of the two carries no velocity, or they are on different stamps.
     """
-    v, v_true = path.v_w, truth.v_w
-    if v is None or v_true is None or not np.array_equal(path.t_ns, truth.t_ns):
+    if path.v_w is None or truth.v_w is None or not np.array_equal(path.t_ns, truth.t_ns):
         raise DataError("path and truth do not match", expected="poses with velocity on the same stamps")
     t = seconds(path.t_ns, int(path.t_ns[0]))
     squares = np.concatenate([[0.0], np.cumsum(np.diff(t) ** 2)])
-    T = (t[last] - t[first])[:, None]
-    g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * (0.5 * (T**2 - (squares[last] - squares[first])[:, None]))
-    (q, p), (q_true, p_true) = ((poses.q_wb_wxyz, poses.p_wb) for poses in (path, truth))
+    ends = np.arange(len(t))[last]
+    T = t[ends] - t[first]
+    S = 0.5 * (T**2 - (squares[ends] - squares[first]))
+    out = np.empty((3, len(first)))
+    for start in range(0, len(first), WINDOWS_AT_ONCE):
+        part = slice(start, start + WINDOWS_AT_ONCE)
+        out[:, part] = _drift_of(path, truth, first[part], ends[part], T[part, None], S[part, None])
+    return Drift(*out)
+
+
+def _drift_of(path: Poses, truth: Poses, first: Indices, last: Indices, T: Column, S: Column) -> Drift:
+    """Drift of some windows, as `window_drift`."""
+    g_T, g_S = np.array(GRAVITY_W) * T, np.array(GRAVITY_W) * S
+    (q, p, v), (q_true, p_true, v_true) = ((poses.q_wb_wxyz, poses.p_wb, np.asarray(poses.v_w)) for poses in (path, truth))
     q_c = quaternion.multiply(q_true[first], quaternion.inverse(q[first]))
     faster = v_true[first] - v_true[last] + g_T + quaternion.rotate(q_c, v[last] - v[first] - g_T)
     further = p_true[first] - p_true[last] + v_true[first] * T + g_S
@@ -262,18 +267,28 @@ def truth_velocity(poses: Poses) -> Vectors:
 
 
 def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -> Vectors:
-    """Slopes of moving least-squares polynomials over one stretch without gaps.
-
-    By the orthogonal polynomials of each window, P_k+1 = (u - a_k) P_k - b_k P_k-1 (Forsythe 1957), of all windows at once: a
-    pseudoinverse of each takes many times as long.
-    """
+    """Slopes of moving least-squares polynomials over one stretch without gaps."""
     n = len(t)
     if n < window:
         window, order = n, min(order, max(1, n // SAMPLES_PER_COEFFICIENT - 1))
     first = np.clip(np.arange(n) - window // 2, 0, n - window)
-    rows = first[:, None] + np.arange(window)
-    span = t[rows[:, -1]] - t[rows[:, 0]]
-    u = (t[rows] - t[:, None]) / span[:, None]  # relative to the pose: the slope is one coefficient
+    out = np.empty_like(p)
+    for start in range(0, n, WINDOWS_AT_ONCE):
+        part = slice(start, start + WINDOWS_AT_ONCE)
+        rows = first[part, None] + np.arange(window)
+        out[part] = np.einsum("nm,nmk->nk", _slope_weights(t[rows], t[part], order), p[rows])
+    return out
+
+
+def _slope_weights(t: Float64[np.ndarray, "n m"], at: Float64[np.ndarray, " n"], order: int) -> Float64[np.ndarray, "n m"]:
+    """Weights of the values of each window in the slope of its polynomial at a time.
+
+    By the orthogonal polynomials of each window, P_k+1 = (u - a_k) P_k - b_k P_k-1 (Forsythe 1957), of all windows at once: a
+    pseudoinverse of each takes many times as long.
+    """
+    n, window = t.shape
+    span = t[:, -1] - t[:, 0]
+    u = (t - at[:, None]) / span[:, None]  # relative to the pose: the slope is one coefficient
     P, at_pose, slope, squares = [np.ones_like(u)], [np.ones(n)], [np.zeros(n)], [np.full(n, float(window))]
     for k in range(order):
         a = np.einsum("nm,nm,nm->n", u, P[k], P[k]) / squares[k]
@@ -282,6 +297,4 @@ def _slopes(t: Float64[np.ndarray, " n"], p: Vectors, window: int, order: int) -
         slope.append(at_pose[k] - a * slope[k] - b * slope[k - 1])
         at_pose.append(-a * at_pose[k] - b * at_pose[k - 1])
         squares.append(np.einsum("nm,nm->n", P[-1], P[-1]))
-    weights = sum(P[k] * (slope[k] / (squares[k] * span))[:, None] for k in range(1, order + 1))
-    slopes: Vectors = np.einsum("nm,nmk->nk", weights, p[rows])
-    return slopes
+    return np.asarray(sum(P[k] * (slope[k] / (squares[k] * span))[:, None] for k in range(1, order + 1)))

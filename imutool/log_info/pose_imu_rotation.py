@@ -61,10 +61,11 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     inside &= ~_has_gap(imu.t_ns, start_ns, end_ns)
     if inside.sum() < LEAST_TURNS:
         return None
-    t = seconds(imu.t_ns, first)
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (imu.gyro[1:] + imu.gyro[:-1]) / 2.0, axis=0)])
-    begin, end = seconds(start_ns[inside], first), seconds(end_ns[inside], first)
-    mean = np.stack([(np.interp(end, t, c) - np.interp(begin, t, c)) / (end - begin) for c in turned.T], axis=1)
+    t, begin, end = (seconds(t_ns, first) for t_ns in (imu.t_ns, start_ns[inside], end_ns[inside]))
+    mean = np.empty((len(begin), 3))
+    for axis, w in enumerate(imu.gyro.T):
+        turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * (w[1:] + w[:-1]) / 2.0)])
+        mean[:, axis] = (np.interp(end, t, turned) - np.interp(begin, t, turned)) / (end - begin)
     gyro, omega = mean - mean.mean(axis=0), rate[inside] - rate[inside].mean(axis=0)
     motion = float(np.sqrt((gyro**2).sum(axis=1).mean()))
     if motion < LEAST_RATE_RAD_S:

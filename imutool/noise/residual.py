@@ -50,7 +50,8 @@ def curves(imu: Imu, truth: Poses) -> tuple[Curve, Curve]:
     period_s = imu.period_s
     start = max(1, round(truth.period_s / period_s))  # shorter windows would lie between two poses
     broken = np.cumsum((np.diff(t, prepend=t[0]) > GAP_PERIODS * period_s) | ~trusted)
-    R_wb = so3.matrix_from_quaternion_wxyz(torch.from_numpy(np.array(poses.q_wb_wxyz)))
+    q_wb_wxyz = torch.from_numpy(np.array(poses.q_wb_wxyz))
+    R_wb = torch.cat([so3.matrix_from_quaternion_wxyz(part) for part in torch.split(q_wb_wxyz, MAX_SAMPLES)])
     assert poses.v_w is not None
     found: tuple[list[Rows], list[Rows]] = ([], [])
     lengths, worth = [], []

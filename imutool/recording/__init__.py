@@ -117,6 +117,8 @@ class Poses(Columns):
         q_wb_wxyz = quaternion.unit(quaternion.slerp(self.q_wb_wxyz[after - 1], self.q_wb_wxyz[after], share))
         p_wb = _interpolate(wanted, knots, self.p_wb)
         v_w = None if self.v_w is None else _interpolate(wanted, knots, self.v_w)
+        for column in (q_wb_wxyz, p_wb, *([] if v_w is None else [v_w])):  # so that the poses need no copy
+            column.flags.writeable = False
         return Poses(t_ns, p_wb, q_wb_wxyz, v_w), valid
 
 

@@ -11,7 +11,7 @@ from imutool.geometry import quaternion
 ROUNDING = 1e-13  # some ten float64 operations on numbers of size one
 SMALLEST = 1e-300
 ANGLES = (0.0, 1e-300, 1e-160, 1e-12, 1e-8, 1e-6, 1e-3, 0.1, 1.0, 3.0, np.pi - 1e-9, np.pi)
-COUNT = 500
+COUNT = quaternion.ROWS_AT_ONCE + 500  # more than one block
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from imutool.errors import DataError, NumericsError
 from imutool.inertial.metrics import absolute
-from imutool.inertial.strapdown import GRAVITY_W, StartPose, dead_reckon, drift, truth_velocity, window_drift
+from imutool.inertial.strapdown import (
+    GRAVITY_W,
+    WINDOWS_AT_ONCE,
+    StartPose,
+    dead_reckon,
+    drift,
+    truth_velocity,
+    window_drift,
+)
 from imutool.recording import Imu, Poses, unit_quaternions
 
 RATE_NS = 5_000_000
@@ -190,8 +198,9 @@ def cubic(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_on_an_even_clock_the_velocity_is_scipys_savitzky_golay_derivative() -> None:
-    p = np.cumsum(np.random.default_rng(1).normal(size=(500, 3)), axis=0)
-    got = truth_velocity(poses_at(np.arange(500) * RATE_NS, p))
+    count = WINDOWS_AT_ONCE + 500
+    p = np.cumsum(np.random.default_rng(1).normal(size=(count, 3)), axis=0)
+    got = truth_velocity(poses_at(np.arange(count) * RATE_NS, p))
     assert np.abs(got - savgol_filter(p, 41, 3, deriv=1, delta=0.005, axis=0, mode="interp")).max() < 1e-7
 
 

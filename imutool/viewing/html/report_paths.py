@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Bool, Float64
 from imutool.recording import Poses
 from imutool.units import AXES
 from imutool.viewing.html.drawing import Panel, Picture, legend
@@ -65,12 +65,16 @@ def error_map(data: RunData) -> Picture | None:
     if trace is None or trace.errors is None or data.truth is None or not data.truth.has_positions:
         return None
     fits = trace in _near(data)[0]
-    points = trace.path.p_wb if fits else data.truth.at(trace.path.t_ns)[0].p_wb
+    rows = len(trace.path)
+    starts = np.unique(np.linspace(0, rows - 1, min(rows, MAX_POINTS)).astype(int))
+    points = trace.path.p_wb[starts] if fits else data.truth.at(trace.path.t_ns[starts])[0].p_wb
+    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, gap_rows(trace.path)) - 1)  # steps without a gap
     kinds = {"Position": (trace.errors.position_total_m, "m"), "Orientation": (trace.errors.orientation_total_deg, "°")}
     panels = []
     for kind, (error, unit) in kinds.items():
         title = f"{kind} error, at most {format_quantity(float(np.nanmax(error)), unit)}"
-        draw = partial(_draw_heat, points=points, holes=gap_rows(trace.path), error=error, title=title, unit=unit)
+        most = np.fmax.reduceat(error, starts)  # of each step
+        draw = partial(_draw_heat, points=points, whole=whole, error=most, title=title, unit=unit)
         panels.append(Panel(draw, HEIGHT_INCH, f"{kind} error of {trace.name} along the path from above, in colours"))
     whose = f"Path of {run_name(trace)}" if fits else "The true path"
     caption = f"{whose} from above, coloured by the error of {run_name(trace)}."
@@ -99,16 +103,13 @@ def _draw_paths(figure: Any, *, data: RunData, shown: Sequence[Trace], axes_of: 
 
 
 def _draw_heat(
-    figure: Any, *, points: Points, holes: Int64[np.ndarray, " _"], error: Float64[np.ndarray, " _"], title: str, unit: str
+    figure: Any, *, points: Points, whole: Bool[np.ndarray, " _"], error: Float64[np.ndarray, " _"], title: str, unit: str
 ) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.ticker import MaxNLocator
 
     axes = figure.subplots()
-    starts = np.unique(np.linspace(0, len(points) - 1, min(len(points), MAX_POINTS)).astype(int))
-    whole = ~np.isin(np.arange(len(starts)), np.searchsorted(starts, holes) - 1)  # steps without a gap of the samples
-    points, error = points[starts], np.fmax.reduceat(error, starts)  # the largest error of each step
     scale, unit = _unit_of(float(np.nanmax(error))) if unit == "m" else (1.0, unit)
     error = error * scale
     top = float(np.nanmax(error))

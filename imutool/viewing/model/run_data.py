@@ -234,9 +234,10 @@ def spectra(imu: Imu) -> Mapping[str, Spectrum]:
     length = min(len(imu), max(MIN_SAMPLES, round(WINDOW_S * rate_hz)))
     densities = {}
     for kind, values in (("gyro", imu.gyro), ("accel", imu.accel)):
-        along = np.ascontiguousarray(values.T)  # twice as fast
-        frequency_hz, density = welch(along, rate_hz, nperseg=length, detrend="constant")
-        densities[kind] = Spectrum(frequency_hz[1:], density.T[1:])  # without the constant part
+        along = map(np.ascontiguousarray, values.T)  # one column after the other is twice as fast
+        columns = [welch(column, rate_hz, nperseg=length, detrend="constant") for column in along]
+        density = np.stack([found for _, found in columns], axis=1)
+        densities[kind] = Spectrum(columns[0][0][1:], density[1:])  # without the constant part
     return densities
 
 
