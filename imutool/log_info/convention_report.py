@@ -18,6 +18,7 @@ from imutool.cleaning.rules.saturation import Saturation
 from imutool.cleaning.rules.stuck import Stuck
 from imutool.cleaning.rules.units import Units
 from imutool.cleaning.samples import BLOCK, Motion, Samples
+from imutool.cleaning.stamp_line import distinct
 from imutool.cleaning.truth import Truth, truth_of
 from imutool.cleaning.unit_evidence import accel_reading
 from imutool.errors import DataError, LogError
@@ -255,7 +256,7 @@ def transforms(log: Log, topic: str) -> list[tuple[str, Int64[np.ndarray, "..."]
 
 def coverage(topic: str, kind: str, truth_ns: Int64[np.ndarray, " n"], imu_ns: Int64[np.ndarray, " m"]) -> TruthInfo:
     """Truth coverage: share of the IMU's time between neighbouring true poses."""
-    knots = np.unique(truth_ns)
+    knots = distinct(truth_ns)
     if len(knots) < 2 or not len(imu_ns):
         return TruthInfo(topic, len(truth_ns), kind)
     start, end = int(imu_ns.min()), int(imu_ns.max())

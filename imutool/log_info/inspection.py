@@ -17,7 +17,7 @@ from imutool.cleaning import raw_batches
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.stamp_line import Stamps, read_stamps, restamped
+from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import rest_stretches
@@ -161,8 +161,8 @@ def _imu(log: Log, topic: Topic, truth: Truth | None) -> ImuInfo:
     stamps = read_stamps(t_ns)
     counts = {
         "out_of_order": int((t_ns < later).sum()),
-        "duplicated": len(t_ns) - len(np.unique(t_ns)),
-        "missing": _missing(np.unique(restamped(t_ns) if stamps.batch > 1.0 or stamps.fraction else t_ns)),
+        "duplicated": len(t_ns) - len(distinct(t_ns)),
+        "missing": _missing(distinct(restamped(t_ns) if stamps.batch > 1.0 or stamps.fraction else t_ns)),
         "not_finite": int((~finite).sum()),
         "saturated": int((_saturated(gyro[finite]) | _saturated(accel[finite])).sum()),
     }
