@@ -110,6 +110,7 @@ class TimestampSettings(Settings, frozen=True):
 class AlignmentSettings(WienerSettings, frozen=True):
     """Alignment of two IMUs in time: by experience on blind cases and logs without an epoch."""
 
+    most_samples: Count = 400_000  # of all recordings that are compared, each from its start: one takes 6 kB of memory
     least_s: Positive = 8.0  # of shared time: below, nothing can be fitted and tested
     hole_s: Positive = 0.1  # without samples of a simulation, from which on it is not interpolated
     align_hz: Positive = 100.0  # of the clock on which angular rates are correlated

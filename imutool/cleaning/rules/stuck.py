@@ -144,5 +144,4 @@ def _noisy(values: Float64[np.ndarray, "n 6"], before: bool) -> bool:
     """Whether samples show noise; `before` for too few samples."""
     if len(values) < 4 * LEAST:
         return before
-    second, third = np.diff(values, n=2, axis=0), np.diff(values, n=3, axis=0)
-    return bool((median(np.abs(third)) > median(np.abs(second))).any())
+    return any(median(np.abs(np.diff(column, n=3))) > median(np.abs(np.diff(column, n=2))) for column in values.T)

@@ -73,12 +73,11 @@ def _gains(logs: Sequence[WhitenedLog], effect: Effect) -> Float64[np.ndarray, "
     """Squares that each parameter adds at its plausible size, less those that a constant takes."""
     total = np.zeros(len(effect.parameters))
     for log in logs:
-        rows, ideal = log.rows("all"), expected(log.pair, ())
-        added = [expected(log.pair, ((effect, theta),)) - ideal for theta in np.diag(SMALL * effect.plausible)]
-        B = log.whiten(np.stack(added, axis=2))[rows] / SMALL
-        constant = log.constants[rows]
-        cross = np.einsum("na,nap->ap", constant, B)
-        total += (B**2).sum(axis=(0, 1)) - (cross**2 / np.maximum((constant**2).sum(axis=0), 1e-300)[:, None]).sum(axis=0)
+        rows, ideal, constant = log.rows("all"), expected(log.pair, ()), log.constants[log.rows("all")]
+        constant = constant / np.sqrt(np.maximum((constant**2).sum(axis=0), 1e-300))
+        for j, theta in enumerate(np.diag(SMALL * effect.plausible)):  # one after the other: a column is as long as the log
+            b = log.whiten(expected(log.pair, ((effect, theta),)) - ideal)[rows] / SMALL
+            total[j] += (b**2).sum() - (np.einsum("na,na->a", constant, b) ** 2).sum()
     return total
 
 

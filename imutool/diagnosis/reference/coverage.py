@@ -48,7 +48,7 @@ def align_all(
     pairs: list[Pair] = []
     refused: list[ImutoolError] = []
     remarks = _held(sim, "the physics step is longer than the sample period") if sim is not None else []
-    for recording in recordings:
+    for recording, remark in _compared(recordings, settings.alignment):
         try:
             aligned = list(align(recording, sim, truth, settings))
         except (DataError, NumericsError) as error:
@@ -57,6 +57,7 @@ def align_all(
             refused.append(error.at(recording.name))
             continue
         pairs += [without_unusable(pair, settings.reference) for pair in aligned]
+        remarks += [remark] if remark else []
         remarks += _held(recording, "the topic is faster than its sensor")
         remarks += batch_remark(recording)
         if again := sum(int(repeats(pair.real).sum()) for pair in aligned):
@@ -133,6 +134,20 @@ def is_another_motion(reals: Sequence[Recording], sim: Recording, signals: Seque
             "`signals` compares one motion, and the simulation is of another", where=sim.name, fix="Leave `signals` out"
         )
     return True
+
+
+def _compared(recordings: Sequence[Recording], settings: AlignmentSettings) -> Iterator[tuple[Recording, str]]:
+    """First parts of recordings that together are too long, each with a remark; else the recordings."""
+    share = settings.most_samples / max(1, sum(len(recording.imu) for recording in recordings))
+    for recording in recordings:
+        t_ns = recording.imu.t_ns
+        if share >= 1.0:
+            yield recording, ""
+            continue
+        part = recording.between(int(t_ns[0]), int(t_ns[int(share * (len(t_ns) - 1))]))
+        first, whole = f"{part.imu.duration_s:.0f} s", f"{recording.imu.duration_s:.0f} s"
+        more = "more need --set alignment.most_samples=N and about 6 kB of memory for each sample"
+        yield part, f"{recording.name}: only the first {first} of {whole} were compared; {more}"
 
 
 def align(real: Recording, sim: Recording | None, truth: str | None, settings: DiagnoseSettings) -> Iterator[Pair]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
@@ -55,6 +56,21 @@ def test_orientations_alone_say_nothing_of_the_accelerometer() -> None:
     turned = replace(real.truth, p_wb=np.zeros_like(real.truth.p_wb), v_w=None)
     pairs, _ = align_all([replace(real, truths={TRUTH_TOPIC: turned})], None, None, DiagnoseSettings())
     assert [pair.axes.tolist() for pair in pairs] == [[True] * 3 + [False] * 3]
+
+
+def test_of_recordings_that_are_too_long_together_the_first_parts_are_compared() -> None:
+    """A diagnosis takes kilobytes for each sample, so that hours would take the memory of the machine."""
+    real, settings = made(EXACT), DiagnoseSettings()
+    half = msgspec.structs.replace(settings, alignment=msgspec.structs.replace(settings.alignment, most_samples=len(real.imu)))
+    pairs, remarks = align_all([real, replace(real, name="again")], along(real), None, half)
+    assert [float(pair.stamp_s[-1] - pair.stamp_s[0]) for pair in pairs] == pytest.approx([DURATION_S / 2] * 2, abs=0.2)
+    assert [pair.start_ns - int(real.imu.t_ns[0]) < 10**8 for pair in pairs] == [True, True]
+    assert [remark.split(";")[0] for remark in remarks] == [
+        f"{name}: only the first {DURATION_S / 2:.0f} s of {DURATION_S:.0f} s were compared" for name in (real.name, "again")
+    ]
+    (whole,), none = align_all([real], along(real), None, half)
+    assert none == []
+    assert len(whole.real) > 1.9 * len(pairs[0].real)
 
 
 def test_a_bad_stretch_of_the_poses_says_nothing_of_the_others() -> None:
