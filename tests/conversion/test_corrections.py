@@ -277,6 +277,25 @@ def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
     assert report.notes == ["same.mcap: the motion shows nothing to correct"]
 
 
+@pytest.mark.parametrize(
+    ("read_g", "kept"), [(1.0, []), (0.55, ["log.mcap: /imu0: the unit of accel is unknown: it reads 0.55"])]
+)
+def test_a_log_at_rest_in_g_and_steps_of_a_register_comes_in_radians(
+    read_g: float, kept: list[str], made: Recording, tmp_path: Path
+) -> None:
+    """What the motion does not settle is said too."""
+    rng, shape = np.random.default_rng(7), made.imu.gyro.shape
+    dps = np.round(np.round(rng.normal(30.0, 9.0, shape)) * 250 / 2**15, 6)
+    forces = read_g * (np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 1e-4, shape))
+    write(Recording("still", Imu(made.imu.t_ns, dps, forces)), tmp_path / "still.mcap")
+    assert any("gyro looks like deg/s" in warning for warning in inspect(tmp_path / "still.mcap").warnings)
+    report = convert(tmp_path / "still.mcap", tmp_path / "log.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "log.mcap").imu
+    np.testing.assert_allclose(fixed.gyro, np.deg2rad(dps), rtol=1e-9)
+    np.testing.assert_allclose(fixed.accel, forces * (1.0 if kept else 9.80665), rtol=1e-9)
+    assert [note.removesuffix(", which stays") for note in report.notes[1:]] == kept
+
+
 def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: Path) -> None:
     last = np.minimum(np.arange(len(made.imu)) // 4 * 4 + 3, len(made.imu) - 1)
     bunched = Imu(made.imu.t_ns[last] + 20_000 * (np.arange(len(made.imu)) % 4), made.imu.gyro, made.imu.accel)
