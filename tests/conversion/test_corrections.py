@@ -389,6 +389,14 @@ def own_type(made: Recording, target: Path, scale: float = 1.0) -> Path:
     return target
 
 
+def test_an_imu_of_a_drivers_own_type_is_one_beside_what_was_made_of_it(made: Recording, tmp_path: Path) -> None:
+    convert(own_type(made, tmp_path / "own.mcap"), tmp_path / "even.mcap", correct=["stamps"])
+    debias_log(tmp_path / "even.mcap", tmp_path / "debiased.mcap", model="static", init=(0.0,) * 6)
+    with Log(tmp_path / "debiased.mcap") as log:
+        assert (log.imu_topics, log.topics["/imu/debiased"].is_derived) == (["/imu"], True)
+    np.testing.assert_array_equal(read(tmp_path / "debiased.mcap").imu.gyro, made.imu.gyro)
+
+
 def test_stamps_in_messages_of_a_drivers_own_type_are_corrected(made: Recording, tmp_path: Path) -> None:
     log = own_type(made, tmp_path / "own.mcap")
     assert any("fractions of a second are written in 100 ns, not in ns" in warning for warning in inspect(log).warnings)
