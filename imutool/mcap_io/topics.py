@@ -267,7 +267,7 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
     if any(topic.schema_name == schemas.IMU and not topic.is_derived for topic in (*found.values(), *topics.values())):
         return found
     for name, topic in topics.items():
-        described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr")
+        described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr") and not topic.is_derived
         definition = definitions[name] if described else None
         if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
             found[name] = _as_ros(topic, imu)

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imutool.conversion.run import ConvertReport, convert
-from imutool.errors import LogError
+from imutool.errors import ConfigError, LogError
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -164,6 +164,22 @@ def test_of_messages_without_a_definition_no_empty_topics_are_made(tmp_path):
     with Log(tmp_path / "out.mcap") as log:
         assert {name: topic.count for name, topic in log.topics.items()} == dict.fromkeys(topics, COUNT)
     assert (report.losses, [note for note in report.notes if "is made of" in note]) == ([], [])
+
+
+def test_the_kind_of_poses_in_an_mcap_log_is_the_users(tmp_path):
+    """Of those that a topic holds, and of those that are made of PX4's and of paths; of a topic without poses it is refused."""
+    topics = {"/odom": [(n, odometry(n)) for n in range(COUNT)], "/path": [(COUNT, path(range(COUNT), COUNT))]}
+    source = written(tmp_path / "bag.mcap", topics | {"/fmu/out/imu": [(n, combined(n)) for n in range(COUNT)]})
+    first = tmp_path / "first.mcap"
+    convert(source, first, kinds=["/odom/pose=truth", "/path/pose=odometry"])
+    convert(first, tmp_path / "second.mcap", kinds=["/path/pose=truth"])
+    with Log(first) as one, Log(tmp_path / "second.mcap") as two:
+        kinds = [[log.topics[f"/{name}/pose"].pose_kind for name in ("odom", "path")] for log in (one, two)]
+    assert kinds == [["truth", "odometry"], ["truth", "truth"]]
+    for topic in ("/fmu/out/imu", "/nothing", "/fmu/out/imu/pose"):
+        with pytest.raises(ConfigError, match=f"'{topic}' holds no poses in bag"):
+            convert(source, tmp_path / "third.mcap", kinds=[f"{topic}=truth"])
+        assert not (tmp_path / "third.mcap").exists()
 
 
 def test_info_names_what_convert_would_make(tmp_path):
