@@ -8,13 +8,14 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.recording import GRAVITY_M_S2, Imu
-from imutool.recording.gyro_steps import RATES_SI as GYRO_SI
+from imutool.recording.gyro_steps import RATES_SI
 from imutool.recording.joined_imu import unit_by_gravity
 
 from ._table_text import Columns
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5, "min": 60e9, "h": 3600e9, "day": 86400e9}  # the last four only where they are stated
+GYRO_SI = RATES_SI
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01, "ft/s^2": 0.3048}
 POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
