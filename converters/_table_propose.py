@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from imutool.recording.gyro_steps import COUNTS_A_DPS, unit_by_steps
+
 from ._table_clock import propose_time
 from ._table_groups import measured
 from ._table_headerless import in_an_array, perhaps
@@ -24,14 +26,12 @@ from ._table_names import (
 from ._table_text import Columns
 from ._table_units import (
     ACCEL_SI,
-    COUNTS_A_DPS,
     GYRO_SI,
     STANDARD_GRAVITY,
     TIME_NS,
     are_unsigned_counts,
     gravity_units,
     raw_counts,
-    unit_by_steps,
 )
 
 RANGES = 250, 500, 1000, 2000  # deg/s, of InvenSense's gyros

@@ -1,7 +1,4 @@
-"""Units of a table's columns by gravity or a register's steps, and doubts about stated ones.
-
-A digital gyro counts in steps that its data sheet states. Values that lie on such a grid, and on no finer one, show the unit.
-"""
+"""Units of a table's columns by gravity, and doubts about stated ones."""
 
 from __future__ import annotations
 
@@ -11,13 +8,14 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.recording import GRAVITY_M_S2, Imu
+from imutool.recording.gyro_steps import RATES_SI
 from imutool.recording.joined_imu import unit_by_gravity
 
 from ._table_text import Columns
 
 USUAL_TIME_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 TIME_NS = {**USUAL_TIME_NS, "100us": 1e5, "min": 60e9, "h": 3600e9, "day": 86400e9}  # the last four only where they are stated
-GYRO_SI = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mdeg/s": np.pi / 180.0e3}
+GYRO_SI = RATES_SI
 STANDARD_GRAVITY = 9.80665
 ACCEL_SI = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000.0, "cm/s^2": 0.01, "ft/s^2": 0.3048}
 POSITION_SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -37,23 +35,6 @@ MOST_TENTH, MOST_MEAN = 0.6, 0.6
 MOST_OF_GRAVITY = 2.0  # factor between gravity and the median acceleration of a robot or a person that moves
 FULL_SCALE_RAD_S = 35.0  # 2000 degrees a second, the widest range of common gyros
 USUAL_SHARE = 0.99  # of the samples: single spikes show no unit
-RANGES_DPS = 125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0  # over 2^15 counts: WitMotion, Bosch, and code for InvenSense
-COUNTS_A_DPS = 131.0, 65.5, 32.8, 16.4, 14.375  # data sheets of InvenSense's MPU, ICM and ITG
-ST_STEPS_DPS = 0.004375, 0.00875, 0.0175, 0.035, 0.07  # data sheets of ST's L3G and LSM
-BNO055_STEPS = {"deg/s": 1 / 16, "rad/s": 1 / 900}  # its data sheet
-WHOLE_DEG_S = 1.0, 0.5, 0.1, 0.01, 0.001  # decimals of degrees, as they look in radians
-STEPS_DPS = *(full / 2**15 for full in RANGES_DPS), *(1 / counts for counts in COUNTS_A_DPS), *ST_STEPS_DPS
-STEPS = [
-    *((unit, step * np.deg2rad(1.0) / size) for unit, size in GYRO_SI.items() for step in STEPS_DPS),
-    *(("rad/s", np.deg2rad(step)) for step in WHOLE_DEG_S),
-    *BNO055_STEPS.items(),
-]
-MOST_ROWS = 100_000  # of a long table, taken evenly
-MOST_STEPS = 100.0  # from the median, within which a step that is stated to 0.1 % stays in phase
-LEAST_LENGTH = 0.85  # of the mean of the phases, where rounded decimals are a tenth of a step off
-LEAST_SUM = 25.0  # of Rayleigh's statistic on three axes: by chance it is larger 5 times in 10^9
-MOST_OFF, MOST_UNCERTAIN = 0.005, 0.003  # share by which the grid's true step differs, and its standard deviation
-LEAST_NEXT = 0.1  # share of neighbours that are one step apart: else the true step is larger
 COUNTS_A_G = {2: 16384, 4: 8192, 8: 4096, 16: 2048}  # by the range in g, of 16 bits
 RAW_BAND = 0.1  # share by which the median length of counts may differ from gravity's
 
@@ -107,42 +88,6 @@ def _usual(values: Float64[np.ndarray, "*n"], share: float) -> float:
     """Quantile of the finite values; nan without any."""
     finite = values[np.isfinite(values)]
     return float(np.quantile(finite, share)) if len(finite) else float("nan")
-
-
-def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
-    """Unit of a gyro whose values are steps of a common sensor, and the step; else None."""
-    rates = rates[:: max(1, len(rates) // MOST_ROWS)]
-    found = [(unit, step) for unit, step in STEPS if _counts_in(rates, step)]
-    return found[0] if len({unit for unit, _ in found}) == 1 else None
-
-
-def _counts_in(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
-    """Whether the values of three axes lie on grids of this step, each with an offset, by Rayleigh's test of their phases."""
-    axes = [_distinct(axis / step) for axis in rates.T]
-    axes = [values for values in axes if len(values) > 1]
-    if not axes:
-        return False
-    sums = [np.exp(2j * np.pi * values).sum() for values in axes]
-    total = sum(abs(each) ** 2 / len(values) for each, values in zip(sums, axes, strict=True))
-    apart = np.concatenate([np.diff(values) for values in axes])
-    if (
-        total < LEAST_SUM
-        or sum(map(abs, sums)) < LEAST_LENGTH * sum(map(len, axes))
-        or (np.round(apart[apart > 0.5]) == 1).sum() < LEAST_NEXT * len(apart)
-    ):
-        return False
-    turns = np.concatenate([np.angle(np.exp(2j * np.pi * v) / each) / (2 * np.pi) for each, v in zip(sums, axes, strict=True)])
-    places = np.concatenate([values - values.mean() for values in axes])
-    power = float((places**2).sum())
-    off, uncertain = float((places * turns).sum()) / power, float(np.sqrt((turns**2).mean() / power))
-    return abs(off) < MOST_OFF and uncertain < MOST_UNCERTAIN
-
-
-def _distinct(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
-    """Different values near the median."""
-    finite = values[np.isfinite(values)]
-    near = finite[np.abs(finite - np.median(finite)) < MOST_STEPS] if len(finite) else finite
-    return np.unique(np.round(near, 6))
 
 
 def raw_counts(accel: Float64[np.ndarray, "n 3"]) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ import numpy as np
 from imutool.errors import DataError
 from imutool.geometry import quaternion
 from imutool.recording import Imu, Poses
-from imutool.recording.joined_imu import in_order
+from imutool.recording.joined_imu import in_order, joined
 from imutool.recording.message_log import MessageLog, Remarks, Table
 
 from . import Sequence
@@ -29,6 +29,7 @@ from .ulog import FLU_FROM_FRD, Q_ENU_FROM_NED_WXYZ, Q_FRD_FROM_FLU_WXYZ
 GENERAL = True
 IMU_FIELDS = "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"
 POSE_FIELDS = "PE", "PN", "PD", "VE", "VN", "VD", "Roll", "Pitch", "Yaw"
+US = 1000  # ns
 EKF_TYPES = "XKF1", "NKF1", "EKF1"  # of EKF3, of EKF2, and of the EKF of logs before 2016
 
 
@@ -115,8 +116,32 @@ def _imus(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Imu]:
         kept = in_order(group.t_ns, values, f"/imu{number}")
         remarks.notes.extend(kept.notes)
         imus[f"/imu{number}"] = Imu(kept.t_ns, kept.values[:, :3] * FLU_FROM_FRD, kept.values[:, 3:] * FLU_FROM_FRD)
+    imus |= _raw_imus(messages, remarks)
     if not imus:
         remarks.losses.append("the log has no samples of an IMU")
+    return imus
+
+
+def _raw_imus(messages: dict[str, Messages], remarks: Remarks) -> dict[str, Imu]:
+    """IMUs of raw samples (GYR and ACC), which a log holds on request, at the times when they were taken."""
+    imus = {}
+    gyros, accels = (_instances(messages, name) for name in ("GYR", "ACC"))
+    for number in sorted(gyros.keys() & accels.keys()):
+        both = (gyros[number], ("SampleUS", *IMU_FIELDS[:3])), (accels[number], ("SampleUS", *IMU_FIELDS[3:]))
+        if not all(_are_numbers(group, fields) for group, fields in both):
+            continue
+        columns = []
+        for group, (clock, *axes) in both:
+            values = np.stack([group.rows[axis] for axis in axes], axis=1).astype(float)
+            columns += [group.rows[clock].astype(np.int64) * US, values * FLU_FROM_FRD]
+        gyro_ns, rates, accel_ns, forces = columns
+        topic = f"/imu{number}/raw"
+        try:
+            imus[topic], notes = joined(gyro_ns, rates, accel_ns, forces, topic)
+        except DataError as error:
+            remarks.losses.append(f"{topic} is left out: {error.what}")
+        else:
+            remarks.notes.extend(notes)
     return imus
 
 

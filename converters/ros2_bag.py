@@ -29,6 +29,7 @@ METADATA = "metadata.yaml"
 SQLITE = b"SQLite format 3\0"
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 LISTED = re.compile(r"relative_file_paths:\s*\n((?:\s*- .*\n)+)")
+STATED = r"{}:[ \t]*['\"]?\w"  # a text of metadata.yaml that is not empty
 MALFORMED = (ValueError, KeyError, TypeError, AttributeError, AssertionError)  # of metadata that rosbags does not check
 ENCODINGS = {"MSG": "ros2msg", "IDL": "ros2idl"}
 
@@ -138,12 +139,16 @@ def _messages(path: Path, topics: dict[str, MessageTopic]) -> Iterator[Message]:
                 yield Message(topics[connection.topic], time_ns, time_ns, payload)
 
 
-def _renamed(folder: Path, remarks: Remarks) -> bool:
-    """Whether files that metadata.yaml names are not there, but others are; fewer than it names are a loss."""
-    match = LISTED.search((folder / METADATA).read_text(encoding="utf-8", errors="replace") + "\n")
+def _misleads(folder: Path, remarks: Remarks) -> bool:
+    """Whether metadata.yaml names no storage, or files that are not there, but others are; fewer than it names are a loss."""
+    text = (folder / METADATA).read_text(encoding="utf-8", errors="replace") + "\n"
+    match = LISTED.search(text)
     named = [PurePath(line.strip()[2:].strip("'\" ")).name for line in match[1].splitlines()] if match else []
     missing = [name for name in named if not (folder / name).exists()]
     there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".db3", ".mcap"))
+    if there and not any(re.search(STATED.format(key), text) for key in ("storage_identifier", "compression_format")):
+        remarks.notes.append(f"{METADATA} names no storage, so its files {', '.join(there)} were read one by one")
+        return True
     if not missing or not there:
         return False
     said = f"{METADATA} names {', '.join(missing)}, which the folder lacks; its files {', '.join(there)} were read instead"
@@ -167,7 +172,7 @@ def _open(path: Path, remarks: Remarks) -> Iterator[list[Any]]:
     readers: list[Any]
     if path.is_file():
         readers = [Sqlite3Reader(path)]
-    elif _has_metadata(path) and not _renamed(path, remarks):
+    elif _has_metadata(path) and not _misleads(path, remarks):
         readers = [DirectoryReader(path)]
     else:
         readers = [Sqlite3Reader(file) for file in sorted(with_suffix(path, ".db3"), key=_first_ns) if _has_messages(file)]

@@ -14,6 +14,7 @@ from imutool.recording import nanoseconds
 BLOCK = 4096  # samples: what rules see at a time depends on the log alone, not on how its chunks were cut
 STEP_NS = nanoseconds(0.1)
 STEP_S = 0.1  # of `Motion`
+MOST_RATES = 20_000  # samples of the gyro that are kept as they are: 480 kB
 
 Numbers = Int64[np.ndarray, " n"]
 
@@ -74,7 +75,7 @@ def padded(stream: Iterable[Samples], margin: int) -> Iterator[tuple[Samples, sl
 
 
 class Motion:
-    """Means of the samples of each step: 64 bytes per 0.1 s, 23 MB for ten hours."""
+    """Means of the samples of each step: 64 bytes per 0.1 s, 23 MB for ten hours; first rates."""
 
     def __init__(self) -> None:
         self.start_ns: int | None = None
@@ -84,6 +85,7 @@ class Motion:
         self._steps: list[Int64[np.ndarray, " m"]] = []
         self._sums: list[Float64[np.ndarray, "m 7"]] = []
         self._open: tuple[int, Float64[np.ndarray, "7"]] | None = None
+        self._rates: list[Float64[np.ndarray, "m 3"]] = []
         self._mean: tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]] | None = None
 
     @property
@@ -99,6 +101,7 @@ class Motion:
             self.start_ns = self.end_ns = int(samples.stamp_ns[0])
         self._sampled_ns += int(np.minimum(np.diff(samples.stamp_ns, prepend=self.end_ns), STEP_NS).sum())
         self.end_ns = int(samples.stamp_ns[-1])
+        self._rates.append(samples.values[: max(MOST_RATES - self.samples, 0), :3].copy())
         self.samples += len(samples.number)
         step = (samples.stamp_ns - self.start_ns) // STEP_NS
         rows = np.column_stack([np.ones(len(step)), samples.values])
@@ -113,6 +116,11 @@ class Motion:
         self._open = int(steps[-1]), sums[-1].copy()
         self._steps.append(steps[:-1])
         self._sums.append(sums[:-1])
+
+    @property
+    def rates(self) -> Float64[np.ndarray, "m 3"]:
+        """First samples of the gyro, as recorded."""
+        return np.concatenate([np.zeros((0, 3)), *self._rates])
 
     def table(self) -> tuple[Int64[np.ndarray, " m"], Float64[np.ndarray, "m 6"]]:
         """Steps of 0.1 s since the first sample, and the mean gyro and accel in each.

@@ -157,7 +157,8 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows.append((imu["topic"], "samples", str(imu["samples"])))
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         if "time" in imu:
-            rows.append((imu["topic"], "time of the samples", f"{imu['time']}, not {', '.join(imu['other_times'])}"))
+            others = f", not {', '.join(imu['other_times'])}" if imu["other_times"] else ""
+            rows.append((imu["topic"], "time of the samples", imu["time"] + others))
         if imu["rate_hz"] is not None:
             clock = f"{imu['rate_hz']:.2f} Hz, jitter {1e3 * imu['jitter_s']:.3f} ms, longest gap {imu['largest_gap_s']:.3f} s"
             rows.append((imu["topic"], "clock of stamps", clock))

@@ -54,6 +54,7 @@ def find_corrections(path: Path, wanted: Sequence[str]) -> Corrections:
                 continue
             survey = look(log, topic, CleaningSettings(fix=True))
             kept += [f"{topic}: {step}" for step in survey.clock_steps]
+            kept += [f"{topic}: {f.distrust}, which stays" for f in survey.findings if f.rule == "units" and f.distrust]
             mount = None if frame_id or (survey.mount == np.eye(3)).all() else survey.mount
             if frame_id:  # the next round judges by the corrected poses
                 survey = replace(survey, axes=AS_RECORDED)

@@ -17,11 +17,12 @@ import imutool
 from imutool.array_types import Shaped, UInt8
 from imutool.conversion.robot_messages import Paths, Px4, pose_kind, px4_of
 from imutool.conversion.sensor_pairs import SensorPairs
+from imutool.conversion.user_labels import check_kinds
 from imutool.errors import DataError, not_installed
 from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.reflection import Reflected, reflect
+from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected, reflect
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import (
@@ -74,7 +75,7 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
             series = Series(log.channel(topic, schemas.IMU), log_times, (imu.t_ns, imu.gyro, imu.accel), _encode_body)
             for chunk in chunks([series]):
                 log.chunk(chunk)
-        _write_trajectories(log, source, stream.paths)
+        check_kinds(source, stream.channels, _write_trajectories(log, source, stream.paths))
         if not log.contents.counts.total():
             raise DataError("holds no messages", where=source.name, expected="a log with data")
         _compare(source, stream.counts)
@@ -83,8 +84,9 @@ def write_log(source: MessageLog, path: Location, *, compression: str = "zstd", 
             log.metadata("imutool/remarks", {f"{number:03d}": line for number, line in enumerate(lines, start=1)})
 
 
-def _write_trajectories(log: LogWriter, source: MessageLog, paths: Paths) -> None:
-    """Write the poses that paths left behind, but where a log that was converted before has them."""
+def _write_trajectories(log: LogWriter, source: MessageLog, paths: Paths) -> list[str]:
+    """Write the poses that paths left behind, but where a log that was converted before has them; their topics."""
+    topics = []
     for topic, found in paths.trajectories():
         if (made := f"{topic}/pose") in source.counts:
             continue
@@ -95,14 +97,16 @@ def _write_trajectories(log: LogWriter, source: MessageLog, paths: Paths) -> Non
             log.chunk(chunk)
         note = f"{made} is made of the messages on {topic}: {paths.messages[topic]}; a later one replaces what it has, too"
         source.remarks.notes.append(note)
+        topics.append(made)
+    return topics
 
 
 class _Stream:
-    """Encoded messages of a source, gathered into chunks."""
+    """Encoded messages of a source, gathered into chunks; `channels` by topic."""
 
     def __init__(self, log: LogWriter, source: MessageLog, pairs: SensorPairs) -> None:
         self._log, self._source, self._pairs = log, source, pairs
-        self._channels: dict[MessageTopic, int] = {}
+        self.channels: dict[MessageTopic, int] = {}
         self._buffers: dict[int, MessageBuffer] = {}  # by channel
         self._shared = MessageBuffer(packed=False), MessageBuffer(packed=False)  # of sensors, and of all others that are small
         self._sequence = Counter[int]()
@@ -123,17 +127,18 @@ class _Stream:
             cdr = self._define(MessageTopic(topic.name, found.schema_name, "ros2msg", b"", "cdr", marks))
             recorded = (*topic.metadata, (RECORDED_KEY, topic.name))
             number = self._define(replace(topic, name=f"{topic.name}/as_recorded", metadata=recorded))
-            self._channels[topic] = number
+            self.channels[topic] = number
             self._reflected[number] = cdr, found
             units = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
-            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}"
+            at = "" if found.stamp else f"; at the {LOG_TIME}"
+            note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}{at}"
             self._source.remarks.notes.append(note)
             return number
         kind = self._source.kinds.get(topic.name)
         marked = topic if kind is None else replace(topic, metadata=(*topic.metadata, (KIND_KEY, kind)))
         if (whole := self._pairs.whole_of(topic.name)) is not None:
             marked = replace(marked, metadata=(*marked.metadata, (PART_KEY, whole)))
-        number = self._channels[topic] = self._log.define(marked)
+        number = self.channels[topic] = self._log.define(marked)
         name = schemas.canonical(topic.schema_name)
         if name in BULKY:
             self._buffers[number] = MessageBuffer(packed=name in PACKED)
@@ -145,7 +150,7 @@ class _Stream:
         """Chunks of about 1 MiB as they fill, and the rest at the end."""
         last, longest, jumps = None, nanoseconds(MOST_GAP_S), list[tuple[int, float]]()
         for topic, log_time, publish_time, payload in self._source.messages():
-            if (number := self._channels.get(topic)) is None:
+            if (number := self.channels.get(topic)) is None:
                 number = self._define(topic, payload)
             if not 0 <= log_time <= LATEST_NS:
                 raise DataError(f"a message of {topic.name} has the time {log_time} ns", expected="a time from 1970 to 2262")
@@ -165,7 +170,7 @@ class _Stream:
             if buffer.parts:
                 yield buffer.pop()
         self._source.remarks.notes += jump_warnings(jumps)
-        for topic, number in self._channels.items():
+        for topic, number in self.channels.items():
             self.counts[topic.name] += self._sequence[number]
         for name, count in self._lacking.items():
             where = f"; see {name}/as_recorded" if name not in self._made_of else ""

@@ -122,7 +122,9 @@ def px4_sensors(topics: Iterable[MessageTopic]) -> dict[str, Px4]:
 
 
 def _px4(topic: MessageTopic, kind: str, schema_name: str, ending: str) -> Px4 | None:
-    """Access to the messages of a topic; None of a definition that cannot be read."""
+    """Access to the messages of a topic; None of a definition that is lacking, as in a bag before Iron, or cannot be read."""
+    if not topic.schema:
+        return None
     try:
         form = DescribedCdr(parse(schemas.canonical(topic.schema_name), topic.schema))
     except LogError:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from imutool.errors import ConfigError
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.joined_imu import parse_parts, whole_of
-from imutool.mcap_io.topics import MESSAGE_POSES
+from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
 from imutool.mcap_io.write import RECORD
 from imutool.recording import Recording
-from imutool.recording.message_log import KINDS, MessageLog
+from imutool.recording.message_log import KINDS, MessageLog, MessageTopic
 
 POSES = (*MESSAGE_POSES, schemas.TF)
 
@@ -42,8 +42,11 @@ class Labels:
             if wrong := [f"{topic}={kind}" for topic, kind in self.kinds if kind != "truth"]:
                 raise ConfigError(f"{wrong[0]}: the data set states that these poses are its truth", where="kinds")
             return content
-        topics = [topic.name for topic in content.topics if schemas.canonical(topic.schema_name) in POSES]
-        self._check([*content.poses, *topics], content.name)
+        known = {topic.name: schemas.canonical(topic.schema_name) for topic in content.topics}
+        poses = [*content.poses, *(name for name, kind in known.items() if kind in POSES)]
+        others = [name for name in content.counts if name not in known]  # an MCAP log's, which the writer judges as they come
+        made = [f"{name}/pose" for name in (*known, *others)]
+        self._check([*poses, *others], content.name, made)
         return replace(content, kinds={**content.kinds, **dict(self.kinds)})
 
     def _with_pair(self, content: Recording | MessageLog, parts: tuple[str, str]) -> MessageLog:
@@ -54,11 +57,28 @@ class Labels:
             raise ConfigError(f"no IMU messages to join on {named}", where="imu", expected=expected)
         return replace(content, pairs={whole_of(parts): parts})
 
-    def _check(self, topics: Collection[str], name: str) -> None:
+    def _check(self, topics: Collection[str], name: str, perhaps: Collection[str] = ()) -> None:
         for topic, _ in self.kinds:
-            if topic not in topics:
-                have = ", ".join(topics) or "a recording with poses, which this one lacks"
-                raise ConfigError(f"{topic!r} holds no poses in {name}", where="kinds", expected=have)
+            if topic not in topics and topic not in perhaps:
+                raise _without_poses(topic, topics, name)
+
+
+def check_kinds(content: MessageLog, topics: Iterable[MessageTopic], made: Iterable[str]) -> None:
+    """Refuse a kind of a topic that turned out to have no poses, as its encoding shows it.
+
+    Raises:
+        ConfigError: such a topic.
+    """
+    types = {topic.name: (topic.message_encoding, schemas.canonical(topic.schema_name)) for topic in topics}
+    poses = [*content.poses, *made, *(name for name, (_, kind) in types.items() if kind in POSES)]
+    for name in content.kinds:
+        if name not in poses and types.get(name, ("cdr", ""))[0] in ENCODINGS:
+            raise _without_poses(name, poses, content.name)
+
+
+def _without_poses(topic: str, topics: Collection[str], name: str) -> ConfigError:
+    have = ", ".join(topics) or "a recording with poses, which this one lacks"
+    return ConfigError(f"{topic!r} holds no poses in {name}", where="kinds", expected=have)
 
 
 def parse_kinds(texts: Sequence[str]) -> tuple[tuple[str, str], ...]:

@@ -35,7 +35,7 @@ from imutool.log_info.convention_report import (
 from imutool.log_info.pose_imu_rotation import agreement
 from imutool.log_info.report import Clock, ImuInfo, ImuNoise, Interval, LogInfo, TopicInfo, TruthInfo
 from imutool.mcap_io.codec import schemas
-from imutool.mcap_io.codec.reflection import Reflected
+from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
@@ -140,10 +140,12 @@ def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
 
 
 def _times(topic: Topic) -> tuple[str, list[str]] | tuple[msgspec.UnsetType, msgspec.UnsetType]:
-    """Field that stamps the samples, and the other times, where a message holds several."""
+    """Field that stamps the samples, and the other times, where a message holds several; the log time where it holds none."""
     found = topic.reflected
-    if not isinstance(found, Reflected) or not found.other_stamps:
+    if not isinstance(found, Reflected) or (found.stamp and not found.other_stamps):
         return UNSET, UNSET
+    if not found.stamp:
+        return LOG_TIME, []
     used, *others = [".".join(map(str, path)) for path in (found.stamp[0][0], *found.other_stamps)]
     return used.removesuffix(f".{found.stamp[0][0][-1]}") if len(found.stamp) > 1 else used, others
 

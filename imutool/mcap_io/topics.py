@@ -243,7 +243,7 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
     """IMUs and poses among the topics whose type is not that of ROS.
 
     `first` gives the first message of a topic.
-    Types of ROS 2 count only where the log has no other IMU: drivers publish their own message beside that of ROS.
+    Types of ROS 2 count only where the log has no other recorded IMU: drivers publish their own message beside that of ROS.
     """
     definitions = {channel.topic: index.schemas.get(channel.schema_id) for channel in index.channels.values()}
     found: dict[str, Topic] = {}
@@ -264,10 +264,10 @@ def reflected_topics(index: LogIndex, topics: Mapping[str, Topic], first: Callab
             continue
         if message is not None:
             found[name] = _as_ros(topic, message)
-    if any(topic.schema_name == schemas.IMU for topic in (*found.values(), *topics.values())):
+    if any(topic.schema_name == schemas.IMU and not topic.is_derived for topic in (*found.values(), *topics.values())):
         return found
     for name, topic in topics.items():
-        described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr")
+        described = (topic.schema_encoding, topic.message_encoding) == ("ros2msg", "cdr") and not topic.is_derived
         definition = definitions[name] if described else None
         if definition is not None and (imu := reflect_cdr(topic.schema_name, definition.data)) is not None:
             found[name] = _as_ros(topic, imu)

@@ -305,6 +305,18 @@ def test_both_units_are_settled_together(made, truth):
     assert survey.scale == pytest.approx([1.0 / DEGREES] * 3 + [9.80665] * 3)
 
 
+@pytest.mark.parametrize(("step", "factor"), [(250 / 2**15, 1.0 / DEGREES), (np.deg2rad(250 / 2**15), 1.0), (0.01, 1.0)])
+def test_the_steps_of_a_register_settle_the_gyros_unit_at_rest(step, factor, made):
+    """As a driver of a hobby sensor that sends its deg/s as rad/s; other steps show none."""
+    counts = np.round(np.random.default_rng(5).normal(20.0, 8.0, made.gyro.shape))
+    still = np.array([0.3, -0.2, 9.8]) + np.random.default_rng(6).normal(0.0, 0.01, made.accel.shape)
+    survey = look(made._replace(gyro=np.round(counts * step, 6), accel=still))
+    assert survey.scale[:3] == pytest.approx(factor)
+    assert [one.what for one in survey.findings] == (
+        [f"gyro is in deg/s, not rad/s: it counts in steps of {step:.6g} deg/s, as a common sensor does"] if factor != 1 else []
+    )
+
+
 def test_units_are_only_said_when_asked_so(made, truth):
     survey = look(made._replace(gyro=made.gyro * DEGREES), truth, CleaningSettings(convert_units=False))
     assert only(survey, "units").action == "flagged"

@@ -277,6 +277,25 @@ def test_a_right_log_stays_as_it_is(made: Recording, tmp_path: Path) -> None:
     assert report.notes == ["same.mcap: the motion shows nothing to correct"]
 
 
+@pytest.mark.parametrize(
+    ("read_g", "kept"), [(1.0, []), (0.55, ["log.mcap: /imu0: the unit of accel is unknown: it reads 0.55"])]
+)
+def test_a_log_at_rest_in_g_and_steps_of_a_register_comes_in_radians(
+    read_g: float, kept: list[str], made: Recording, tmp_path: Path
+) -> None:
+    """What the motion does not settle is said too."""
+    rng, shape = np.random.default_rng(7), made.imu.gyro.shape
+    dps = np.round(np.round(rng.normal(30.0, 9.0, shape)) * 250 / 2**15, 6)
+    forces = read_g * (np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 1e-4, shape))
+    write(Recording("still", Imu(made.imu.t_ns, dps, forces)), tmp_path / "still.mcap")
+    assert any("gyro looks like deg/s" in warning for warning in inspect(tmp_path / "still.mcap").warnings)
+    report = convert(tmp_path / "still.mcap", tmp_path / "log.mcap", correct=["conventions"])
+    fixed = read(tmp_path / "log.mcap").imu
+    np.testing.assert_allclose(fixed.gyro, np.deg2rad(dps), rtol=1e-9)
+    np.testing.assert_allclose(fixed.accel, forces * (1.0 if kept else 9.80665), rtol=1e-9)
+    assert [note.removesuffix(", which stays") for note in report.notes[1:]] == kept
+
+
 def test_batched_stamps_are_put_on_the_sensors_line(made: Recording, tmp_path: Path) -> None:
     last = np.minimum(np.arange(len(made.imu)) // 4 * 4 + 3, len(made.imu) - 1)
     bunched = Imu(made.imu.t_ns[last] + 20_000 * (np.arange(len(made.imu)) % 4), made.imu.gyro, made.imu.accel)
@@ -368,6 +387,14 @@ def own_type(made: Recording, target: Path, scale: float = 1.0) -> Path:
             writer.add_message(channel, t_ns + 3_000_000, data, t_ns + 3_000_000)
         writer.finish()
     return target
+
+
+def test_an_imu_of_a_drivers_own_type_is_one_beside_what_was_made_of_it(made: Recording, tmp_path: Path) -> None:
+    convert(own_type(made, tmp_path / "own.mcap"), tmp_path / "even.mcap", correct=["stamps"])
+    debias_log(tmp_path / "even.mcap", tmp_path / "debiased.mcap", model="static", init=(0.0,) * 6)
+    with Log(tmp_path / "debiased.mcap") as log:
+        assert (log.imu_topics, log.topics["/imu/debiased"].is_derived) == (["/imu"], True)
+    np.testing.assert_array_equal(read(tmp_path / "debiased.mcap").imu.gyro, made.imu.gyro)
 
 
 def test_stamps_in_messages_of_a_drivers_own_type_are_corrected(made: Recording, tmp_path: Path) -> None:

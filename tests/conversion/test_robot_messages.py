@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from imutool.conversion.run import ConvertReport, convert
-from imutool.errors import LogError
+from imutool.errors import ConfigError, LogError
 from imutool.log_info.inspection import inspect
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -82,14 +82,14 @@ def path(poses: Iterable[int], now: int, stamp_of: int | None = None) -> Any:
     return TYPES["nav_msgs/msg/Path"](header(START_NS + STEP_NS * now), made)
 
 
-def written(log: Path, topics: dict[str, list[tuple[int, Any]]]) -> Path:
-    """A log of messages by topic, each at its step."""
+def written(log: Path, topics: dict[str, list[tuple[int, Any]]], *, defined: bool = True) -> Path:
+    """A log of messages by topic, each at its step; with or without definitions."""
     with log.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
         for topic, messages in topics.items():
             kind = messages[0][1].__msgtype__
-            definition = STORE.generate_msgdef(kind, ros_version=2)[0]
+            definition = STORE.generate_msgdef(kind, ros_version=2)[0] if defined else ""
             channel = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", definition.encode()))
             for n, message in messages:
                 t_ns = START_NS + n * STEP_NS
@@ -153,6 +153,33 @@ def test_a_log_that_was_converted_before_gets_no_second_topic(tmp_path):
     convert(out, tmp_path / "again.mcap")
     with Log(out) as first, Log(tmp_path / "again.mcap") as second:
         assert {t: d.count for t, d in first.topics.items()} == {t: d.count for t, d in second.topics.items()}
+
+
+def test_of_messages_without_a_definition_no_empty_topics_are_made(tmp_path):
+    """As in bags before Iron: what lacks is said where they are read, and nothing of them is lost."""
+    topics = {"/fmu/out/sensor_combined": [(n, combined(n)) for n in range(COUNT)]}
+    topics |= {"/fmu/out/sensor_gyro": [(n, single("SensorGyro", n, GYRO)) for n in range(COUNT)]}
+    topics |= {"/fmu/out/vehicle_odometry": [(n, odometry(n)) for n in range(COUNT)]}
+    report = convert(written(tmp_path / "bag.mcap", topics, defined=False), tmp_path / "out.mcap")
+    with Log(tmp_path / "out.mcap") as log:
+        assert {name: topic.count for name, topic in log.topics.items()} == dict.fromkeys(topics, COUNT)
+    assert (report.losses, [note for note in report.notes if "is made of" in note]) == ([], [])
+
+
+def test_the_kind_of_poses_in_an_mcap_log_is_the_users(tmp_path):
+    """Of those that a topic holds, and of those that are made of PX4's and of paths; of a topic without poses it is refused."""
+    topics = {"/odom": [(n, odometry(n)) for n in range(COUNT)], "/path": [(COUNT, path(range(COUNT), COUNT))]}
+    source = written(tmp_path / "bag.mcap", topics | {"/fmu/out/imu": [(n, combined(n)) for n in range(COUNT)]})
+    first = tmp_path / "first.mcap"
+    convert(source, first, kinds=["/odom/pose=truth", "/path/pose=odometry"])
+    convert(first, tmp_path / "second.mcap", kinds=["/path/pose=truth"])
+    with Log(first) as one, Log(tmp_path / "second.mcap") as two:
+        kinds = [[log.topics[f"/{name}/pose"].pose_kind for name in ("odom", "path")] for log in (one, two)]
+    assert kinds == [["truth", "odometry"], ["truth", "truth"]]
+    for topic in ("/fmu/out/imu", "/nothing", "/fmu/out/imu/pose"):
+        with pytest.raises(ConfigError, match=f"'{topic}' holds no poses in bag"):
+            convert(source, tmp_path / "third.mcap", kinds=[f"{topic}=truth"])
+        assert not (tmp_path / "third.mcap").exists()
 
 
 def test_info_names_what_convert_would_make(tmp_path):

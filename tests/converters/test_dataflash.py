@@ -69,6 +69,24 @@ def test_an_imu_of_other_fields_is_named_as_lost(tmp_path):
     assert any("/imu1 lacks numbers of GyrX" in loss for loss in log.remarks.losses)
 
 
+@pytest.mark.parametrize("older", [False, True])
+def test_raw_samples_become_an_imu_at_the_times_when_they_were_taken(tmp_path, older):
+    """GYR and ACC are what a log holds of each sample on request; of logs before 2020 each sensor has its own message."""
+    lines = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
+    for kind, sensor in ((9, "GYR"), (10, "ACC")):
+        name, axes = sensor + ("2" if older else ""), ",".join(f"{sensor.capitalize()}{axis}" for axis in "XYZ")
+        form, which, instance = ("QQfff", "", "") if older else ("QBQfff", "I,", "1, ")
+        lines.append(f"FMT, {kind}, 40, {name}, {form}, TimeUS,{which}SampleUS,{axes}")
+        lines += [f"{name}, {5000 + 1000 * n}, {instance}{4000 + 1000 * n}, {0.1 * n}, 0.2, -9.5" for n in range(50)]
+    (tmp_path / "1.log").write_text("\n".join(lines) + "\n")
+    log = dataflash.read_sequence(dataflash.sequences(tmp_path / "1.log")[0])
+    imu = log.imus["/imu1/raw"]
+    assert (list(log.imus), log.remarks.losses) == (["/imu1/raw"], [])
+    assert imu.t_ns.tolist() == [(4000 + 1000 * n) * 1000 for n in range(50)]
+    for values in (imu.gyro, imu.accel):  # FRD becomes FLU
+        np.testing.assert_allclose(values, np.array([[0.1 * n, -0.2, 9.5] for n in range(50)]), rtol=1e-6)
+
+
 def test_imus_poses_and_every_message_arrive(convert, imutool, tmp_path):
     done = convert(write_dataflash(tmp_path / "00000042.BIN"), tmp_path / "out.mcap")
     assert done.returncode == 0, done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sqlite3
 from pathlib import Path
@@ -254,6 +255,20 @@ def test_a_storage_file_that_was_renamed_is_read(convert, tmp_path, storage):
     done = convert(bag, tmp_path / "a.mcap")
     assert done.returncode == 0, done.stderr
     assert f"metadata.yaml names {file.name}, which the folder lacks; its files walk{file.suffix} were read" in done.stderr
+    assert len(messages_of(tmp_path / "a.mcap")[0]) == 3 * COUNT
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_metadata_that_names_no_storage_is_passed_over(convert, tmp_path, storage):
+    """As `ros2 bag reindex` of some versions writes it."""
+    bag = write_bag(tmp_path / "bag", storage)
+    text = (bag / "metadata.yaml").read_text()
+    named = re.compile(r"storage_identifier: \w+")
+    assert named.search(text)
+    (bag / "metadata.yaml").write_text(named.sub('storage_identifier: ""', text))
+    done = convert(bag, tmp_path / "a.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "metadata.yaml names no storage, so its files" in done.stderr
     assert len(messages_of(tmp_path / "a.mcap")[0]) == 3 * COUNT
 
 

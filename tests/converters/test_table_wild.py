@@ -12,8 +12,9 @@ from support.tables import write_csv
 from imutool.converters import table
 from imutool.converters._table_headerless import as_table
 from imutool.converters._table_names import split_name
-from imutool.converters._table_units import raw_counts, unit_by_steps
+from imutool.converters._table_units import raw_counts
 from imutool.errors import ConfigError
+from imutool.recording.gyro_steps import unit_by_steps
 
 COUNT = 300
 RNG = np.random.default_rng(23)

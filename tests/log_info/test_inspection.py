@@ -15,6 +15,7 @@ from mcap.writer import Writer
 from support.imu_defects import survey
 
 from imutool.cli.info import imu_rows, topic_rows
+from imutool.conversion.run import convert
 from imutool.converters import fetch, tum_vi
 from imutool.errors import LogError
 from imutool.log_info.inspection import inspect
@@ -347,9 +348,19 @@ def test_what_is_no_log_is_refused(tmp_path, content):
         inspect(tmp_path / "log.mcap")
 
 
-@pytest.mark.parametrize("device_time", [True, False])
-def test_of_two_times_in_a_message_the_one_that_counts_is_named(tmp_path: Path, device_time: bool) -> None:
-    """A made-up driver's JSON: a header of the computer, and the sensor's own counter, which starts at 0."""
+LOG_TIME = "log time, as the messages state no stamp with its unit"
+
+
+@pytest.mark.parametrize(
+    ("fields", "time", "others"),
+    [
+        ({"header": {"stamp": {"sec": 1_700_000_000, "nsec": 0}}}, None, None),
+        ({"header": {"stamp": {"sec": 1_700_000_000, "nsec": 0}}, "sensor_time_us": 5000}, "header.stamp", ["sensor_time_us"]),
+        ({"timestamp": 1_700_000_000.25}, LOG_TIME, []),  # of which unit?
+    ],
+)
+def test_the_time_that_counts_is_named_if_a_message_leaves_it_open(tmp_path: Path, fields, time, others) -> None:
+    """A made-up driver's JSON: a header of the computer, the sensor's own counter, which starts at 0, or a bare number."""
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -357,15 +368,13 @@ def test_of_two_times_in_a_message_the_one_that_counts_is_named(tmp_path: Path, 
         for n in range(200):
             t_ns = 1_700_000_000_000_000_000 + n * 5_000_000
             vectors = {name: {"x": 0.0, "y": 0.1, "z": 9.81} for name in ("angularVelocity", "linearAcceleration")}
-            header = {"stamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}}
-            content = {"header": header, **({"sensor_time_us": n * 5000} if device_time else {}), **vectors}
-            writer.add_message(imu, t_ns, json.dumps(content).encode(), t_ns)
+            writer.add_message(imu, t_ns, json.dumps({**fields, **vectors}).encode(), t_ns)
         writer.finish()
     report = inspect(tmp_path / "a.mcap")
     (info,) = json_values(report)["imu"]
     assert info["first_ns"] == 1_700_000_000_000_000_000
-    assert (info.get("time"), info.get("other_times")) == (
-        ("header.stamp", ["sensor_time_us"]) if device_time else (None, None)
-    )
+    assert (info.get("time"), info.get("other_times")) == (time, others)
     shown = [value for _, name, value in imu_rows(report) if name == "time of the samples"]
-    assert shown == (["header.stamp, not sensor_time_us"] if device_time else [])
+    assert shown == ([f"{time}, not sensor_time_us" if others else time] if time else [])
+    notes = convert(tmp_path / "a.mcap", tmp_path / "b.mcap").notes
+    assert any(note.endswith(f"; at the {LOG_TIME}") for note in notes) == (time == LOG_TIME)

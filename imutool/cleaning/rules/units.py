@@ -1,7 +1,7 @@
 """Units other than m/s² and rad/s: g, mg, mm/s², ft/s², counts of 16 bits; degrees a second.
 
-Gravity at rest settles the accelerometer's. The gyro's is settled by the rate of the poses, and else by gravity: integrated,
-the gyro must carry the specific force along.
+Gravity at rest settles the accelerometer's. The gyro's is settled by the rate of the poses, else by gravity: integrated, the
+gyro must carry the specific force along; and else by the steps in which a common sensor counts.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from imutool.cleaning.finding import Finding, Severity
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.unit_evidence import FORCES, MOVING_TOLERANCE, RATES, accel_reading, rate_ratio
 from imutool.recording import GRAVITY_M_S2
+from imutool.recording.gyro_steps import unit_by_steps
 from imutool.units import FULL_SCALE_RAD_S
 
 FREE_OF_GRAVITY_M_S2 = 0.5
@@ -87,6 +88,8 @@ def _gyro_unit(whole: TopicSummary) -> tuple[str, bool, str, float | None]:
     relative = whole.conventions.relative
     if relative is not None:
         return relative.unit, True, "in this unit it turns as gravity does in the accelerometer", ratio
+    if (steps := unit_by_steps(whole.motion.rates)) is not None:
+        return steps[0], True, f"it counts in steps of {steps[1]:.6g} {steps[0]}, as a common sensor does", ratio
     _, mean = whole.motion.table()
     fastest = float(np.abs(mean[:, :3]).max(initial=0.0))
     return ("deg/s" if fastest > FULL_SCALE_RAD_S else "rad/s"), False, f"it reaches {fastest:.4g}", ratio
