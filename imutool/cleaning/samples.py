@@ -101,7 +101,8 @@ class Motion:
             self.start_ns = self.end_ns = int(samples.stamp_ns[0])
         self._sampled_ns += int(np.minimum(np.diff(samples.stamp_ns, prepend=self.end_ns), STEP_NS).sum())
         self.end_ns = int(samples.stamp_ns[-1])
-        self._rates.append(samples.values[: max(MOST_RATES - self.samples, 0), :3].copy())
+        if self.samples < MOST_RATES:
+            self._rates.append(samples.values[: MOST_RATES - self.samples, :3].copy())
         self.samples += len(samples.number)
         step = (samples.stamp_ns - self.start_ns) // STEP_NS
         rows = np.column_stack([np.ones(len(step)), samples.values])
