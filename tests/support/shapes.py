@@ -181,7 +181,7 @@ def _look(value: Any) -> Hashable:
     if not issubclass(kind, np.ndarray) and not (torch is not None and issubclass(kind, torch.Tensor)):
         _looks[kind] = None
         return kind
-    _looks[kind] = lambda array: (kind, array.dtype, tuple(array.shape))
+    _looks[kind] = lambda array: (kind, array.dtype, array.shape)
     return _combination(value)
 
 
