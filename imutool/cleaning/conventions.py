@@ -15,7 +15,7 @@ import numpy as np
 
 from imutool.array_types import Float64, Int64
 from imutool.cleaning.likelihood import BLOCKS_S, CLEARLY, FEWEST_BLOCKS, SURE, Choice, Reading, choose, signed_permutations
-from imutool.cleaning.pose_delay import Delay, between, pose_delay, usable
+from imutool.cleaning.pose_delay import Delay, StepIntegral, pose_delay, usable
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD, is_other_world, read_right
 from imutool.cleaning.position_unit import POSITIONS, Misfits, position_unit
 from imutool.cleaning.samples import STEP_S, Motion
@@ -192,7 +192,7 @@ def _gyro_against_poses(
     if not len(use):
         return None
     true = rate[use] - median(rate[use])
-    measured = between(step, mean[:, :3], first_s, last_s)
+    measured = StepIntegral.of(step, mean[:, :3]).between(first_s, last_s)
     measured -= median(measured)
     readings = _rate_readings(float(quantile(np.linalg.norm(measured, axis=1), 0.9)))
     if not readings:

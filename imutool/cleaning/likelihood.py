@@ -40,9 +40,10 @@ def choose(errors: Float64[np.ndarray, "c n"], blocks: Int64[np.ndarray, " n"]) 
     number, inverse = np.unique(blocks, return_inverse=True)
     if len(number) < FEWEST_BLOCKS:
         return None
-    misfit = np.sqrt(median(errors**2, axis=1))
+    squares = errors**2
+    misfit = np.sqrt(median(squares, axis=1))
     sigma = max(float(misfit.min()), 1e-9)
-    likelihood = -0.5 * (STUDENT + 3.0) * np.log1p((errors / sigma) ** 2 / STUDENT)
+    likelihood = -0.5 * (STUDENT + 3.0) * np.log1p(squares / (STUDENT * sigma**2))
     sums = np.stack([np.bincount(inverse, row) for row in likelihood])
     best = int(np.argmax(sums.sum(axis=1)))
     ahead = sums[best] - sums

@@ -174,8 +174,7 @@ class _Turns(NamedTuple):
     size: Float64[np.ndarray, " n"]
     first_s: Float64[np.ndarray, " n"]
     last_s: Float64[np.ndarray, " n"]
-    step: Int64[np.ndarray, " m"]
-    gyro: Float64[np.ndarray, "m 3"]
+    gyro: StepIntegral
 
     @classmethod
     def of(
@@ -186,22 +185,20 @@ class _Turns(NamedTuple):
         step, mean = motion.table()
         use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)
         inside = (first_s > longest_s + STEP_S * step[0]) & (last_s + longest_s < STEP_S * (step[-1] + 1))
-        gyro = mean[:, :3] - bias
-        return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], step, gyro)
+        gyro = StepIntegral.of(step, mean[:, :3] - bias)
+        return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], gyro)
 
     def correlations(self, lags: Float64[np.ndarray, " l"], count: int) -> Float64[np.ndarray, "l p"]:
         """Correlations with the gyro at each lag: of all turns, and of each of `count` parts of the log."""
-        rows = []
-        for lag in lags:
-            measured = np.linalg.norm(between(self.step, self.gyro, self.first_s - lag, self.last_s - lag), axis=1)
-            parts = zip(np.array_split(self.size, count), np.array_split(measured, count), strict=True)
-            rows.append([_correlation(self.size, measured), *(_correlation(*part) for part in parts)])
-        return np.array(rows)
+        means = (self.gyro.between(self.first_s - lag, self.last_s - lag) for lag in lags)
+        measured = np.stack([np.linalg.norm(mean, axis=1) for mean in means])
+        parts = zip(np.array_split(self.size, count), np.array_split(measured, count, axis=1), strict=True)
+        return np.stack([_correlations(self.size, measured), *(_correlations(*part) for part in parts)], axis=1)
 
 
-def _correlation(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    return float((a * b).sum() / np.sqrt(max((a * a).sum() * (b * b).sum(), 1e-300)))
+def _correlations(a: Float64[np.ndarray, " n"], rows: Float64[np.ndarray, "l n"]) -> Float64[np.ndarray, " l"]:
+    a, rows = a - a.mean(), rows - rows.mean(axis=1, keepdims=True)
+    return np.asarray((a * rows).sum(axis=1) / np.sqrt(np.maximum((a * a).sum() * (rows * rows).sum(axis=1), 1e-300)))
 
 
 def _peak(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) -> float:
@@ -214,24 +211,30 @@ def _peak(lags: Float64[np.ndarray, " l"], values: Float64[np.ndarray, " l"]) ->
     return float(lags[best] + (0.5 * (before - after) / curve * FINE_S if curve < 0 else 0.0))
 
 
-def between(
-    step: Int64[np.ndarray, " m"],
-    values: Float64[np.ndarray, "m 3"],
-    first_s: Float64[np.ndarray, " n"],
-    last_s: Float64[np.ndarray, " n"],
-) -> Float64[np.ndarray, "n 3"]:
-    """Mean of the values between two times, from the integral of the steps' means.
+class StepIntegral(NamedTuple):
+    """Integral over the means of steps, at the steps' edges (s)."""
 
-    Missing steps count as one wide step with the mean of its neighbours: the cost goes by samples, whatever the stamps say.
-    """
-    edges = STEP_S * np.stack([step, step + 1], axis=1).reshape(-1)
-    means = np.repeat(values, 2, axis=0)[:-1]
-    means[1::2] = 0.5 * (values[1:] + values[:-1])
-    whole = np.concatenate([np.zeros((1, 3)), np.cumsum(means * np.diff(edges)[:, None], axis=0)])
-    edges, rows = np.unique(edges, return_index=True)
-    a, b = (np.stack([np.interp(t, edges, column) for column in whole[rows].T], axis=1) for t in (first_s, last_s))
-    mean: Float64[np.ndarray, "n 3"] = (b - a) / (last_s - first_s)[:, None]
-    return mean
+    edges_s: Float64[np.ndarray, " e"]
+    columns: Float64[np.ndarray, "3 e"]
+
+    @classmethod
+    def of(cls, step: Int64[np.ndarray, " m"], values: Float64[np.ndarray, "m 3"]) -> StepIntegral:
+        """Integral of some steps.
+
+        Missing steps count as one wide step with the mean of its neighbours: the cost goes by samples, whatever the stamps say.
+        """
+        edges = STEP_S * np.stack([step, step + 1], axis=1).reshape(-1)
+        means = np.repeat(values, 2, axis=0)[:-1]
+        means[1::2] = 0.5 * (values[1:] + values[:-1])
+        whole = np.concatenate([np.zeros((1, 3)), np.cumsum(means * np.diff(edges)[:, None], axis=0)])
+        edges, rows = np.unique(edges, return_index=True)
+        return cls(edges, np.ascontiguousarray(whole[rows].T))
+
+    def between(self, first_s: Float64[np.ndarray, " n"], last_s: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:
+        """Mean of the values between two times."""
+        a, b = (np.stack([np.interp(t, self.edges_s, column) for column in self.columns], axis=1) for t in (first_s, last_s))
+        mean: Float64[np.ndarray, "n 3"] = (b - a) / (last_s - first_s)[:, None]
+        return mean
 
 
 def usable(

@@ -41,8 +41,9 @@ class Misfits(NamedTuple):
 
     def sizes(self, factor: float) -> Float64[np.ndarray, "r n"]:
         """Lengths of the misfits of every reading."""
-        moved = factor * self.a_w + self.gravity[:, None]
-        return np.concatenate([np.linalg.norm(moved - turned, axis=2) for turned in self.turned])
+        moved = np.moveaxis(factor * self.a_w + self.gravity[:, None], -1, 0)  # norm(axis=2) takes three times as long
+        squares = (sum((to - of) ** 2 for to, of in zip(moved, turned.T, strict=True)) for turned in self.turned)
+        return np.asarray(np.sqrt(np.concatenate([*squares])))
 
     def averaged(self, width: int) -> Misfits:
         """Triangular averages, as second differences over `width` rows average an acceleration."""

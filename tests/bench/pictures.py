@@ -105,7 +105,7 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     logs = [load(options.log, models=[options.model], init=options.init)]
     duration_s = logs[0].duration_s
-    with tempfile.TemporaryDirectory() as folder, VIEWERS.chromium() as browser:
+    with tempfile.TemporaryDirectory() as folder, VIEWERS.chromium(webgl=True) as browser:
         for tab in TABS:
             with in_front(tab):
                 export(logs, Path(folder) / tab, source=False, at_s=duration_s)

@@ -211,11 +211,16 @@ def test_positions_of_no_certain_scale_have_no_other_unit(scale: float, flown: t
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("noise_m", [0.02, 0.2, 2.0, 20.0])
-def test_noisy_or_unrelated_positions_have_no_other_unit(noise_m: float, seed: int, flown: tuple[Imu, Truth]) -> None:
+def test_noisy_positions_have_no_other_unit(noise_m: float, seed: int, flown: tuple[Imu, Truth]) -> None:
     imu, truth = flown
     noise = noise_m * np.random.default_rng(seed).normal(size=truth.p_wb.shape)
-    for p_wb in (truth.p_wb + noise, truth.p_wb[::-1] / noise_m, 0.0 * noise):
-        assert judge(motion_of(imu), truth._replace(p_wb=p_wb), 1.0).unit == "m"
+    assert judge(motion_of(imu), truth._replace(p_wb=truth.p_wb + noise), 1.0).unit == "m"
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.05, 0.5, 5.0, 50.0])
+def test_unrelated_positions_have_no_other_unit(scale: float, flown: tuple[Imu, Truth]) -> None:
+    imu, truth = flown
+    assert judge(motion_of(imu), truth._replace(p_wb=scale * truth.p_wb[::-1]), 1.0).unit == "m"
 
 
 @pytest.mark.parametrize("number", range(48))

@@ -116,15 +116,16 @@ def test_what_cannot_be_shown_is_named(tmp_path: Path, out: Path) -> None:
         logs_of([tmp_path])
 
 
-@pytest.mark.parametrize("web", [[], ["--web"]])
-def test_the_command_lists_the_worst_and_serves_until_it_is_interrupted(
-    out: Path, command: str, imutool: Imutool, web: list[str]
-) -> None:
+def test_the_command_lists_the_worst(out: Path, imutool: Imutool) -> None:
     listed = imutool("fleet", "view", str(out), "--list", "--worst", "1", "--json", "-", cwd=out.parent)
     assert listed.returncode == 0, listed.stderr
     report = json.loads(listed.stdout)
     assert_valid(report)
     assert (report["segments"], len(report["worst"]), report["by"], report["not_shown"]) == (2, 1, "aoe", [])
+
+
+@pytest.mark.parametrize("web", [[], ["--web"]])
+def test_the_command_serves_until_it_is_interrupted(out: Path, command: str, web: list[str]) -> None:
     words = [command, "fleet", "view", str(out), "--quiet", *web]
     env = {name: value for name, value in os.environ.items() if name not in {"DISPLAY", "WAYLAND_DISPLAY"}}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=env) as process:

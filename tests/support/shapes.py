@@ -66,28 +66,28 @@ def _check_function(function: types.FunctionType, names: dict[str, Any], typeche
         return function
     assert not code.co_posonlyargcount, f"{function.__qualname__}: `/` in parameters is not known here"
     passed = _passed.setdefault((function.__module__, function.__qualname__, code), {})
-    check = functools.cache(functools.partial(_CHECK_EACH_CALL, typechecker=typechecker))
     defaults, places = _defaults(function), code.co_varnames[: code.co_argcount]
     results: list[Any] = []
-    give_result = _with_signature(lambda *_, **__: results.pop(), function)
+    again = _with_signature(lambda *args, **kwargs: results.pop() if results else function(*args, **kwargs), function)
+    check = functools.cache(lambda: _CHECK_EACH_CALL(again, typechecker=typechecker))  # of few functions: it takes a while
 
-    def checked(call: Any, in_place: tuple[Any, ...], rest: tuple[Any, ...], named: dict[str, Any]) -> Any:
+    def checked(in_place: tuple[Any, ...], rest: tuple[Any, ...], named: dict[str, Any]) -> Any:
         __tracebackhide__ = True
         if rest:
-            return check(call)(*in_place, *rest, **named)
+            return check()(*in_place, *rest, **named)
         named = {**dict(zip(places, in_place, strict=True)), **named}
-        return check(call)(**{name: value for name, value in named.items() if value is not defaults.get(name, _no_default)})
+        return check()(**{name: value for name, value in named.items() if value is not defaults.get(name, _no_default)})
 
     def new_call(called: Hashable, *given: Any) -> Any:
         __tracebackhide__ = True
-        result = checked(function, *given)
+        result = checked(*given)
         passed[called] = {_combination(result)}
         return result
 
     def new_result(result: Any, returned: set[Hashable], combination: Hashable, *given: Any) -> None:
         __tracebackhide__ = True
         results.append(result)
-        checked(give_result, *given)
+        checked(*given)
         returned.add(combination)
 
     known = {**_IN_CODE, "_passed": passed, "_function": function, "_new_call": new_call, "_new_result": new_result}
@@ -181,7 +181,7 @@ def _look(value: Any) -> Hashable:
     if not issubclass(kind, np.ndarray) and not (torch is not None and issubclass(kind, torch.Tensor)):
         _looks[kind] = None
         return kind
-    _looks[kind] = lambda array: (kind, array.dtype, tuple(array.shape))
+    _looks[kind] = lambda array: (kind, array.dtype, array.shape)
     return _combination(value)
 
 

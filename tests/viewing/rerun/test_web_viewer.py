@@ -48,7 +48,7 @@ def served(folder: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with viewers.chromium() as running:
+    with viewers.chromium(webgl=True) as running:
         yield running
 
 
