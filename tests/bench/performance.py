@@ -1,11 +1,12 @@
 """Every command on small, large and many logs beside its peers: `python tests/bench/performance.py [--gb 0.4] [--in FOLDER]`.
 
-A line a command: CPU and wall seconds of the whole process, the least of `--rounds` after one round that does not count, and
-the ratio of its CPU time to that of a peer in the same run. Peers: python importing what a command cannot do without, `cp` of
-the log, a shell loop of `cp`. The small log is a made-up flight of 90 s with true poses; the large one has images and IMU
-messages in every chunk (`tests/bench/rewrite.py`); many are logs of 2 MB of that kind (`tests/bench/fleet.py`). Diagnosis and
-training run once: of the flight beside its simulation, and of each of `--recordings LOG...` alone and beside its simulation;
-one training of all of them (on EuRoC: MH_01, MH_03, MH_05, V1_02, V2_01, V2_03).
+A line a command: CPU and wall seconds and memory of the whole process, the least of `--rounds` after one round that does not
+count, and the ratio of its CPU time to that of a peer in the same run. Peers: python importing what a command cannot do
+without, `cp` of the log, a shell loop of `cp`. The small log is a made-up flight of 90 s with true poses; the large one has
+images and IMU messages in every chunk (`tests/bench/rewrite.py`); many are logs of 2 MB of that kind
+(`tests/bench/fleet.py`). The long one is a made-up flight of `--hours`. Its commands run once, as do diagnosis and training:
+of the flight beside its simulation, and of each of `--recordings LOG...` alone and beside its simulation; one training of all
+of them (on EuRoC: MH_01, MH_03, MH_05, V1_02, V2_01, V2_03).
 """
 
 from __future__ import annotations
@@ -28,9 +29,17 @@ from imutool.sensor.made_up_flight import flight
 
 IMUTOOL = str(Path(sys.executable).with_name("imutool"))
 MODEL = "euroc-adis16448-hybrid"
-PARTS = ("start", "small", "large", "many", "diagnose", "train")
+PARTS = ("start", "small", "large", "many", "long", "diagnose", "train")
 TERMINAL = [sys.executable, "-c", "import typer, rich"]
 NUMERIC = [sys.executable, "-c", "import numpy, scipy.signal"]
+# a process of its own, which is small: the memory of the one that starts a command would count
+MEASURED = [
+    sys.executable,
+    "-ISc",
+    "import os, sys; pid = os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ); _, status, used = os.wait4(pid, 0); "
+    "print('', used.ru_maxrss); sys.exit(os.waitstatus_to_exitcode(status))",
+]
+FLIGHT = "import imutool, sys; imutool.write(sys.argv[2], imutool.example_recording(2, duration_s=float(sys.argv[1])))"
 
 
 class Row(NamedTuple):
@@ -124,6 +133,28 @@ def many(folder: Path, logs: int, mb: float) -> Iterator[Row]:
         yield Row(f"fleet {command}", line, "cp in a loop", (out,))
 
 
+def long(folder: Path, hours: float) -> Iterator[Row]:
+    """Commands on a flight of hours."""
+    log, out, report = folder / "long.mcap", folder / "out.mcap", folder / "report.json"
+    page, scene, asl = folder / "page.html", folder / "scene.rrd", folder / "asl"
+    subprocess.run([sys.executable, "-c", FLIGHT, str(3600.0 * hours), str(log)], check=True, env=rewrite.INSTALLED)
+    lines: list[tuple[str, list[object], tuple[Path, ...]]] = [
+        ("info", ["info", log, "--json", report], (report,)),
+        ("info --noise", ["info", log, "--noise", "--json", report], (report,)),
+        ("clean", ["clean", log, out, "-q", "--force"], (out,)),
+        ("debias, hybrid", ["debias", log, out, "-q", "--force", "--model", MODEL], (out,)),
+        ("debias --smooth, hybrid", ["debias", log, out, "-q", "--force", "--smooth", "--model", MODEL], (out,)),
+        ("evaluate", ["evaluate", log, "--model", MODEL, "--json", report], (report,)),
+        ("view --html", ["view", log, "--html", page, "-q"], (page,)),
+        ("view --save", ["view", log, "--save", scene, "-q"], (scene,)),
+        ("export", ["export", log, asl, "--format", "euroc", "-q"], (asl,)),
+        ("diagnose", ["diagnose", log, "--json", report], (report,)),
+    ]
+    yield Row("numpy, scipy.signal", NUMERIC, "numpy, scipy.signal")
+    for name, words, outputs in lines:
+        yield Row(name, [*MEASURED, IMUTOOL, *map(str, words)], "numpy, scipy.signal", outputs, once=True)
+
+
 def taken(row: Row, rounds: int) -> rewrite.Spent:
     """The least of each figure over rounds; the first run fills the caches."""
     runs = []
@@ -144,6 +175,7 @@ def main() -> None:
     parser.add_argument("--gb", type=float, default=0.4, help="size of the large log")
     parser.add_argument("--logs", type=int, default=100, help="how many small logs a fleet has")
     parser.add_argument("--mb", type=float, default=2.0, help="size of each")
+    parser.add_argument("--hours", type=float, default=2.0, help="duration of the long log")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--in", dest="folder", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument(
@@ -152,7 +184,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS)
     args = parser.parse_args()
     print(f"{args.rounds} rounds in {args.folder}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
-    print(f"{'':34}{'CPU s':>8}{'wall s':>9}{'CPU / peer':>12}  peer")
+    print(f"{'':34}{'CPU s':>8}{'wall s':>9}{'MB':>8}{'CPU / peer':>12}  peer")
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
         folder = Path(name)
         parts = {
@@ -160,6 +192,7 @@ def main() -> None:
             "small": lambda: small(folder),
             "large": lambda: large(folder, args.gb),
             "many": lambda: many(folder, args.logs, args.mb),
+            "long": lambda: long(folder, args.hours),
             "diagnose": lambda: diagnosed(folder, args.recordings),
             "train": lambda: trained(folder, args.recordings),
         }
@@ -170,7 +203,7 @@ def main() -> None:
                 spent = taken(row, args.rounds)
                 peer = spent.cpu if row.peer and row.name.startswith(row.peer) else peer
                 ratio = f"{spent.cpu / peer:12.2f}  {row.peer}" if row.peer else ""
-                print(f"  {row.name:32}{spent.cpu:8.2f}{spent.wall:9.2f}{ratio}", flush=True)
+                print(f"  {row.name:32}{spent.cpu:8.2f}{spent.wall:9.2f}{spent.peak_mb:8.0f}{ratio}", flush=True)
 
 
 if __name__ == "__main__":
