@@ -6,7 +6,7 @@ Causal: after the initial bias, the bias at a sample depends on that sample and 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import index
 from typing import NamedTuple
@@ -41,9 +41,12 @@ class DebiasedImu(NamedTuple):
 
 
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
-    """Corrected samples and bias of a model."""
-    good = measured(imu.gyro, imu.accel)
-    bias = _with_drift(model, imu, _to_all(good, start.stream(model)(*model_samples(model, imu))))
+    """Corrected samples and bias of a model. Computed in blocks, as for a log."""
+    good, samples, stream = measured(imu.gyro, imu.accel), model_samples(model, imu), start.stream(model)
+    bias = np.empty((len(samples[0]), 6))
+    for rows in _blocks(len(bias)):
+        bias[rows] = stream(*(column[rows] for column in samples))
+    bias = _with_drift(model, imu, _to_all(good, bias))
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias)
 
 
@@ -56,14 +59,18 @@ def apply_with_std(model: BiasModel, start: InitialBias, imu: Imu) -> tuple[Debi
     good, (t_s, gyro, accel) = measured(imu.gyro, imu.accel), model_samples(model, imu)
     t_ns = imu.t_ns[good]
     bias, std = np.empty((len(t_s), 6)), np.empty((len(t_s), 6))
-    for first in range(0, len(t_s), BLOCK_SAMPLES):
-        rows = slice(first, first + BLOCK_SAMPLES)
+    for rows in _blocks(len(t_s)):
         bias[rows], covariance = estimator(t_s[rows], gyro[rows], accel[rows])
         if model.log_drift is not None:
             covariance += model.log_drift.covariance(t_ns[rows])
         std[rows] = np.sqrt(covariance.diagonal(axis1=1, axis2=2))
     bias, std = _with_drift(model, imu, _to_all(good, bias)), _to_all(good, std)
     return DebiasedImu(Imu(imu.t_ns, imu.gyro - bias[:, :3], imu.accel - bias[:, 3:]), bias), std
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    for first in range(0, count, BLOCK_SAMPLES):
+        yield slice(first, first + BLOCK_SAMPLES)
 
 
 def _with_drift(model: BiasModel, imu: Imu, bias: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, "n 6"]:
