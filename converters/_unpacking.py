@@ -31,6 +31,7 @@ from ._archive import (
 from ._source import head
 from ._table_packed import is_packed_alone, pieces, table_name
 
+TAR = ".tar"  # in .xz, .bz2 or .zst; a .tar.gz is an archive itself
 SHARE = 2  # at most one part in two of the free disk: the log needs its place, too
 ENCRYPTED = 1  # bit of a zip member's flags
 
@@ -95,7 +96,7 @@ def _tar_files(source: Path) -> Iterator[tuple[str, IO[bytes]]]:
 
 
 def _unpack_file(source: Path, root: Path) -> Path:
-    """Unpack a file that is packed alone, under its name without the ending."""
+    """Unpack a file that is packed alone, under its name without the ending; of a tar its files."""
     natural, room = MAX_RATIO * source.stat().st_size + RATIO_FREE, _room(root.parent)
     total, target = 0, root / root.name
     with refusing(source):
@@ -108,7 +109,11 @@ def _unpack_file(source: Path, root: Path) -> Path:
                 if total > room:
                     raise _too_large(source, f"unpacks to more than {room} bytes", room)
                 file.write(piece)
-    return target
+    if target.suffix.lower() != TAR:
+        return target
+    content = _unpack_archive(target, root / stem(target))
+    target.unlink()
+    return content
 
 
 def _room(folder: Path) -> int:

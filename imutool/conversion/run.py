@@ -228,7 +228,8 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
     """
     slash, out = str(out).endswith(("/", os.sep)), local(str(out), "out")
     if many and (out.suffix.lower() == SUFFIX or out.is_file()):
-        raise ConfigError("several sequences do not fit into one file", where=out, expected="a folder")
+        some = ", ".join([*names[:3], *["..."][: len(names) > 3]])
+        raise ConfigError(f"several sequences do not fit into one file ({some})", where=out, expected="a folder")
     into_folder = many or slash or out.is_dir()
     folder = out if into_folder else out.parent
     try:

@@ -56,8 +56,8 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
     ),
     rb"PK\x03\x04|.{257}ustar": (
-        "it is an archive, of a kind or in a place where archives are not read",
-        "Unpack it, and convert the folder that is in it",
+        "it is an archive whose name does not end in .zip, .tar, .tar.gz or .tgz",
+        "Give it the ending of its kind, or unpack it and convert the folder that is in it",
     ),
     rb"\x75\x65": (
         "it looks like a binary log of a MicroStrain sensor",
@@ -71,7 +71,7 @@ WITHOUT_NUMBERS = (
 
 
 def nothing_found(source: Path, *, packed: bool) -> DataError:
-    """Error of a source without a sequence: what it is, and what to do; a packed one was unpacked."""
+    """Error of a source without a sequence; `packed` if it is what was unpacked."""
     what, fix = describe_folder(source) if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
     if packed and source.is_dir() and not what:
         what, fix = "nothing in the archive shows that it is a recording", f"Unpack it. {fix}"

@@ -87,13 +87,16 @@ def refused(source: Path, match: str) -> None:
     assert sorted(source.parents[1].rglob("*")) == before
 
 
-@pytest.mark.parametrize("ending", [*PACKERS, "zip", "tar.gz"])
+@pytest.mark.parametrize("ending", [*PACKERS, "zip", "tar.gz", "tar.xz", "tar.zst"])
 def test_a_packed_log_becomes_the_log_of_the_unpacked_one(log: Path, ending: str) -> None:
     raw, source, out = log.read_bytes(), log.with_name(f"walk.mcap.{ending}"), log.parents[1] / "out/b.mcap"
     if ending == "zip":
         zipped(source, {"some/walk.mcap": raw, "__MACOSX/some/._walk.mcap": b"x"})
     elif ending == "tar.gz":
         tarred(source, {"./some/walk.mcap": raw})
+    elif ending.startswith("tar"):
+        tar = gzip.decompress(tarred(log.with_name("a.tgz"), {"some/walk.mcap": raw}).read_bytes())
+        source.write_bytes(PACKERS[ending.removeprefix("tar.")](tar))
     else:
         source.write_bytes(PACKERS[ending](raw))
     converted(source, out)
@@ -107,7 +110,7 @@ def test_an_archive_of_several_recordings_becomes_a_log_for_each(log: Path) -> N
     header = "time [s],gyr_x [rad/s],gyr_y [rad/s],gyr_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n"
     tables = {f"day/{name}/imu.csv": (header + rows).encode() for name in ("a", "b")}
     source = zipped(log.with_name("day.zip"), tables)
-    with pytest.raises(ConfigError, match=r"several sequences do not fit into one file"):
+    with pytest.raises(ConfigError, match=r"several sequences do not fit into one file \(a, b\)"):
         convert(source, log.parents[1] / "out/b.mcap")
     report = converted(source, log.parents[1] / "out/logs")
     assert sorted(path.name for path in report.written) == ["a.mcap", "b.mcap"]
@@ -155,6 +158,12 @@ def test_an_encrypted_zip_is_refused(log: Path) -> None:
 @pytest.mark.parametrize("pack", [zipped, tarred])
 def test_a_member_outside_the_archive_is_refused(log: Path, name: str, pack: Callable[..., Path]) -> None:
     refused(pack(log.with_name("walk.zip" if pack is zipped else "walk.tgz"), {name: log.read_bytes()}), "points outside")
+
+
+def test_a_member_outside_a_packed_tar_is_refused(log: Path) -> None:
+    tar = gzip.decompress(tarred(log.with_name("a.tgz"), {"../walk.mcap": log.read_bytes()}).read_bytes())
+    log.with_name("walk.tar.xz").write_bytes(lzma.compress(tar))
+    refused(log.with_name("walk.tar.xz"), "points outside")
 
 
 def special(kind: bytes, target: str = "") -> tarfile.TarInfo:
