@@ -1,6 +1,6 @@
 """Sequences in folders and archives, and their files; files recognised by their first bytes.
 
-Nothing is ever unpacked on disk: members are read one by one, each under a bound, and a .tar.gz is streamed.
+Nothing is unpacked on disk here: members are read one by one, each under a bound, and a .tar.gz is streamed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def find(source: Path) -> list[Sequence]:
         return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_in_folder(folder))
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a folder, an archive or a bag")
-    return _in_file(source)
+    return _in_file(source, nested=SUFFIXES)  # bags in it are found when it is unpacked
 
 
 def is_bag(path: Path) -> bool:
@@ -63,7 +63,7 @@ def _in_folder(folder: Path) -> Iterator[Sequence]:
             yield Sequence(stem(path), path)
 
 
-def _in_file(path: Path) -> list[Sequence]:
+def _in_file(path: Path, nested: tuple[str, ...] = (*SUFFIXES, BAG)) -> list[Sequence]:
     name = path.name.lower()
     if name.endswith(BAG):
         return [Sequence(stem(path), path)]
@@ -72,7 +72,7 @@ def _in_file(path: Path) -> list[Sequence]:
     members = list_members(path).sizes
     folders = (member.split("/")[:-1] for member in members)
     roots = {"/".join(parts[: parts.index(ROOT)]) for parts in folders if ROOT in parts and "__MACOSX" not in parts}
-    if not roots and (inner := sorted(m for m in members if m.lower().endswith((*SUFFIXES, BAG)))):
+    if not roots and (inner := sorted(m for m in members if m.lower().endswith(nested))):
         raise DataError(
             f"holds archives or bags, not the files of a sequence ({', '.join(inner[:3])}{', ...' if len(inner) > 3 else ''})",
             where=path,

@@ -18,13 +18,14 @@ import zstandard
 
 from imutool.errors import DataError
 
-from ._archive import HEAD, MAX_RATIO, RATIO_FREE, refusing
+from ._archive import CHUNK, HEAD, MAX_RATIO, RATIO_FREE, refusing
 from ._source import head
 
 TABLES = ".csv", ".txt", ".tsv", ".dat"
 ENDINGS = ".gz", ".xz", ".bz2", ".zst", ".zip"
 LIMIT = 4 << 30  # bytes of a table
 ZSTD = b"\x28\xb5\x2f\xfd"
+ZSTD_STEP = 1 << 10  # packed bytes: a block of four bytes can unpack to 128 KiB
 FOREIGN = lzma.LZMAError, zstandard.ZstdError  # errors of damaged bytes that are no OSError
 
 
@@ -82,26 +83,49 @@ def read_bytes(path: Path) -> bytes:
     if opener(head(path)) is None:
         return path.read_bytes()
     most = min(LIMIT, MAX_RATIO * path.stat().st_size + RATIO_FREE)
+    parts: list[bytes] = []
+    total = 0
+    for piece in pieces(path):
+        parts.append(piece)
+        total += len(piece)
+        if total > most:
+            raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
+    return b"".join(parts)
+
+
+def is_packed_alone(start: bytes) -> bool:
+    """Whether a file with these first bytes is one packed file, not an archive."""
+    return opener(start) not in (None, _open_zip)
+
+
+def pieces(path: Path) -> Iterator[bytes]:
+    """Yield the bytes of a packed file, unpacked, in pieces of bounded size.
+
+    Raises:
+        DataError: it is damaged or cut off.
+    """
     with _opened(path) as file:
-        content = bytes(file.read(most + 1))
-    if len(content) > most:
-        raise DataError(f"unpacks to more than {most} bytes", where=path, expected=f"at most {MAX_RATIO} to 1")
-    if head(path).startswith(ZSTD):
-        _check_frames(path)
-    return content
+        if head(path).startswith(ZSTD):
+            yield from _zstd_pieces(path)
+        else:
+            while piece := file.read(CHUNK):
+                yield bytes(piece)
 
 
-def _check_frames(path: Path) -> None:
-    """Refuse a last frame that is cut; the frames together are known to be within the bound."""
-    rest = path.read_bytes()
-    while rest:
-        frame = zstandard.ZstdDecompressor().decompressobj()
-        frame.decompress(rest)
-        if not frame.eof:
-            raise DataError(
-                "cannot be unpacked (it is cut off)", where=path, fix="Unpack what is there with zstd -d, and convert that"
-            )
-        rest = frame.unused_data
+def _zstd_pieces(path: Path) -> Iterator[bytes]:
+    """Pieces of all frames; the library's own reader passes over the end of one that is cut."""
+    frame = zstandard.ZstdDecompressor().decompressobj()
+    with path.open("rb") as file:
+        while packed := file.read(ZSTD_STEP):
+            while packed:
+                if frame.eof:
+                    frame = zstandard.ZstdDecompressor().decompressobj()
+                yield frame.decompress(packed)
+                packed = frame.unused_data
+    if not frame.eof:
+        raise DataError(
+            "cannot be unpacked (it is cut off)", where=path, fix="Unpack what is there with zstd -d, and convert that"
+        )
 
 
 @contextmanager

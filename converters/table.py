@@ -50,6 +50,7 @@ from ._table_sheets import recordings
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
+from ._unpacking import unpacked  # noqa: F401  `convert` asks for it where no converter reads a source as it is
 
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics

@@ -17,11 +17,11 @@ from typing import Any
 from imutool import registry
 from imutool.conversion import Failure
 from imutool.conversion.corrections import parse_corrections
-from imutool.conversion.unread_formats import ENOUGH, describe_folder, describe_unread
+from imutool.conversion.unread_formats import nothing_found
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
 from imutool.conversion.workers import GROUP, Job, Outcome, Progress, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
-from imutool.file_location import first_bytes, local
+from imutool.file_location import local
 from imutool.mcap_io.storage.local import removed_if_empty
 from imutool.processes.system import processors
 from imutool.recording import Recording
@@ -45,6 +45,12 @@ class ConvertReport:
         self.written.append(target)
         self.notes.extend(f"{target.name}: {note}" for note in outcome.notes)
         self.losses.extend(f"{target.name}: {loss}" for loss in outcome.losses)
+
+    def renamed(self, temporary: str, source: str, note: str) -> ConvertReport:
+        """Report that names the source in place of the temporary folder, with a note."""
+        failures = [Failure(failure.name, failure.message.replace(temporary, source)) for failure in self.failures]
+        notes, losses = ([text.replace(temporary, source) for text in texts] for texts in (self.notes, self.losses))
+        return ConvertReport(self.written, failures, [note, *notes], losses)
 
 
 @dataclass
@@ -92,7 +98,27 @@ def convert(
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)
-    source_sequences = _find(source, format, Path(out))
+    if (found := _find(source, format, Path(out))).names():
+        return _convert_found(found, source, out, sequences, ways, workers, progress)
+    unpacked = next(module.unpacked for _, module in _converters(AUTO) if hasattr(module, "unpacked"))
+    with unpacked(source, Path(out)) as (content, root):
+        if not (root and (found := _find(content, format, Path(out))).names()):
+            raise nothing_found(content, packed=bool(root))
+        report = _convert_found(found, source, out, sequences, ways, workers, progress)
+    note = f"{source.name}: it is packed, and was unpacked into a temporary folder"
+    return report.renamed(str(root), str(source), note)
+
+
+def _convert_found(
+    source_sequences: _Sequences,
+    source: Path,
+    out: str | Path,
+    sequences: Sequence[str],
+    ways: Job,
+    workers: int | None,
+    progress: Progress | None,
+) -> ConvertReport:
+    """Write a log of each sequence, or of those asked for."""
     if sequences:
         source_sequences = _only(source_sequences, sequences)
     names = source_sequences.names()
@@ -104,7 +130,7 @@ def convert(
         ]
         if len(names) == 1 and source_sequences.errors:
             raise source_sequences.errors[0][1]
-        _check_targets(jobs)
+        _check_targets(jobs, source)
         outcomes = run_jobs(jobs, len(names), _worker_count(workers, len(jobs)), progress)
     failed = [(jobs[n].sequence.name, outcome.error) for n, outcome in sorted(outcomes.items()) if outcome.error is not None]
     if len(names) == 1 and failed:
@@ -120,7 +146,6 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
     """Find every sequence of the source, with its converter; of its own logs none below `out`.
 
     Raises:
-        DataError: there is none.
         ConfigError: a sequence is claimed twice.
     """
     claims: dict[str, list[Job]] = {}
@@ -142,14 +167,6 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
         found = ((key, m.own_logs(source)) for key, m in _converters(format) if hasattr(m, "own_logs"))
         apart = ((key, log) for key, own in found for log in own if not log.path.resolve().is_relative_to(out.resolve()))
         claims = {str(log): [Job(key, log)] for key, log in apart}
-    if not claims:
-        what, fix = describe_folder(source) if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
-        raise DataError(
-            f"no sequence found: {what}" if what else "no sequence found",
-            where=source,
-            expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
-            fix=fix,
-        )
     for place, jobs in claims.items():
         if len(jobs) > 1:
             keys = " and ".join(job.converter for job in jobs)
@@ -211,7 +228,8 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
     """
     slash, out = str(out).endswith(("/", os.sep)), local(str(out), "out")
     if many and (out.suffix.lower() == SUFFIX or out.is_file()):
-        raise ConfigError("several sequences do not fit into one file", where=out, expected="a folder")
+        some = ", ".join([*names[:3], *["..."][: len(names) > 3]])
+        raise ConfigError(f"several sequences do not fit into one file ({some})", where=out, expected="a folder")
     into_folder = many or slash or out.is_dir()
     folder = out if into_folder else out.parent
     try:
@@ -221,15 +239,15 @@ def _targets(names: Sequence[str], out: str | Path, *, many: bool) -> list[Path]
     return [out / f"{name}{SUFFIX}" if into_folder else out for name in names]
 
 
-def _check_targets(jobs: Sequence[Job]) -> None:
+def _check_targets(jobs: Sequence[Job], source: Path) -> None:
     """Refuse to overwrite a log, a source, or another log of the same run."""
     jobs_by_target: dict[Path, Job] = {}
     for job in jobs:
         if (other := jobs_by_target.setdefault(job.target, job)) is not job:
             what = f"two sequences are named {job.sequence.name}: {other.sequence} and {job.sequence}"
             raise ConfigError(what, where="source", fix="Convert them one at a time")
-        path = getattr(job.sequence, "path", None)
-        if path is not None and _is_part_of(job.target, path):
+        sources = getattr(job.sequence, "path", None), source if source.is_file() else None
+        if any(path is not None and _is_part_of(job.target, path) for path in sources):
             raise ConfigError("is the source itself", where=job.target, expected="another `out`")
         if job.target.exists() and not job.overwrite:
             raise ConfigError("exists", where=job.target, fix="Choose another `out`, or add `overwrite`")

@@ -6,7 +6,8 @@ import os
 import re
 from pathlib import Path
 
-from imutool.file_location import compression
+from imutool.errors import DataError
+from imutool.file_location import compression, first_bytes
 
 ENOUGH = 1024  # bytes of a file's start
 FORMATS = {  # what a file that begins like this is, and what to do
@@ -55,8 +56,8 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "Load it where you trust its source, save the arrays with numpy.savez, and convert that",
     ),
     rb"PK\x03\x04|.{257}ustar": (
-        "it is an archive without a mav0 folder, a bag or a single table",
-        "Unpack it, and convert the folder that is in it",
+        "it is an archive whose name does not end in .zip, .tar, .tar.gz or .tgz",
+        "Give it the ending of its kind, or unpack it and convert the folder that is in it",
     ),
     rb"\x75\x65": (
         "it looks like a binary log of a MicroStrain sensor",
@@ -67,6 +68,19 @@ WITHOUT_NUMBERS = (
     "it is text without a row of four numbers, which are the least of a table: a time and a vector",
     "See whether the recorder wrote any rows, and how it separates their fields: by comma, semicolon, tab or blanks",
 )
+
+
+def nothing_found(source: Path, *, packed: bool) -> DataError:
+    """Error of a source without a sequence; `packed` if it is what was unpacked."""
+    what, fix = describe_folder(source) if source.is_dir() else describe_unread(first_bytes(source, ENOUGH))
+    if packed and source.is_dir() and not what:
+        what, fix = "nothing in the archive shows that it is a recording", f"Unpack it. {fix}"
+    return DataError(
+        f"no sequence found: {what}" if what else "no sequence found",
+        where=source,
+        expected="a ROS bag, an MCAP log, a PX4 or ArduPilot log, a table, a mav0 folder or its archive",
+        fix=fix,
+    )
 
 
 def describe_unread(start: bytes) -> tuple[str, str]:

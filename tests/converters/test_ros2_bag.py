@@ -118,6 +118,18 @@ def test_a_bag_without_metadata_and_a_lone_database_convert(convert, tmp_path):
     assert messages_of(tmp_path / "a.mcap") == messages_of(tmp_path / "b.mcap")
 
 
+@pytest.mark.parametrize("form", ["zip", "gztar", "zip of its files"])
+def test_a_packed_bag_reads_as_the_bag(convert, tmp_path, form):
+    bag = split_bag(tmp_path / "bag", StoragePlugin.SQLITE3, None)
+    where = {"root_dir": bag} if form == "zip of its files" else {"root_dir": tmp_path, "base_dir": "bag"}
+    packed = shutil.make_archive(str(tmp_path / "packed" / "run"), form.partition(" ")[0], **where)
+    assert convert(bag, tmp_path / "a.mcap").returncode == 0
+    done = convert(packed, tmp_path / "b.mcap")
+    assert done.returncode == 0, done.stderr
+    assert f"note: {Path(packed).name}: it is packed" in done.stderr
+    assert messages_of(tmp_path / "a.mcap") == messages_of(tmp_path / "b.mcap")
+
+
 def unfinished(folder: Path, suffix: str, parts: int) -> Path:
     """A bag whose recorder died: numbered parts, and no metadata.yaml."""
     folder.mkdir()

@@ -31,7 +31,10 @@ class Source:
         self._is_local = descriptor(self.file) is not None
         if self._is_local and (program := compression(self._read(0, 8))):
             self.file.close()
-            what, fix = f"is compressed with {program}", f"Unpack it first, for instance with {program} -d"
+            what, fix = (
+                f"is compressed with {program}",
+                f"Unpack it first, for instance with {program} -d; `imutool convert` reads it as it is",
+            )
             raise LogError(what, where=path, expected=expected, fix=fix)
 
     def at(self, offset: int, length: int) -> bytes:
