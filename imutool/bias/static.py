@@ -70,4 +70,4 @@ def _constant(
     rest: Vector6, t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], accel: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 6"]:
     """The rest bias in each row; a function of the module, so that a stream can be pickled."""
-    return np.broadcast_to(rest, (len(t_s), 6))
+    return np.broadcast_to(rest, (len(t_s), 6)).copy()
