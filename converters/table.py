@@ -20,7 +20,7 @@ from imutool.recording import Imu, Poses, Scalars, unit_quaternions
 from imutool.recording.joined_imu import in_order, joined, lost_to_set_back
 from imutool.recording.message_log import MessageLog, Remarks
 
-from . import Sequence
+from . import Sequence, _unpacking
 from ._source import head, name
 from ._table_files import kind_of, load, read_text
 from ._table_folder import load_split, sequences_below
@@ -50,8 +50,8 @@ from ._table_sheets import recordings
 from ._table_text import Columns, matrix_columns
 from ._table_times import COUNTED, begun_at_zero, count_times
 from ._table_units import ACCEL_SI, ANGLE_SI, GYRO_SI, POSITION_SI, unit_doubts
-from ._unpacking import unpacked  # noqa: F401  `convert` asks for it where no converter reads a source as it is
 
+unpacked = _unpacking.unpacked  # `convert` asks for it where no converter reads a source as it is
 GENERAL = True
 MOST_SCALARS = 200  # further columns that become topics
 MOST_LOSSES = 8  # in a refusal

@@ -41,7 +41,7 @@ class DebiasedImu(NamedTuple):
 
 
 def apply(model: BiasModel, start: InitialBias, imu: Imu) -> DebiasedImu:
-    """Corrected samples and bias of a model. Computed in blocks, as for a log."""
+    """Corrected samples and bias of a model, computed in blocks, as for a log."""
     good, samples, stream = measured(imu.gyro, imu.accel), model_samples(model, imu), start.stream(model)
     bias = np.empty((len(samples[0]), 6))
     for rows in _blocks(len(bias)):

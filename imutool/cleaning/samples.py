@@ -75,7 +75,7 @@ def padded(stream: Iterable[Samples], margin: int) -> Iterator[tuple[Samples, sl
 
 
 class Motion:
-    """Means of the samples of each step: 64 bytes per 0.1 s, 23 MB for ten hours; first rates."""
+    """Means of the samples of each step of 0.1 s, and the first rates: 23 MB for ten hours."""
 
     def __init__(self) -> None:
         self.start_ns: int | None = None

@@ -149,6 +149,8 @@ def topic_rows(report: LogInfo) -> list[tuple[str, ...]]:
 
 def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
     """Rows of the property table of IMUs and truth, the header first."""
+    from imutool.mcap_io.codec.reflection import WITHOUT_STAMP
+
     rows: list[tuple[str, ...]] = [("topic", "property", "value")]
     for imu in map(json_values, report.imu):
         if "samples" not in imu:
@@ -157,8 +159,8 @@ def imu_rows(report: LogInfo) -> list[tuple[str, ...]]:
         rows.append((imu["topic"], "samples", str(imu["samples"])))
         rows += [(imu["topic"], name.replace("_", " "), str(imu[name])) for name in counts]
         if "time" in imu:
-            others = f", not {', '.join(imu['other_times'])}" if imu["other_times"] else ""
-            rows.append((imu["topic"], "time of the samples", imu["time"] + others))
+            why = f"not {', '.join(imu['other_times'])}" if imu["other_times"] else WITHOUT_STAMP
+            rows.append((imu["topic"], "time of the samples", f"{imu['time']}, {why}"))
         if imu["rate_hz"] is not None:
             clock = f"{imu['rate_hz']:.2f} Hz, jitter {1e3 * imu['jitter_s']:.3f} ms, longest gap {imu['largest_gap_s']:.3f} s"
             rows.append((imu["topic"], "clock of stamps", clock))

@@ -22,7 +22,7 @@ from imutool.errors import DataError, not_installed
 from imutool.file_location import Location
 from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.encode import encode_imu, encode_pose
-from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected, reflect
+from imutool.mcap_io.codec.reflection import LOG_TIME, WITHOUT_STAMP, Reflected, reflect
 from imutool.mcap_io.file_writer import Chunk, LogWriter
 from imutool.mcap_io.topics import KIND_KEY, MESSAGE_POSES, PART_KEY, RECORDED_KEY
 from imutool.mcap_io.write import (
@@ -130,7 +130,7 @@ class _Stream:
             self.channels[topic] = number
             self._reflected[number] = cdr, found
             units = "rad/s and m/s^2" if found.schema_name == schemas.IMU else "metres"
-            at = "" if found.stamp else f"; at the {LOG_TIME}"
+            at = "" if found.stamp else f"; at the {LOG_TIME}, {WITHOUT_STAMP}"
             note = f"{topic.name}: {topic.message_encoding} became {found.schema_name}, taken as {units}{at}"
             self._source.remarks.notes.append(note)
             return number

@@ -26,7 +26,7 @@ GRAVITY_W = (0.0, 0.0, -GRAVITY_M_S2)
 VELOCITY_WINDOW_S = 0.2
 VELOCITY_ORDER = 3
 COMPARED_S, LEAST_SPEED_M_S, MOST_OFF = 1.0, 0.05, 0.5  # of velocities and positions: over a second, in motion, by the median
-WINDOWS_AT_ONCE = 1 << 12  # of poses: they fit a core's cache
+WINDOWS_AT_ONCE = 1 << 12  # whose arrays fit a core's cache
 SAMPLES_PER_COEFFICIENT = 3  # a stretch shorter than the window gets a lower order, against noise
 
 Vectors = Float64[np.ndarray, "n 3"]

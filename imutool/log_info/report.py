@@ -66,7 +66,8 @@ class Convention(Section, frozen=True):
 class ImuInfo(Section, frozen=True, kw_only=True):
     """IMU topic: clock from the header stamps, defects, rest and noise.
 
-    `time` is the field that stamps the samples and `other_times` those that do not, where the message holds several.
+    `time` is the field that stamps the samples and `other_times` those that do not, where the message holds several; it is `log
+    time` where the message holds none.
     Only warnings where its encoding is unknown.
     """
 

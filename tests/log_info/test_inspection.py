@@ -348,7 +348,7 @@ def test_what_is_no_log_is_refused(tmp_path, content):
         inspect(tmp_path / "log.mcap")
 
 
-LOG_TIME = "log time, as the messages state no stamp with its unit"
+WITHOUT_STAMP = "as the messages state no stamp with its unit"
 
 
 @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ LOG_TIME = "log time, as the messages state no stamp with its unit"
     [
         ({"header": {"stamp": {"sec": 1_700_000_000, "nsec": 0}}}, None, None),
         ({"header": {"stamp": {"sec": 1_700_000_000, "nsec": 0}}, "sensor_time_us": 5000}, "header.stamp", ["sensor_time_us"]),
-        ({"timestamp": 1_700_000_000.25}, LOG_TIME, []),  # of which unit?
+        ({"timestamp": 1_700_000_000.25}, "log time", []),  # of which unit?
     ],
 )
 def test_the_time_that_counts_is_named_if_a_message_leaves_it_open(tmp_path: Path, fields, time, others) -> None:
@@ -375,6 +375,6 @@ def test_the_time_that_counts_is_named_if_a_message_leaves_it_open(tmp_path: Pat
     assert info["first_ns"] == 1_700_000_000_000_000_000
     assert (info.get("time"), info.get("other_times")) == (time, others)
     shown = [value for _, name, value in imu_rows(report) if name == "time of the samples"]
-    assert shown == ([f"{time}, not sensor_time_us" if others else time] if time else [])
+    assert shown == ([f"{time}, {'not sensor_time_us' if others else WITHOUT_STAMP}"] if time else [])
     notes = convert(tmp_path / "a.mcap", tmp_path / "b.mcap").notes
-    assert any(note.endswith(f"; at the {LOG_TIME}") for note in notes) == (time == LOG_TIME)
+    assert any(note.endswith(f"; at the log time, {WITHOUT_STAMP}") for note in notes) == (time == "log time")

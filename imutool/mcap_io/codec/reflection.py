@@ -34,7 +34,7 @@ POSITION = r"position|pos|translation|p"
 ORIENTATION = r"orientation|rotation|quaternion|quat|attitude|q"
 POSE_TYPES = r"pose(?!s)|odom|truth|mocap|vicon|tracker"  # in the name of a type or topic: clouds and grids have poses too
 FRAME = r"frame_?id|frame"
-LOG_TIME = "log time, as the messages state no stamp with its unit"  # of a sample
+LOG_TIME, WITHOUT_STAMP = "log time", "as the messages state no stamp with its unit"
 
 
 class Sample(NamedTuple):
