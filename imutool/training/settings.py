@@ -74,7 +74,7 @@ class SensorPrior(Settings, frozen=True):
     """Prior over sensors: standard deviations of an effect's parameters, about zero.
 
     From data sheets: MPU-6050 (PS-MPU-6000A 3.4) for consumer sensors, ADIS16448 for industrial ones. What they were judged by
-    is in docs/accuracy.md. Units stand beside each. An effect that is not named here has its plausible size.
+    is in docs/measurements/a-minute.md. Units stand beside each. An effect that is not named here has its plausible size.
     """
 
     gyro_scale: Positive = 0.05  # -: MPU-6050 ±3 %; a choice, wider because TUM-VI's BMI160 has 10 %

@@ -10,7 +10,7 @@ combined by their information, and kept where the sequences agree that they are 
 search all the training sequences at once instead.
 
 What is there already is not made again; --tables only tells what there is. Writes OUT/real.md (all values),
-OUT/fragment.md (for docs/diagnosis.md) and OUT/real.png.
+OUT/fragment.md (for docs/measurements/real-recordings.md) and OUT/real.png.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 `--method neural_ode --set scheme=paper`. Fields start at random, and Adam's learning rate halves on the way. First the gyro's,
 then the accelerometer's along attitudes of the gyro's. No closed form, no robust loss and no bias of a log are fitted: what
-belongs to a run goes into the field, too. What differs from the released code stands in docs/accuracy.md.
+belongs to a run goes into the field, too. What differs from the released code stands in docs/paper.md.
 """
 
 from __future__ import annotations
