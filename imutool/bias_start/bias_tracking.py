@@ -124,9 +124,10 @@ class BiasFilter:
 
     def _arrived(self, t: Float64[np.ndarray, " n"], u: Float64[np.ndarray, "n 6"]) -> Iterator[FilteredBlock]:
         dt = t[1:] - t[:-1]
-        late = dt > GAP_PERIODS * quantile(dt, 0.5) if len(dt) > 1 else dt > BLOCK_S * 1.5
-        block = _Block(t, u, float(dt.max()), float(dt[late].sum()))
-        rests = self._rest_detector(u[:-1, :3], u[:-1, 3:], whole=not late.any())
+        most = GAP_PERIODS * float(quantile(dt, 0.5)) if len(dt) > 1 else BLOCK_S * 1.5
+        whole = (longest := float(dt.max())) <= most
+        block = _Block(t, u, longest, 0.0 if whole else float(dt[dt > most].sum()))
+        rests = self._rest_detector(u[:-1, :3], u[:-1, 3:], whole=whole)
         rests = rests and (self._aiding is None or self._aiding.stops)
         self._waiting.append((block, rests))
         if rests:
@@ -156,7 +157,8 @@ class BiasFilter:
             step = inertial_filter.rest_step(x, resting.mean(axis=0), variance, T, self._walk, s)
         else:
             gyro, accel = u[:, :3] - x.bias[:3], u[:, 3:] - x.bias[3:]
-            rate = gyro[np.searchsorted(t, t[-1] - RATE_S) :].mean(axis=0)
+            last = gyro[t.searchsorted(t[-1] - RATE_S) :]
+            rate = last.sum(axis=0) / len(last)
             step = inertial_filter.motion_step(x, integrate(t, gyro, accel), rate, block.missing_s, self._walk, s)
         if self._aiding is not None:
             step = step._replace(after=self._aiding.measure(step.after, float(t[-1])))

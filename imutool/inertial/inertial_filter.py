@@ -214,10 +214,10 @@ def _predict(
     v = x.v_w + G_W * T + x.R_wb @ dv
     p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
     by_bias_w = x.R_wb @ by_bias.reshape(3, 3, 6)
-    by_bias_w[0] = turned = R @ by_bias[:3]
+    by_bias_w[0] = of_turn = R @ by_bias[:3]
     V, X = hat(v), hat(p)
-    by_bias_w[1] += V @ turned
-    by_bias_w[2] += X @ turned
+    by_bias_w[1] += V @ of_turn
+    by_bias_w[2] += X @ of_turn
     F = np.eye(len(x.P))
     F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
     F[POSE, BIAS] = by_bias_w.reshape(9, 6)
@@ -227,11 +227,14 @@ def _predict(
     by_noise = np.zeros((9, 6))  # of the turn, then of the push
     by_noise[TURN, :3], by_noise[VELOCITY, :3], by_noise[POSITION, :3] = EYE, V, X
     by_noise[VELOCITY, 3:], by_noise[POSITION, 3:] = EYE, 0.5 * T * EYE
-    P[POSE, POSE] += (by_noise * np.repeat(noise, 3)) @ by_noise.T
+    turned, push = noise
+    P[POSE, POSE] += (by_noise * np.array([turned] * 3 + [push] * 3)) @ by_noise.T
     variances = P.reshape(-1)[:: len(P) + 1]
     variances += LEAST_VARIANCE
-    variances[BIAS] += walk[:6] ** 2 * T
-    variances[SIZE:] += walk[6:] ** 2 * T
+    walked = walk**2 * T
+    variances[BIAS] += walked[:6]
+    if len(walk) > 6:
+        variances[SIZE:] += walked[6:]
     expected = State(R, v, p, x.bias, x.ground, x.steady, 0.5 * (P + P.T), x.offsets)
     return Step(x, expected, F, expected)
 
@@ -252,8 +255,8 @@ def gain(
     """Kalman gain of a measurement z = H e + n, and the covariance after it (Joseph form)."""
     HP = H @ P
     S = HP @ H.T
-    diagonal = np.arange(len(H))
-    S[..., diagonal, diagonal] += noise
+    variances = np.einsum("...kk->...k", S)  # a view
+    variances += noise
     K = np.linalg.solve(S, HP).swapaxes(-1, -2)
     I_KH = np.eye(P.shape[-1]) - K @ H
     after = I_KH @ P @ I_KH.swapaxes(-1, -2) + (K * noise[..., None, :]) @ K.swapaxes(-1, -2)
