@@ -45,7 +45,7 @@ def _counts_in(ordered: Sequence[Float64[np.ndarray, " _"]], step: float) -> boo
     if not axes:
         return False
     apart = np.concatenate([values[1:] - values[:-1] for values in axes])
-    if (np.round(apart[apart > 0.5]) == 1).sum() < LEAST_NEXT * len(apart):  # first, as phases take longest
+    if np.count_nonzero(apart[apart > 0.5].round() == 1) < LEAST_NEXT * len(apart):  # first, as phases take longest
         return False
     sums = [np.exp(2j * np.pi * values).sum() for values in axes]
     total = sum(abs(each) ** 2 / len(values) for each, values in zip(sums, axes, strict=True))
@@ -63,5 +63,7 @@ def _distinct(ordered: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
     if not len(ordered):
         return ordered
     middle = 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
-    near = np.round(ordered[np.abs(ordered - middle) < MOST_STEPS], 6)
-    return near[np.append(True, near[1:] != near[:-1])] if len(near) else near
+    near = ordered[np.abs(ordered - middle) < MOST_STEPS].round(6)
+    different = np.ones(len(near), bool)
+    np.not_equal(near[1:], near[:-1], out=different[1:])
+    return near[different]
