@@ -83,7 +83,10 @@ class Reading(NamedTuple):
 
 @cache
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
-    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first; read-only."""
+    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first.
+
+    Read-only: all callers share it.
+    """
     signed = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):

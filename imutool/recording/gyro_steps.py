@@ -66,4 +66,4 @@ def _distinct(ordered: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
     near = ordered[np.abs(ordered - middle) < MOST_STEPS].round(6)
     different = np.ones(len(near), bool)
     np.not_equal(near[1:], near[:-1], out=different[1:])
-    return near[different]
+    return np.asarray(near[different])
