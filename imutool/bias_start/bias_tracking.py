@@ -191,8 +191,8 @@ def filter_together(filters: Sequence[BiasFilter], samples: Sequence[Samples]) -
         else:
             x = State(*map(np.stack, zip(*(vars(state).values() for state in states), strict=True)))
             together = first._replace(u=np.stack([block.u for block, _ in blocks], axis=1))
-            step, begin, *_, end = _motion_step(x, together, filters[0]._walk, filters[0].settings), *first.t_s.tolist()
-            found = [FilteredBlock(begin, end, False, step.of(k)) for k in range(len(filters))]
+            step, t_s = _motion_step(x, together, filters[0]._walk, filters[0].settings), first.t_s
+            found = [FilteredBlock(float(t_s[0]), float(t_s[-1]), False, step.of(k)) for k in range(len(filters))]
         for each, so_far, block in zip(filters, out, found, strict=True):
             each.state = block.step.after
             so_far.append(block)
