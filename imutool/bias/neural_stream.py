@@ -268,11 +268,11 @@ def erf(x: Array, out: Array | None = None) -> Array:
     steps *= ERF_NODES
     nearest = np.rint(steps)
     steps -= nearest
-    steps /= ERF_NODES
+    steps *= 1.0 / ERF_NODES
     node = nearest.astype(np.intp)
     node += round(ERF_END * ERF_NODES)
     *lower, highest = ERF_TABLE
-    y: Array = highest.take(node, out=out)
+    y: Array = highest.take(node, out=out, mode="clip")  # all are inside; to make sure of it takes a copy
     for row in reversed(lower):
         y *= steps
         y += row.take(node)

@@ -17,12 +17,12 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.bias.model import BiasModel
-from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples, innovations
+from imutool.bias_start.bias_tracking import BLOCK_S, BiasFilter, FilteredBlock, Samples, filter_together
 from imutool.bias_start.fitness import head
 from imutool.bias_start.initial_bias import bias_prior
 from imutool.errors import ConfigError
 from imutool.inertial.inertial_filter import STILL, FilterSettings
-from imutool.inertial.innovations import Innovations
+from imutool.inertial.innovations import Innovations, innovations
 from imutool.sensor.signals import LOAD_TAU_S, LOADS, ON, Load, SignalFilter
 
 # T: a few seconds also imitate what a model misses of a cold start; after the last the slowest state has settled
@@ -44,7 +44,7 @@ def with_earlier_load(model: BiasModel, batches: Iterable[Samples], first_ns: in
     if len(samples[0]) < 2 or samples[0][-1] < BLOCK_S:
         return model
     loads = loads_after(model.rate_hz, samples)
-    log_likelihood = np.array([_log_likelihood(after_load(model, load), samples, first_ns) for load in loads])
+    log_likelihood = _log_likelihood([after_load(model, load) for load in loads], samples, first_ns)
     weights = PRIOR * np.exp(log_likelihood - log_likelihood.max())
     weights /= weights.sum()
     if weights[0] >= LEAST_COLD:
@@ -87,15 +87,20 @@ def after_load(model: BiasModel, load: Load | None) -> BiasModel:
     return out
 
 
-def _log_likelihood(model: BiasModel, samples: Samples, first_ns: int | None) -> float:
-    """Log-likelihood of the rest bias, of the velocity and of what the gyro reads at rest, half second by half second."""
-    t_s, gyro, accel = samples
-    prior = bias_prior(model, first_ns)
-    bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
-    gyro, accel = gyro - bias[:, :3], accel - bias[:, 3:]
-    filter_ = BiasFilter(prior, ahead=True)
-    blocks = [*filter_.feed(t_s, gyro, accel), *filter_.finish()]
-    return float(innovations(blocks).log_likelihood.sum()) + _at_rest([block for block in blocks if block.resting], t_s, gyro)
+def _log_likelihood(models: Sequence[BiasModel], samples: Samples, first_ns: int | None) -> Float64[np.ndarray, " t"]:
+    """Log-likelihood of the rest bias, of the velocity and of what the gyro reads at rest, half second by half second.
+
+    The models are one after different loads.
+    """
+    (t_s, gyro, accel), prior, without = samples, bias_prior(models[0], first_ns), list[Samples]()
+    for model in models:
+        bias = model.stream(prior.mean)(t_s, gyro, accel) - prior.mean
+        without.append((t_s, gyro - bias[:, :3], accel - bias[:, 3:]))
+    found, out = filter_together([BiasFilter(prior, ahead=True) for _ in models], without), []
+    for blocks, (_, rates, _) in zip(found, without, strict=True):
+        in_motion = float(innovations(block.step for block in blocks).log_likelihood.sum())
+        out.append(in_motion + _at_rest([block for block in blocks if block.resting], t_s, rates))
+    return np.array(out)
 
 
 def _at_rest(blocks: Sequence[FilteredBlock], t_s: Float64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"]) -> float:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -29,7 +29,7 @@ from imutool.bias.model import BiasModel, Vector6
 from imutool.bias.model_file import library, shipped_for
 from imutool.bias_start import Fitness, Verdict
 from imutool.bias_start.bias_at_rest import MOST_UNKNOWN, changed_at_rest, shown_at_rest
-from imutool.bias_start.bias_tracking import BiasFilter, Samples, innovations, stops_of
+from imutool.bias_start.bias_tracking import BiasFilter, FilteredBlock, Samples, filter_together, stops_of
 from imutool.bias_start.initial_bias import AT_REST_STD, LEAST_STD, InitialBias, bias_prior
 from imutool.bias_start.prior_width import (
     MOST_CHANGE,
@@ -41,7 +41,7 @@ from imutool.bias_start.prior_width import (
     untold_bias,
 )
 from imutool.bias_start.stretches import GRAVITY_RANGE, unusual_gravity
-from imutool.inertial.innovations import SURPRISING, Innovations, Share, share_of_correction
+from imutool.inertial.innovations import SURPRISING, Innovations, Share, innovations, share_of_correction
 from imutool.inertial.stationary import white_noise
 from imutool.recording import GRAVITY_M_S2
 from imutool.recording.columns import quantile
@@ -88,16 +88,15 @@ def judge(model: BiasModel, start: InitialBias, batches: Iterable[Samples], abou
     if len(samples[0]) < 2:
         return Fitness("doubtful", ("the log is too short to be judged",))
     prior = _prior(model)
+    unknown = replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least=None)
     corrected = _without_motion(model, samples, prior)
-    found = _evidence(corrected, prior)
+    found, none, unstarted = _evidence((corrected, samples, corrected), (prior, unknown, unknown))
     shown_std = np.sqrt(DEPENDENT**2 * found.variance + AT_REST_STD**2)
     other_start, harmful = contradicted_start(start.rest, start.std, prior.mean + found.difference, shown_std)
     supported = supported_std(prior.std, prior.least, found.difference, DEPENDENT**2 * found.variance)
     prior = replace(prior, std=np.minimum(supported, prior.std))  # a contradiction widens nothing here
     most = np.full(6, MOST_DEVIATIONS) if prior.least is None else MOST_OF_GUESS
-    unknown = replace(prior, mean=np.zeros(6), std=UNKNOWN_STD, least=None)
-    none = _evidence(samples, unknown)
-    share = share_of_correction(none.innovations, _evidence(corrected, unknown).innovations)
+    share = share_of_correction(none.innovations, unstarted.innovations)
     confirmed = HALF < share.value - SURE * share.std < MOST_SHARE
     other_axes = turned_axes(found.difference, _shown_std(found, prior), prior.mean)
     other_bias, refuted = list(_other_bias(found, prior, most)), list(_refuted(share))
@@ -172,15 +171,18 @@ def _started(start: InitialBias, prior: BiasPrior) -> BiasPrior:
     return start.follows or measured
 
 
-def _evidence(samples: Samples, prior: BiasPrior) -> _Evidence:
-    """Evidence of samples, which hold no motion-dependent bias, about a prior of a constant bias."""
-    speed_m_s = max(prior.settings.speed_m_s, LEAST_SPEED_M_S)
-    careful = msgspec.structs.replace(prior.settings, speed_m_s=speed_m_s, pivot_m=LEAST_PIVOT_M)
-    filter_ = BiasFilter(replace(prior, walk=np.zeros(6)), careful, ahead=True)
-    blocks = [*filter_.feed(*samples), *filter_.finish()]
+def _evidence(samples: Sequence[Samples], priors: Sequence[BiasPrior]) -> list[_Evidence]:
+    """Evidence of samples at the same times, which hold no motion-dependent bias, each about its prior of a constant bias."""
+    settings = priors[0].settings  # all are of one model
+    careful = msgspec.structs.replace(settings, speed_m_s=max(settings.speed_m_s, LEAST_SPEED_M_S), pivot_m=LEAST_PIVOT_M)
+    filters = [BiasFilter(replace(prior, walk=np.zeros(6)), careful, ahead=True) for prior in priors]
+    return [_shown(blocks, prior) for blocks, prior in zip(filter_together(filters, samples), priors, strict=True)]
+
+
+def _shown(blocks: Sequence[FilteredBlock], prior: BiasPrior) -> _Evidence:
     if not blocks:
         return _Evidence(0.0, 0.0, np.zeros(6), np.full(6, np.inf))
-    found = innovations(blocks)
+    found = innovations(block.step for block in blocks)
     last = blocks[-1].step.after
     after, before = np.diag(last.covariance(False)), prior.std**2
     precision = 1.0 / after - 1.0 / before
@@ -250,7 +252,7 @@ def _worse_than_none(samples: Samples, used: BiasPrior, found: _Evidence, prior:
     shown = found.variance < MOST_CHANGE**2 / MOST_DEVIATIONS**2
     if (shown & (np.abs(found.difference) > MOST_CHANGE + MOST_DEVIATIONS * prior.std)).any():
         return ["no turn-on changes the bias by so much: the log is of another unit"]
-    evidence = _evidence(samples, used).log_likelihood - none.log_likelihood
+    evidence = _evidence([samples], [used])[0].log_likelihood - none.log_likelihood
     if evidence > LEAST_EVIDENCE:
         return []
     return [f"the raw samples agree with gravity and stops better than the corrected, by {-evidence:.0f} in log-likelihood"]

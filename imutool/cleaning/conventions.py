@@ -147,19 +147,17 @@ def _carried(
 
     A signed permutation P of a rate turns the rotation: exp(P w) = P exp(det(P) w) P^T.
     """
-    turns: dict[tuple[str, bool], Float64[np.ndarray, "w 4"]] = {}
-    for unit in {unit for unit, _ in readings}:
-        for sign in (1.0, -1.0):
-            q = quaternion.exp(np.zeros((len(rate), 3)))
-            for k in range(WINDOW):
-                q = quaternion.multiply(q, quaternion.exp(sign * RATES[unit] * STEP_S * rate[:, k]))
-            turns[unit, sign > 0] = q
-    errors = []
-    for unit, matrix in readings:
-        P = matrix / RATES[unit]
-        q = turns[unit, bool(np.linalg.det(P) > 0)]
-        errors.append(np.linalg.norm(quaternion.rotate(q, last @ P) @ P.T - first, axis=1))
-    return np.stack(errors)
+    P = np.array([matrix / RATES[unit] for unit, matrix in readings])
+    units, proper = np.array([unit for unit, _ in readings]), np.linalg.det(P) > 0
+    errors = np.empty((len(readings), len(rate)))
+    for unit, rotates in dict.fromkeys(zip(units.tolist(), proper.tolist(), strict=True)):
+        of, factor = P[alike := (units == unit) & (proper == rotates)], (1.0 if rotates else -1.0) * RATES[unit] * STEP_S
+        q = quaternion.exp(np.zeros((len(rate), 3)))
+        for k in range(WINDOW):
+            q = quaternion.multiply(q, quaternion.exp(factor * rate[:, k]))
+        turned = quaternion.rotate(np.tile(q, (len(of), 1)), (last @ of).reshape(-1, 3)).reshape(len(of), -1, 3)
+        errors[alike] = np.linalg.norm(turned @ of.swapaxes(1, 2) - first, axis=2)
+    return errors
 
 
 def _turns_against_poses(

@@ -6,6 +6,7 @@ model selection, Econometrica 57, 1989, eq. 5.6).
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -80,15 +81,21 @@ class Reading(NamedTuple):
         return bool((self.axes == np.eye(3)).all())
 
 
+@cache
 def signed_permutations() -> Float64[np.ndarray, "48 3 3"]:
-    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first."""
+    """Signed permutations of three axes: 24 rotations and 24 reflections, the identity first.
+
+    Read-only: all callers share it.
+    """
     signed = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             P = np.zeros((3, 3))
             P[range(3), order] = signs
             signed.append(P)
-    return np.stack(signed)
+    every = np.stack(signed)
+    every.flags.writeable = False
+    return every
 
 
 def axis_names(P: Float64[np.ndarray, "3 3"]) -> str:

@@ -36,7 +36,7 @@ from msgspec import Meta
 
 from imutool.array_types import Float64
 from imutool.config import Settings
-from imutool.inertial.preintegration import EYE, SMALL_RAD2, Increment, Matrix3, Vector3, exp_and_jacobian, hat, log
+from imutool.inertial.preintegration import EYE, SMALL_RAD2, Increment, Matrix3, Vector3, exp_and_jacobian, hat, log, matvec
 from imutool.recording import GRAVITY_M_S2
 
 TURN, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -54,9 +54,9 @@ LEAST_VARIANCE = 1e-14  # that a step adds to every error: keeps the covariance 
 MISSING_RAD_S, MISSING_M_S2 = 2.0, 10.0  # standard deviation of the motion during missing samples
 PAUSE_RAD, PAUSE_M_S, PAUSE_M = 0.3, 3.0, 1e3  # of turn, velocity and (at most) position over a gap in which the pose stays
 
-Covariance = Float64[np.ndarray, "_ _"]  # SIZE, and one for each offset
-Vector6 = Float64[np.ndarray, "6"]
-Error = Float64[np.ndarray, " _"]
+Covariance = Float64[np.ndarray, "*filters _ _"]  # SIZE, and one for each offset
+Vector6 = Float64[np.ndarray, "*filters 6"]
+Error = Float64[np.ndarray, "*filters _"]
 Walk = Float64[np.ndarray, " _"]  # of b, then of the offsets, per second^1/2
 Positive = Annotated[float, Meta(gt=0)]
 
@@ -90,7 +90,7 @@ class State:
     ground: Vector6
     steady: Vector6
     P: Covariance
-    offsets: Float64[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0))  # of other sensors
+    offsets: Float64[np.ndarray, "*filters _"] = field(default_factory=lambda: np.zeros(0))  # of other sensors
 
     def rest_bias(self, resting: bool) -> Vector6:
         """Bias of the sensor, at rest or in motion."""
@@ -104,10 +104,10 @@ class State:
 
     def moved(self, e: Error, P: Covariance) -> State:
         """State with an added error e: Exp(e) of the pose, and sums."""
-        E, J = exp_and_jacobian(e[TURN])
-        v, p = (E @ x + J @ xi for x, xi in ((self.v_w, e[VELOCITY]), (self.p_wb, e[POSITION])))
-        bias, ground, steady = self.bias + e[BIAS], self.ground + e[GROUND], self.steady + e[STEADY]
-        return State(E @ self.R_wb, v, p, bias, ground, steady, P, self.offsets + e[SIZE:])
+        E, J = exp_and_jacobian(e[..., TURN])
+        v, p = matvec(E, self.v_w) + matvec(J, e[..., VELOCITY]), matvec(E, self.p_wb) + matvec(J, e[..., POSITION])
+        bias, ground, steady = self.bias + e[..., BIAS], self.ground + e[..., GROUND], self.steady + e[..., STEADY]
+        return State(E @ self.R_wb, v, p, bias, ground, steady, P, self.offsets + e[..., SIZE:])
 
     def minus(self, other: State) -> Error:
         """Error e with `self == other.moved(e)`."""
@@ -120,16 +120,18 @@ class State:
 
 
 class Step(NamedTuple):
-    """Filter step over a block.
-
-    State before, predicted state, transition, state after the measurements. No innovation over a gap.
-    """
+    """Filter step over a block: states before, predicted and after; over a gap no innovation."""
 
     before: State
     expected: State
     F: Covariance
     after: State
     innovation: tuple[Vector3, Matrix3] | None = None  # of the bounded velocity, in world axes, and its covariance
+
+    def of(self, k: int) -> Step:
+        """Step of one filter of several."""
+        before, expected, after = (State(*(x[k] for x in vars(s).values())) for s in (self.before, self.expected, self.after))
+        return Step(before, expected, self.F[k], after, self.innovation and tuple(x[k] for x in self.innovation))
 
 
 def start(accel: Vector3, bias: Vector6, std: Float64[np.ndarray, "12"], s: FilterSettings) -> State:
@@ -169,25 +171,23 @@ def motion_step(x: State, motion: Increment, rate: Vector3, missing_s: float, wa
     turned = s.gyro_density**2 * T + (s.gyro_scale * motion.turned_rad) ** 2 + (MISSING_RAD_S * missing_s) ** 2
     push = s.accel_density**2 * T + (MISSING_M_S2 * missing_s) ** 2
     step = _predict(x, R, motion.v, motion.p, motion.by_bias, T, (turned, push), walk, resting=False)
-    H = STOPPED.copy()
-    H[:, STEADY] = steady = np.concatenate([R @ hat(rate), -R], axis=1)
+    H = np.zeros((*R.shape[:-1], SIZE))
+    H[..., VELOCITY] = EYE
+    H[..., STEADY] = steady = np.concatenate([R @ hat(rate), -R], axis=-1)
     noise = 2.0 * s.speed_m_s**2 * s.speed_correlation_s / T
-    return _with_velocity(step, H, step.expected.v_w + steady @ x.steady, noise, HUBER)
+    return _with_velocity(step, H, step.expected.v_w + matvec(steady, x.steady), noise, HUBER)
 
 
-def _with_velocity(step: Step, H: Float64[np.ndarray, "3 m"], v: Vector3, noise: float, most: float) -> Step:
+def _with_velocity(step: Step, H: Float64[np.ndarray, "*filters 3 m"], v: Vector3, noise: float, most: float) -> Step:
     """Step after a velocity that is zero but for `noise` per axis; with less weight above `most` standard deviations."""
-    S = H @ step.expected.P[:SIZE, :SIZE] @ H.T + noise * EYE
-    size = math.sqrt(float(v @ v) / float(np.einsum("ii", S)))
-    after = update(step.expected, H, v, np.full(3, noise * max(1.0, size / most) ** 2))
+    S = H @ step.expected.P[..., :SIZE, :SIZE] @ H.swapaxes(-1, -2) + noise * EYE
+    size = np.sqrt((v[..., None, :] @ v[..., None])[..., 0, 0] / np.einsum("...ii->...", S))
+    after = update(step.expected, H, v, noise * np.maximum(1.0, size / most)[..., None] ** 2 * np.ones(3))
     return step._replace(after=after, innovation=(v, S))
 
 
 def rest_step(x: State, mean: Vector6, variance: Float64[np.ndarray, "3"], T: float, walk: Walk, s: FilterSettings) -> Step:
-    """Filter step over a block at rest.
-
-    From the samples' mean and the variance of the gyro's mean.
-    """
+    """Filter step over a block at rest, from the mean and the variance of the gyro's mean."""
     dv = (mean[3:] - x.bias[3:] - x.ground[3:]) * T
     by_bias = np.zeros((9, 6))
     by_bias[3:6, 3:], by_bias[6:, 3:] = -T * np.eye(3), -0.5 * T**2 * np.eye(3)
@@ -203,57 +203,59 @@ def _predict(
     R: Matrix3,
     dv: Vector3,
     dp: Vector3,
-    by_bias: Float64[np.ndarray, "9 6"],
+    by_bias: Float64[np.ndarray, "*filters 9 6"],
     T: float,
-    noise: tuple[float, float],
+    noise: tuple[Float64[np.ndarray, "*filters"] | float, float],
     walk: Walk,
     *,
     resting: bool,
 ) -> Step:
     """Predicted state after a block."""
-    v = x.v_w + G_W * T + x.R_wb @ dv
-    p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + x.R_wb @ dp
-    by_bias_w = x.R_wb @ by_bias.reshape(3, 3, 6)
-    by_bias_w[0] = turned = R @ by_bias[:3]
+    v = x.v_w + G_W * T + matvec(x.R_wb, dv)
+    p = x.p_wb + x.v_w * T + 0.5 * T**2 * G_W + matvec(x.R_wb, dp)
+    by_bias_w = x.R_wb[..., None, :, :] @ by_bias.reshape(*by_bias.shape[:-2], 3, 3, 6)
+    by_bias_w[..., 0, :, :] = of_turn = R @ by_bias[..., :3, :]
     V, X = hat(v), hat(p)
-    by_bias_w[1] += V @ turned
-    by_bias_w[2] += X @ turned
-    F = np.eye(len(x.P))
-    F[VELOCITY, TURN], F[POSITION, TURN], F[POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
-    F[POSE, BIAS] = by_bias_w.reshape(9, 6)
+    by_bias_w[..., 1, :, :] += V @ of_turn
+    by_bias_w[..., 2, :, :] += X @ of_turn
+    F = np.zeros(x.P.shape) + np.eye(x.P.shape[-1])
+    F[..., VELOCITY, TURN], F[..., POSITION, TURN], F[..., POSITION, VELOCITY] = T * HAT_G, 0.5 * T**2 * HAT_G, T * EYE
+    F[..., POSE, BIAS] = by_bias_w.reshape(by_bias.shape)
     if resting:
-        F[POSE, GROUND] = F[POSE, BIAS]
-    P = F @ x.P @ F.T
-    by_noise = np.zeros((9, 6))  # of the turn, then of the push
-    by_noise[TURN, :3], by_noise[VELOCITY, :3], by_noise[POSITION, :3] = EYE, V, X
-    by_noise[VELOCITY, 3:], by_noise[POSITION, 3:] = EYE, 0.5 * T * EYE
-    P[POSE, POSE] += (by_noise * np.repeat(noise, 3)) @ by_noise.T
-    variances = P.reshape(-1)[:: len(P) + 1]
+        F[..., POSE, GROUND] = F[..., POSE, BIAS]
+    P = F @ x.P @ F.swapaxes(-1, -2)
+    by_noise, of_noise = np.zeros(by_bias.shape), np.empty(x.bias.shape)  # of the turn, then of the push
+    by_noise[..., TURN, :3], by_noise[..., VELOCITY, :3], by_noise[..., POSITION, :3] = EYE, V, X
+    by_noise[..., VELOCITY, 3:], by_noise[..., POSITION, 3:] = EYE, 0.5 * T * EYE
+    of_noise[..., :3], of_noise[..., 3:] = np.asarray(noise[0])[..., None], noise[1]
+    P[..., POSE, POSE] += (by_noise * of_noise[..., None, :]) @ by_noise.swapaxes(-1, -2)
+    variances, walked = np.einsum("...ii->...i", P), walk**2 * T
     variances += LEAST_VARIANCE
-    variances[BIAS] += walk[:6] ** 2 * T
-    variances[SIZE:] += walk[6:] ** 2 * T
-    expected = State(R, v, p, x.bias, x.ground, x.steady, 0.5 * (P + P.T), x.offsets)
+    variances[..., BIAS] += walked[:6]
+    if len(walked) > 6:
+        variances[..., SIZE:] += walked[6:]
+    expected = State(R, v, p, x.bias, x.ground, x.steady, 0.5 * (P + P.swapaxes(-1, -2)), x.offsets)
     return Step(x, expected, F, expected)
 
 
-def update(x: State, H: Float64[np.ndarray, "k m"], z: Float64[np.ndarray, " k"], noise: Float64[np.ndarray, " k"]) -> State:
+def update(x: State, H: Float64[np.ndarray, "*filters k m"], z: Error, noise: Error) -> State:
     """Kalman update by z = H e + n.
 
     With e the first m errors of the estimate and `noise` the variances of n.
     """
-    H = H if H.shape[1] == len(x.P) else np.pad(H, ((0, 0), (0, len(x.P) - H.shape[1])))
+    H = H if (more := x.P.shape[-1] - H.shape[-1]) == 0 else np.pad(H, ((0, 0), (0, more)))
     K, P = gain(x.P, H, noise)
-    return x.moved(-K @ z, P)
+    return x.moved(-matvec(K, z), P)
 
 
 def gain(
-    P: Float64[np.ndarray, "*batch s s"], H: Float64[np.ndarray, "k s"], noise: Float64[np.ndarray, "*batch k"]
+    P: Float64[np.ndarray, "*batch s s"], H: Float64[np.ndarray, "... k s"], noise: Float64[np.ndarray, "*batch k"]
 ) -> tuple[Float64[np.ndarray, "*batch s k"], Float64[np.ndarray, "*batch s s"]]:
     """Kalman gain of a measurement z = H e + n, and the covariance after it (Joseph form)."""
     HP = H @ P
-    S = HP @ H.T
-    diagonal = np.arange(len(H))
-    S[..., diagonal, diagonal] += noise
+    S = HP @ H.swapaxes(-1, -2)
+    variances = np.einsum("...kk->...k", S)  # a view
+    variances += noise
     K = np.linalg.solve(S, HP).swapaxes(-1, -2)
     I_KH = np.eye(P.shape[-1]) - K @ H
     after = I_KH @ P @ I_KH.swapaxes(-1, -2) + (K * noise[..., None, :]) @ K.swapaxes(-1, -2)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.inertial.inertial_filter import Step
 
 STUDENT = 7.0  # degrees of freedom of the likelihood, so that one jolt does not decide
 SURPRISING = 7.81  # chi-square of three that one innovation in twenty exceeds: above, it gets less weight
@@ -30,6 +32,13 @@ class Innovations(NamedTuple):
         """Student's log-likelihood of each block."""
         fit = -0.5 * (STUDENT + 3.0) * np.log1p(self.chi_square / STUDENT)
         return np.asarray(fit - 0.5 * np.linalg.slogdet(self.S)[1])
+
+
+def innovations(steps: Iterable[Step]) -> Innovations:
+    """Innovations of each step's velocity, in body axes; none of a step over a gap."""
+    measured = [(step.expected.R_wb.T, *step.innovation) for step in steps if step.innovation is not None]
+    R_bw, v, S = (np.array([row[k] for row in measured]).reshape(-1, *shape) for k, shape in enumerate(((3, 3), (3,), (3, 3))))
+    return Innovations((R_bw @ v[..., None])[..., 0], R_bw @ S @ R_bw.transpose(0, 2, 1))
 
 
 class Share(NamedTuple):

@@ -16,9 +16,9 @@ import numpy as np
 
 from imutool.array_types import Float64
 
-Vector3 = Float64[np.ndarray, "3"]
-Matrix3 = Float64[np.ndarray, "3 3"]
-Vectors = Float64[np.ndarray, "n 3"]
+Vector3 = Float64[np.ndarray, "*filters 3"]
+Matrix3 = Float64[np.ndarray, "*filters 3 3"]
+Vectors = Float64[np.ndarray, "n *filters 3"]
 EYE = np.eye(3)
 HATS = np.cross(EYE[:, None], EYE[None]).swapaxes(1, 2).reshape(3, 9)  # hat(x), row by row, is x @ HATS: one product
 AFTER, BEFORE = (1, 2, 0), (2, 0, 1)  # axes of a cross product
@@ -36,13 +36,19 @@ class Increment(NamedTuple):
     R: Matrix3
     v: Vector3
     p: Vector3
-    by_bias: Float64[np.ndarray, "9 6"]
-    turned_rad: float  # length of the path, not of the chord
+    by_bias: Float64[np.ndarray, "*filters 9 6"]
+    turned_rad: Float64[np.ndarray, "*filters"] | float  # length of the path, not of the chord
 
 
 def hat(x: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
     """Skew matrix of `x ×`."""
-    return np.asarray(np.dot(x, HATS).reshape(*x.shape, 3))
+    return np.asarray(np.dot(x.reshape(-1, 3), HATS).reshape(*x.shape, 3))
+
+
+def matvec(A: Float64[np.ndarray, "*batch k m"], x: Float64[np.ndarray, "*batch m"]) -> Float64[np.ndarray, "*batch k"]:
+    """Product of each matrix and its vector."""
+    product: Float64[np.ndarray, "*batch k"] = (A @ x[..., None])[..., 0]
+    return product
 
 
 def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"]:
@@ -60,7 +66,10 @@ def exp(xi: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 3 3"
 
 
 def exp_and_jacobian(xi: Vector3) -> tuple[Matrix3, Matrix3]:
-    """Rotation by one rotation vector, and its left Jacobian; in floats, which are faster."""
+    """Rotation by a rotation vector, and its left Jacobian; in floats, which are faster."""
+    if xi.ndim > 1:
+        E, J = zip(*map(exp_and_jacobian, xi), strict=True)
+        return np.array(E), np.array(J)
     x, y, z = xi.tolist()
     square = x * x + y * y + z * z
     if square < SMALL_RAD2:
@@ -83,39 +92,46 @@ def log(R: Matrix3) -> Vector3:
 
 
 def integrate(t_s: Float64[np.ndarray, " n"], gyro: Vectors, accel: Vectors) -> Increment:
-    """Increment from the first sample to the last; the samples are already minus their bias."""
+    """Increment from the first sample to the last; the samples are already minus their bias.
+
+    Behind the samples there may be an axis of filters, which costs numpy little more than a single filter.
+    """
     # numpy's functions that join and pad take as long as the sums: the arrays are filled in place
     n, dt = len(t_s), t_s[1:] - t_s[:-1]
-    step = (gyro[:-1] + gyro[1:]) * (0.5 * dt)[:, None]
-    R, turned = np.empty((n, 3, 3)), np.zeros((n, 3, 3))  # R: body at each sample to body at the first
+    each = dt.reshape(-1, *(1 for _ in gyro.shape[1:]))
+    step = (gyro[:-1] + gyro[1:]) * (0.5 * each)
+    R, turned = np.empty((*gyro.shape, 3)), np.zeros((*gyro.shape, 3))  # R: body at each sample to body at the first
     R[0], R[1:] = EYE, _running_product(exp(step))
     # a constant c added to the bias turns step k by -Jr c dt, transformed by the later steps
-    right_jacobian = (EYE - 0.5 * hat(step)) * dt[:, None, None]
+    right_jacobian = (EYE - 0.5 * hat(step)) * each[..., None]
     np.cumsum(R[1:] @ right_jacobian, axis=0, out=turned[1:])
-    force = (R @ accel[..., None])[..., 0]
+    force = matvec(R, accel)
 
     weights = np.zeros((2, n))  # trapezoidal, to velocity and to position
     weights[0, :-1], weights[1, :-1] = dt, dt * (t_s[-1] - 0.5 * (t_s[:-1] + t_s[1:]))
     weights[:, 1:] += weights[:, :-1].copy()
     weights *= 0.5
-    v, p = weights @ force
-    by_bias = np.zeros((9, 6))
-    by_bias[:3, :3] = -R[-1].T @ turned[-1]
+    filters = gyro.shape[1:-1]
+    all_turned, all_R, force = (x.swapaxes(0, len(filters)) for x in (turned, R, force))  # the samples behind the filters
+    moved = weights @ force
+    by_bias = np.zeros((*filters, 9, 6))
+    by_bias[..., :3, :3] = -R[-1].swapaxes(-1, -2) @ turned[-1]
     # force turned by -turned: its derivative is hat(force) turned, from the sums of force_a turned_bj
-    sums = ((weights[:, None] * force.T).reshape(6, n) @ turned.reshape(n, 9)).reshape(2, 3, 3, 3)
-    by_bias[3:, :3] = (sums[:, AFTER, BEFORE] - sums[:, BEFORE, AFTER]).reshape(6, 3)
-    by_bias[3:, 3:] = -(weights @ R.reshape(n, 9)).reshape(6, 3)
-    turned_rad = float(np.sqrt(np.einsum("ni,ni->n", step, step)).sum())
-    return Increment(float(t_s[-1] - t_s[0]), R[-1], v, p, by_bias, turned_rad)
+    weighted = (weights[:, None] * force.swapaxes(-1, -2)[..., None, :, :]).reshape(*filters, 6, n)
+    sums = (weighted @ all_turned.reshape(*filters, n, 9)).reshape(*filters, 2, 3, 3, 3)
+    by_bias[..., 3:, :3] = (sums[..., AFTER, BEFORE, :] - sums[..., BEFORE, AFTER, :]).reshape(*filters, 6, 3)
+    by_bias[..., 3:, 3:] = -(weights @ all_R.reshape(*filters, n, 9)).reshape(*filters, 6, 3)
+    turned_rad = np.sqrt(np.einsum("...i,...i->...", step, step)).sum(axis=0)
+    return Increment(float(t_s[-1] - t_s[0]), R[-1], moved[..., 0, :], moved[..., 1, :], by_bias, turned_rad)
 
 
-def _running_product(R: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "n 3 3"]:
+def _running_product(R: Float64[np.ndarray, "n *filters 3 3"]) -> Float64[np.ndarray, "n *filters 3 3"]:
     """R_0, R_0 R_1, ...: within rows of about n^1/2 at once, then from row to row."""
     n = len(R)
     width = max(1, math.isqrt(n))
     rows = -(-n // width)
-    product = np.empty((rows, width, 3, 3))
-    whole = product.reshape(-1, 3, 3)
+    product = np.empty((rows, width, *R.shape[1:]))
+    whole = product.reshape(-1, *R.shape[1:])
     whole[:n], whole[n:] = R, EYE
     for k in range(1, width):
         product[:, k] = product[:, k - 1] @ product[:, k]

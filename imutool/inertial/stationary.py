@@ -200,15 +200,16 @@ class OnlineRestDetector:
         insort(self._calmest, scatter[0])
         del self._calmest[FLOOR_RANK + 1 :]
         self._windows += 1
+        if scatter[0] > s.gyro_scatter_rad_s or scatter[1] > s.accel_scatter_m_s2:  # nearly always in motion
+            return False
+        if noise[0] > s.gyro_noise_rad_s or noise[1] > s.accel_noise_m_s2:
+            return False
         floor = self._calmest[min(FLOOR_RANK, self._windows // 10, len(self._calmest) - 1)]
         white = float(_white_margin(var[:, :3].sum(axis=0))) * noise[0] / math.sqrt(k)
-        allowed = min(max(white, FLOOR_MARGIN * floor), s.gyro_scatter_rad_s)
-        calm = scatter[0] <= allowed and scatter[1] <= s.accel_scatter_m_s2
-        quiet = noise[0] <= s.gyro_noise_rad_s and noise[1] <= s.accel_noise_m_s2
         half = len(mean) // 2
         trend = float(np.linalg.norm(mean[-half:, :3].sum(axis=0) - mean[:half, :3].sum(axis=0))) / half
         steady = trend <= s.gyro_trend_rad_s + TREND_DEVIATIONS * noise[0] * math.sqrt(2.0 / (half * k))
-        if not (calm and quiet and steady and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
+        if not (scatter[0] <= max(white, FLOOR_MARGIN * floor) and steady and np.linalg.norm(centre) <= s.gyro_mean_rad_s):
             return False
         self._means.append(centre)
         return bool(np.linalg.norm(centre - quantile(np.array(self._means), 0.5)) <= s.gyro_agreement_rad_s)

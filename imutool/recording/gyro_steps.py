@@ -5,6 +5,8 @@ A digital gyro counts in steps that its data sheet states. Values that lie on su
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from imutool.array_types import Float64
@@ -32,24 +34,22 @@ LEAST_NEXT = 0.1  # share of neighbours that are one step apart: else the true s
 def unit_by_steps(rates: Float64[np.ndarray, "n 3"]) -> tuple[str, float] | None:
     """Unit of a gyro whose values are steps of a common sensor, and the step; else None."""
     rates = rates[:: max(1, len(rates) // MOST_ROWS)]
-    found = [(unit, step) for unit, step in STEPS if _counts_in(rates, step)]
+    ordered = [np.sort(axis[np.isfinite(axis)]) for axis in rates.T]
+    found = [(unit, step) for unit, step in STEPS if _counts_in(ordered, step)]
     return found[0] if len({unit for unit, _ in found}) == 1 else None
 
 
-def _counts_in(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
+def _counts_in(ordered: Sequence[Float64[np.ndarray, " _"]], step: float) -> bool:
     """Whether the values of three axes lie on grids of this step, each with an offset, by Rayleigh's test of their phases."""
-    axes = [_distinct(axis / step) for axis in rates.T]
-    axes = [values for values in axes if len(values) > 1]
+    axes = [values for axis in ordered if len(values := _distinct(axis / step)) > 1]
     if not axes:
+        return False
+    apart = np.concatenate([values[1:] - values[:-1] for values in axes])
+    if np.count_nonzero(apart[apart > 0.5].round() == 1) < LEAST_NEXT * len(apart):  # first, as phases take longest
         return False
     sums = [np.exp(2j * np.pi * values).sum() for values in axes]
     total = sum(abs(each) ** 2 / len(values) for each, values in zip(sums, axes, strict=True))
-    apart = np.concatenate([np.diff(values) for values in axes])
-    if (
-        total < LEAST_SUM
-        or sum(map(abs, sums)) < LEAST_LENGTH * sum(map(len, axes))
-        or (np.round(apart[apart > 0.5]) == 1).sum() < LEAST_NEXT * len(apart)
-    ):
+    if total < LEAST_SUM or sum(map(abs, sums)) < LEAST_LENGTH * sum(map(len, axes)):
         return False
     turns = np.concatenate([np.angle(np.exp(2j * np.pi * v) / each) / (2 * np.pi) for each, v in zip(sums, axes, strict=True)])
     places = np.concatenate([values - values.mean() for values in axes])
@@ -58,8 +58,12 @@ def _counts_in(rates: Float64[np.ndarray, "n 3"], step: float) -> bool:
     return abs(off) < MOST_OFF and uncertain < MOST_UNCERTAIN
 
 
-def _distinct(values: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
-    """Different values near the median."""
-    finite = values[np.isfinite(values)]
-    near = finite[np.abs(finite - np.median(finite)) < MOST_STEPS] if len(finite) else finite
-    return np.unique(np.round(near, 6))
+def _distinct(ordered: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " m"]:
+    """Different values near the median of ordered ones."""
+    if not len(ordered):
+        return ordered
+    middle = 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+    near = ordered[np.abs(ordered - middle) < MOST_STEPS].round(6)
+    different = np.ones(len(near), bool)
+    np.not_equal(near[1:], near[:-1], out=different[1:])
+    return np.asarray(near[different])

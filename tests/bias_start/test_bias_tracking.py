@@ -22,10 +22,12 @@ from imutool.bias_start.bias_tracking import (
     FilteredBlock,
     TrackedBiasStream,
     filter_blocks,
+    filter_together,
     smooth_blocks,
 )
 from imutool.bias_start.initial_bias import smooth_bias
 from imutool.bias_start.prior_width import BiasPrior, LeastWidth, shown_bias, supported_std
+from imutool.inertial import inertial_filter
 from imutool.recording import Imu, seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 
@@ -45,6 +47,7 @@ SETTINGS = FlightSettings(**SENSOR, room_m=0.6, position_knot_s=0.9, tilt_rad=0.
 KNOWN = BiasPrior(np.zeros(6), PRIOR, GROUND)
 NOTHING_HELD = BiasTrajectory(np.zeros(1), np.zeros((1, 6)), np.tile(PRIOR, (1, 1)))
 SEEDS = range(12)
+SAME = 1e-11  # sums of products of order one, in another order
 BOUND = 0.999  # of chi-square: one run of this suite in a thousand would fail by chance, were the seeds not fixed
 
 
@@ -256,6 +259,32 @@ def test_a_hole_in_the_samples_makes_it_less_sure_and_a_long_one_starts_the_pose
     assert np.isfinite(much.bias).all()
     end = forward(long)[-1].step.after
     assert (np.abs(end.bias - planted(11)[0])[:3] < 3 * np.sqrt(np.diag(end.P)[9:12])).all()
+
+
+def test_filters_together_find_what_each_finds_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    imu, other = biased(12, duration_s=30.0, still_s=4.0), biased(13, duration_s=30.0)  # the other never rests
+    t = seconds(imu.t_ns, int(imu.t_ns[0]))
+    kept = (t < 10.0) | ((t > 10.2) & (t < 20.0)) | (t > 25.0)
+    given = [(t[kept], x.gyro[kept] + shift, x.accel[kept]) for x, shift in ((imu, 0.0), (imu, 0.02), (other, 0.0))]
+    priors = [KNOWN, replace(KNOWN, std=10.0 * PRIOR), KNOWN]
+    alone = []
+    for prior, of in zip(priors, given, strict=True):
+        filter_ = BiasFilter(prior, ahead=True)
+        alone.append([*filter_.feed(*of), *filter_.finish()])
+    steps, motion_step = [], inertial_filter.motion_step
+    monkeypatch.setattr(inertial_filter, "motion_step", lambda *given: steps.append(1) or motion_step(*given))
+    filters = [BiasFilter(prior, ahead=True) for prior in priors]
+    for found, right, filter_ in zip(filter_together(filters, given), alone, filters, strict=True):
+        assert [block[:3] for block in found] == [block[:3] for block in right]
+        for a, b in zip(found, right, strict=True):
+            for x, y in ((a.step.expected, b.step.expected), (a.step.after, b.step.after)):
+                np.testing.assert_allclose(x.rest_bias(True), y.rest_bias(True), rtol=0.0, atol=SAME)
+                np.testing.assert_allclose(x.P, y.P, rtol=0.0, atol=SAME)
+            np.testing.assert_allclose(a.step.F, b.step.F, rtol=0.0, atol=SAME)
+        assert filter_.state is found[-1].step.after
+    moving = sum(not block.resting for found in alone for block in found)
+    assert any(block.resting for block in alone[0])
+    assert len(steps) < 0.6 * moving
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50, 100])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,12 @@ def test_repair_and_clean_do_without_scipy(tmp_path: Path) -> None:
     for word in ("repair", "clean"):
         assert loaded_by_command([word, tmp_path / "flight.mcap", tmp_path / f"{word}.mcap"], {"scipy"}) == []
         assert (tmp_path / f"{word}.mcap").exists()
+
+
+def test_a_log_without_poses_does_without_masked_arrays(tmp_path: Path) -> None:
+    write(replace(flight(2, duration_s=10.0), truths={}), tmp_path / "imu.mcap")
+    assert loaded_by_command(["info", tmp_path / "imu.mcap"], {"numpy.ma"}) == []
+    assert loaded_by_command(["clean", tmp_path / "imu.mcap"], {"numpy.ma"}) == []
 
 
 def test_an_argument_goes_by_its_word_and_an_option_by_its_long_flag() -> None:

@@ -39,7 +39,7 @@ class Ends:
 
     def __init__(self) -> None:
         self._few = np.zeros(0)  # distinct values, until there are enough of them
-        self._ends = {-1: (np.zeros(0), np.zeros(0, np.int64)), 1: (np.zeros(0), np.zeros(0, np.int64))}
+        self._ends: dict[int, list[tuple[float, int]]] = {-1: [], 1: []}  # values and their counts, the extreme first
         self._samples = 0
 
     def see(self, values: Float64[np.ndarray, " n"]) -> None:
@@ -49,27 +49,26 @@ class Ends:
         if len(self._few) < FINE_LEVELS:
             # with counts `np.unique` does not import numpy.ma, which takes longer than a short log
             self._few = np.unique(np.concatenate([self._few, levels]), return_counts=True)[0][:FINE_LEVELS]
-        for side, (known, times) in self._ends.items():
+        for side, known in self._ends.items():
             near = slice(None, KEPT) if side < 0 else slice(-KEPT, None)
-            both, which = np.unique(np.concatenate([known, levels[near]]), return_inverse=True)
-            total = np.bincount(which, np.concatenate([times, counts[near]])).astype(np.int64)
-            self._ends[side] = both[near], total[near]
+            total = dict(known)  # for so few values numpy takes ten times as long
+            for level, count in zip(levels[near].tolist(), counts[near].tolist(), strict=True):
+                total[level] = total.get(level, 0) + count
+            self._ends[side] = sorted(total.items(), reverse=side > 0)[:KEPT]
 
     def limit(self, side: int) -> float | None:
         """Saturation limit (`RULE`) at the low (-1) or high (1) end; None without saturation."""
         if len(self._few) < LEVELS:
             return None
-        levels, counts = self._ends[side]
-        end, near, before = (0, counts[1:], levels[1]) if side < 0 else (-1, counts[:-1], levels[-2])
-        far = len(self._few) >= FINE_LEVELS and side * before < (1.0 - FAR) * side * levels[end]
-        piled = counts[end] >= (FEW_SAMPLES if far else SAMPLES) and counts[end] > PILE * near.max()
-        median = 2 * counts[end] > self._samples
-        return float(levels[end]) if piled and not median else None
+        (level, count), *others = self._ends[side]
+        far = len(self._few) >= FINE_LEVELS and side * others[0][0] < (1.0 - FAR) * side * level
+        piled = count >= (FEW_SAMPLES if far else SAMPLES) and count > PILE * max(times for _, times in others)
+        median = 2 * count > self._samples
+        return level if piled and not median else None
 
     def extreme(self, side: int) -> float:
         """Extreme value so far at an end."""
-        levels = self._ends[side][0]
-        return float(levels[0 if side < 0 else -1]) if len(levels) else np.nan
+        return self._ends[side][0][0] if self._ends[side] else np.nan
 
 
 NONE = np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -98,13 +98,14 @@ class KeptChunk(NamedTuple):
     head: ChunkHead
     indexes: MessageIndexes
     parts: Mapping[str, list[Part]]  # by topic
+    defines: bool  # schemas or channels: whoever copies it has to read them
 
 
 class KeptChunks:
     """Chunks that were read and checked before the copy, and then are only copied.
 
-    A chunk is kept if nothing is left to do about it: it is intact, its message indexes are right, and it defines nothing.
-    Whoever copies it must make sure that the file is still the same (`location.identity`).
+    A chunk is kept if it is intact and its message indexes are right. One that defines nothing is only copied: whoever does so
+    must make sure that the file is still the same (`location.identity`).
     """
 
     def __init__(self, source: Source, topics: Mapping[str, tuple[Topic, set[int]]], max_chunk: int) -> None:
@@ -114,8 +115,9 @@ class KeptChunks:
         self._room = KEPT_BYTES
 
     def pop(self, block: MessageBlock, channels: set[int]) -> KeptChunk | None:
-        """Hand over a chunk, if it was kept with the messages of these channels."""
-        return self._kept.pop(block.offset, None) if channels == self._channels else None
+        """Hand over a chunk, if it was kept with the messages of these channels and defines nothing."""
+        kept = self._kept.pop(block.offset, None) if channels == self._channels else None
+        return None if kept is None or kept.defines else kept
 
     def rows(
         self, block: MessageBlock, wanted: Mapping[str, set[int]], first: int, last: int
@@ -144,11 +146,11 @@ class KeptChunks:
             return None
         everything = memoryview(self._source.at(block.offset, block.end - block.offset))
         head, indexes, right, found = check_chunk(everything, block, self._max_chunk)
-        if indexes is None or not right or found.definitions:
+        if indexes is None or not right:
             return None
         parts = {name: list(parts_of(found, topic, channels)) for name, (topic, channels) in self._topics.items()}
         self._room -= sum(column.nbytes for of_topic in parts.values() for part in of_topic for column in part)
-        self._kept[block.offset] = KeptChunk(head, indexes._replace(entries=NO_ENTRIES), parts)
+        self._kept[block.offset] = KeptChunk(head, indexes._replace(entries=NO_ENTRIES), parts, bool(found.definitions))
         return parts
 
 

@@ -33,17 +33,22 @@ def copied(source: Path, target: Path, keep_until_ns: int | None) -> RewriteRepo
         return rewrite(log, target, [Debiaser(IMU, static.Model(), from_numbers("0,0,0,0,0,0"))], metadata={})
 
 
-def test_kept_chunks_make_the_same_copy_and_are_unpacked_once(
-    foreign: Foreign, flight: Messages, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source, unpacked = foreign(flight, layout, chunk_size=10_000), list[int]()
-    unpack = chunk_check.records.unpack
+def counted_chunks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Offsets of the chunks that are unpacked from now on."""
+    unpacked, unpack = list[int](), chunk_check.records.unpack
 
     def counted(record: memoryview, offset: int, *others: Any) -> bytes | memoryview:
         unpacked.append(offset)
         return unpack(record, offset, *others)
 
     monkeypatch.setattr(chunk_check.records, "unpack", counted)
+    return unpacked
+
+
+def test_kept_chunks_make_the_same_copy_and_are_unpacked_once(
+    foreign: Foreign, flight: Messages, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, unpacked = foreign(flight, layout, chunk_size=10_000), counted_chunks(monkeypatch)
     with Log(source) as log:
         middle = sorted(int(t) for stamps in log.stamps(IMU) for t in stamps)[400]
     reports, counts = [], []
@@ -56,6 +61,18 @@ def test_kept_chunks_make_the_same_copy_and_are_unpacked_once(
     if layout in ("zstd", "lz4", "plain", "data-crc"):
         assert reports[0].chunks > 20
         assert max(counts) <= counts[0] + 3  # those that define channels are read again
+
+
+def test_a_chunk_is_unpacked_once_though_it_defines_channels(
+    foreign: Foreign, flight: Messages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Log(foreign(flight, "zstd", chunk_size=10_000)) as log:
+        log.keep([IMU])
+        unpacked = counted_chunks(monkeypatch)
+        first = [rows.payload.tobytes() for _, rows in log.rows([IMU])]
+        assert len(unpacked) == len(set(unpacked)) > 20
+        assert [rows.payload.tobytes() for _, rows in log.rows([IMU])] == first
+        assert len(unpacked) == len(set(unpacked))
 
 
 def test_a_log_that_changes_after_its_chunks_were_kept_is_refused(foreign: Foreign, flight: Messages, tmp_path: Path) -> None:
