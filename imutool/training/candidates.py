@@ -110,7 +110,7 @@ def _solved(
     network, biases = hybrid.Network(Config(remainder=False), pool.rate_hz).double(), {}
     for sensor, fit in fits.items():
         columns = parameter_columns(fit.forms, effects[sensor])
-        theta, covariance = fit.problem.solve(columns, without=without)
+        theta, covariance = fit.problem.solve(columns, without=without).theta, fit.problem.covariance(columns, without)
         network.take(sensor, effects[sensor], theta[columns], covariance)
         biases[sensor] = fit.problem.own_at(theta)[:, :3]
         if sensor == "gyro" and "accel" not in fits:

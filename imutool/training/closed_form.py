@@ -110,7 +110,7 @@ def solve(
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = [(first, n) for first, n in _window_sets(pool, window_s, part) if len(first)]
+    sets = [(first, n) for first, n in window_sets(pool, window_s, part, MAX_SAMPLES) if len(first)]
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
     nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
     own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
@@ -238,28 +238,29 @@ def minus_log_likelihood(logs: Integrated, theta: Float[Tensor, " p"], prior: Fl
     return torch.where(failed == 0, found, math.inf)  # rounding alone makes S indefinite
 
 
-def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:
-    """First samples of the windows of each length, and the length in samples.
+def window_sets(
+    pool: Pool, window_s: Sequence[float], part: Part, most_samples: int, *, ends_only: bool = False
+) -> list[tuple[Int[Tensor, " k"], int]]:
+    """Windows of each length, half overlapping, evenly chosen where there are many: first samples, and steps.
 
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = [_some(pool.starts(n, part, hop=max(1, n // 2)), n) for n in map(pool.samples, window_s)]
-    seen = torch.cat([pool.log[first] for first, _ in sets])
-    missing = [name for i, name in enumerate(pool.names) if not bool((seen == i).any())]
+    sets = []
+    for n in map(pool.samples, window_s):
+        first = pool.starts(n, part, hop=max(1, n // 2), ends_only=ends_only)
+        sets.append((first[:: max(1, -(-len(first) * n // most_samples))], n))
+    covered = torch.cat([pool.log[first] for first, _ in sets])
+    missing = [name for i, name in enumerate(pool.names) if not bool((covered == i).any())]
     if missing:
-        where = f"the {part.replace('_', '-')} part of {', '.join(missing)}"
+        of = "" if part == "all" else f" in the {part.replace('_', '-')} part"
         raise DataError(
-            f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
-            expected="truth that covers at least one window",
-            fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
+            f"no stretch of truth without a gap{of}",
+            where=", ".join(missing),
+            expected=f"{min(window_s):g} s of it in every log",
+            fix="Leave the log out; or shorten gyro_window_s and accel_window_s, if you set them",
         )
     return sets
-
-
-def _some(first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " k"], int]:
-    """At most `MAX_SAMPLES` of samples, evenly chosen."""
-    return first[:: max(1, -(-len(first) * n // MAX_SAMPLES))], n
 
 
 def _by_matrix(A: Float[Tensor, "m n 3 3"], u: Float[Tensor, "m n 3"]) -> Float[Tensor, "m 3 9"]:

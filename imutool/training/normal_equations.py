@@ -19,13 +19,12 @@ from torch import Tensor
 
 from imutool.array_types import Float, Int
 from imutool.bias.networks.threads import of_each
-from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_by_sample, huber_weight, turns_from_start
 from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import end_samples, median_per_log, nuisance_jacobian, shown_by_logs, widest
+from imutool.training.closed_form import end_samples, median_per_log, nuisance_jacobian, shown_by_logs, widest, window_sets
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
@@ -38,6 +37,7 @@ REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of m
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
+USUAL_SQUARES, LEAST_VARIANCE = 4.0, 1e-10  # of differences between logs; of a combination of parameters, in units of the prior
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -98,6 +98,28 @@ class Problem:
         covariance = torch.linalg.inv(S) if columns else S
         at[columns] -= covariance @ v
         return Solution(at, covariance)
+
+    def covariance(self, columns: Sequence[int], without: int | None = None) -> Float[Tensor, "c c"]:
+        """Covariance of a solution, as wide as the logs scatter (Birge's ratio).
+
+        Each log alone is compared with the others. Posterior means of one prior differ by C + D - CD - DC, in units of the
+        prior. The ratio of their squares to this takes the place of the design effect, and `USUAL_SQUARES` squares of the usual
+        size count beside them. A log on its own counts in full.
+        """
+        columns, logs = list(columns), [i for i in range(len(self.own)) if i != without]
+        own, root = replace(self._of(logs, self.design_effect), design_effect=1.0), self.prior[columns].sqrt()
+        squares, expected, share = USUAL_SQUARES, USUAL_SQUARES - 2.0, 1.0 - 1.0 / len(logs)
+        if share == 0.0 or not columns:
+            return own.solve(columns).covariance
+        for i in range(len(logs)):
+            alone, others = own.alone(i).solve(columns), own.solve(columns, without=i)
+            C, D = (root[:, None] * found.covariance * root for found in (alone, others))
+            variance, V = torch.linalg.eigh(C + D - C @ D - D @ C)
+            difference = V.mT @ (root * (alone.theta - others.theta)[columns])
+            shown = variance > LEAST_VARIANCE
+            squares += share * float((difference[shown].square() / variance[shown]).sum())
+            expected += share * int(shown.sum())
+        return own._of(range(len(logs)), expected / squares).solve(columns).covariance
 
     def without(self, index: int) -> Problem:
         """The problem of all logs but one."""
@@ -168,7 +190,10 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     Raises:
         DataError: a log without a window that is free of gaps.
     """
-    sets, logs = _window_sets(seen, part), len(seen.pool.names)
+    judged_s, lengths_s = JUDGED_FROM_S[seen.sensor], WINDOW_S[seen.sensor]
+    found = window_sets(seen.pool, lengths_s, part, MAX_SAMPLES, ends_only=True)
+    sets = [WindowSet(*windows, s >= judged_s) for s, windows in zip(lengths_s, found, strict=True) if len(windows[0])]
+    logs = len(seen.pool.names)
     prior = torch.from_numpy(np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)]) ** -2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
@@ -192,32 +217,10 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
         problem = Problem(theta, own, held, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
         if step > len(sets) and settled:
             break
-        found = problem.solve(range(len(prior)))
-        settled = bool(((found.theta - theta).abs() < SETTLED * found.covariance.diagonal().sqrt()).all())
-        theta, own = found.theta, problem.own_at(found.theta)
+        to, covariance = problem.solve(range(len(prior)))
+        settled = bool(((to - theta).abs() < SETTLED * covariance.diagonal().sqrt()).all())
+        theta, own = to, problem.own_at(to)
     return problem
-
-
-def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
-    """Windows of all lengths that fit, half overlapping, evenly chosen where there are many."""
-    pool, sets = seen.pool, []
-    for length_s in WINDOW_S[seen.sensor]:
-        n = pool.samples(length_s)
-        first = pool.starts(n, part, hop=max(1, n // 2), ends_only=True)
-        if len(first):
-            evenly = first[:: max(1, -(-len(first) * n // MAX_SAMPLES))]
-            sets.append(WindowSet(evenly, n, length_s >= JUDGED_FROM_S[seen.sensor]))
-    covered = set(pool.log[sets[0].first].tolist()) if sets else set()
-    missing = [name for i, name in enumerate(pool.names) if i not in covered]
-    if missing:
-        of = "" if part == "all" else f" in the {part.replace('_', '-')} part"
-        raise DataError(
-            f"no stretch of truth without a gap{of}",
-            where=", ".join(missing),
-            expected=f"{WINDOW_S[seen.sensor][0]:g} s of it in every log",
-            fix="Leave the log out",
-        )
-    return sets
 
 
 def _prefix(

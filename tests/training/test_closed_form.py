@@ -200,7 +200,7 @@ def test_a_log_whose_training_part_has_no_truth_is_named(flights: list[Recording
     holed = flights[1]
     for start in np.arange(0.05, 0.8 * DURATION_S, 0.45):
         holed = without_truth(holed, start, start + 0.3)
-    with pytest.raises(DataError, match=r"no stretch of 0.5 s of truth without a gap in the train part of exact_2"):
+    with pytest.raises(DataError, match=r"exact_2: no stretch of truth without a gap in the train part; expected 0.5 s"):
         calibrate([flights[0], holed])
 
 
