@@ -19,7 +19,7 @@ from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
-from imutool.training.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.calibration.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, without_motion

@@ -11,7 +11,7 @@ from imutool.bias import linear
 from imutool.bias.model import COLUMNS
 from imutool.bias.networks.linear import Network
 from imutool.bias.networks.static import Network as StaticNetwork
-from imutool.training import closed_form
+from imutool.training.calibration import closed_form
 from imutool.training.training_windows import Pool
 from imutool.units import SENSORS, Sensor
 

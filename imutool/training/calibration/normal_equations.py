@@ -1,10 +1,11 @@
 """Normal equations of windows between true poses, log by log, so that one can be left out.
 
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
-(`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
-the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's complement),
-so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the parameters: with a
-window's residual and Jacobian (sums of pieces, `imutool.inertial.windows`), the rest is a product of matrices.
+(`imutool.training.calibration.log_scatter`: rotation, clock and lever arm between poses and sensor, tilt of the poses'
+world). An effect of the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's
+complement), so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the
+parameters: with a window's residual and Jacobian (sums of pieces, `imutool.inertial.windows`), the rest is a product of
+matrices.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_by_sample, huber_weight, turns_from_start
 from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import end_samples, median_per_log, nuisance_jacobian, shown_by_logs, widest, window_sets
+from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
+from imutool.training.calibration.log_scatter import covariance_by_scatter, integrated, shown_by_logs, sums_by_log, widest
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
@@ -37,7 +39,6 @@ REPEATED = 3.0  # windows that hold a sample's noise, from Wald's statistic of m
 SHARED = 0.5  # correlation of the errors that poses of one setup share from log to log: from logs left out, and from one alone
 SETTLED, MOST_STEPS = 0.2, 40  # deviations by which a step moves a parameter at most; steps with windows of all lengths
 WEAK = 0.01  # of a prior's precision, that of the prior at first
-USUAL_SQUARES, LEAST_VARIANCE = 4.0, 1e-10  # of differences between logs; of a combination of parameters, in units of the prior
 RIDGE = 1e-9  # of a diagonal, so that a log without information on its own unknowns can be solved
 
 
@@ -100,26 +101,14 @@ class Problem:
         return Solution(at, covariance)
 
     def covariance(self, columns: Sequence[int], without: int | None = None) -> Float[Tensor, "c c"]:
-        """Covariance of a solution, as wide as the logs scatter (Birge's ratio).
-
-        Each log alone is compared with the others. Posterior means of one prior differ by C + D - CD - DC, in units of the
-        prior. The ratio of their squares to this takes the place of the design effect, and `USUAL_SQUARES` squares of the usual
-        size count beside them. A log on its own counts in full.
-        """
+        """Covariance of a solution, as wide as the logs scatter, in place of the design effect."""
         columns, logs = list(columns), [i for i in range(len(self.own)) if i != without]
-        own, root = replace(self._of(logs, self.design_effect), design_effect=1.0), self.prior[columns].sqrt()
-        squares, expected, share = USUAL_SQUARES, USUAL_SQUARES - 2.0, 1.0 - 1.0 / len(logs)
-        if share == 0.0 or not columns:
-            return own.solve(columns).covariance
-        for i in range(len(logs)):
-            alone, others = own.alone(i).solve(columns), own.solve(columns, without=i)
-            C, D = (root[:, None] * found.covariance * root for found in (alone, others))
-            variance, V = torch.linalg.eigh(C + D - C @ D - D @ C)
-            difference = V.mT @ (root * (alone.theta - others.theta)[columns])
-            shown = variance > LEAST_VARIANCE
-            squares += share * float((difference[shown].square() / variance[shown]).sum())
-            expected += share * int(shown.sum())
-        return own._of(range(len(logs)), expected / squares).solve(columns).covariance
+        at = torch.zeros_like(self.theta)
+        at[columns] = self.theta[columns]
+        fit = self._of(logs, self.design_effect).fit.moved(at - self.theta)
+        kept = [*columns, *range(len(self.prior), fit.g.shape[1])]
+        of_logs = integrated(fit.H[:, kept][:, :, kept], fit.g[:, kept], self.own[logs], self.own_prior, len(columns))
+        return covariance_by_scatter(of_logs, at[columns], self.prior[columns])
 
     def without(self, index: int) -> Problem:
         """The problem of all logs but one."""
@@ -291,10 +280,4 @@ def _summed(
     usual = median_per_log(size, log, shorter)
     delta = HUBER_MEDIANS * usual[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / REPEATED
-
-    def of_log(i: int) -> tuple[Float[Tensor, "k k"], Float[Tensor, " k"], Float[Tensor, ""]]:
-        w, J_i, e_i = (x[log == i] for x in (weight, J, e))
-        H, g = torch.einsum("m,mij,mik->jk", w, J_i, J_i), torch.einsum("m,mij,mi->j", w, J_i, e_i)
-        return H, g, (w * e_i.square().sum(1)).sum()
-
-    return Equations(*(torch.stack(parts) for parts in zip(*of_each(of_log, range(len(shorter))), strict=True))), usual
+    return Equations(*sums_by_log(J, e, weight, log, len(shorter))), usual

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from imutool.bias.networks import linear
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Recording
-from imutool.training import closed_form
-from imutool.training.closed_form import CLOCK, NUISANCE_STD, ROTATION, Solution, shown_by_logs, solve
+from imutool.training.calibration import closed_form
+from imutool.training.calibration.closed_form import Solution, solve
+from imutool.training.calibration.log_scatter import CLOCK, NUISANCE_STD, ROTATION, shown_by_logs
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 

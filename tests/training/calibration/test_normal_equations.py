@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from imutool.training.normal_equations import USUAL_SQUARES, Equations, Problem
+from imutool.training.calibration.log_scatter import USUAL_SQUARES
+from imutool.training.calibration.normal_equations import Equations, Problem
 
 LOGS, SHARED, OWN, DRAWS = 4, 5, 2, 200
 ROUNDING = 1e-10
