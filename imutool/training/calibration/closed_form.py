@@ -8,7 +8,7 @@ has a prior, measured against the residuals' own noise, so that what the motion 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,13 +24,12 @@ from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
 from imutool.training.calibration.log_scatter import (
-    NUISANCE_STD,
-    REST_PRIOR,
     ROTATION,
     covariance_by_scatter,
     integrated,
     shown_by_logs,
     sums_by_log,
+    widest,
 )
 from imutool.training.training_windows import Part, Pool, Windows
 from imutool.units import SENSORS, Sensor
@@ -101,7 +100,6 @@ def solve(
     """Rest biases of all logs by Gauss-Newton; with `matrix` also W on top of the model's.
 
     Without `nuisances` a rest bias is the constant that fits best, which takes the nuisances of its log as far as it can.
-
     Windows of all lengths count together, each length against its own noise: short ones show the matrix, long ones the bias.
 
     Raises:
@@ -109,11 +107,9 @@ def solve(
     """
     sets = [(first, n) for first, n in window_sets(pool, window_s, part, MAX_SAMPLES) if len(first)]
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
-    nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
-    own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
-    turns = ROTATION[sensor] if nuisances else slice(0, 0)
-    own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
-    prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
+    own_prior = widest(sensor, rest)[: None if nuisances else 3]  # of the rest bias, then of nuisances
+    own, turns = torch.zeros(len(pool.names), len(own_prior)).to(rest), ROTATION[sensor] if nuisances else slice(0, 0)
+    prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior.repeat(len(own))])
     fixed: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
 
     def linearised(of_length: tuple[Int[Tensor, " k"], int]) -> _Linearised:
@@ -124,7 +120,7 @@ def solve(
             fixed[n] = carried, model.motion_bias(sensor, windows.segment)
         e, A = sensor_residual(model, sensor, windows, W if matrix else None, *fixed[n])
         rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
-        by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
+        by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(own_prior) - 3]
         e = e + (by_nuisance @ _apart(own, turns)[windows.log, 3:, None])[..., 0]
         u = step_means(windows.segment.of(sensor)[0]) if sensor == "gyro" else windows.segment.of(sensor)[0]
         by_own, weight = torch.cat([A.sum(1), by_nuisance], dim=2), _weight(e, windows.log, pool.least(sensor))
@@ -147,9 +143,7 @@ def solve(
         rest[:, columns] = own[:, :3]
     P = torch.linalg.inv(H)
     std = P.diagonal()[known:].reshape(own.shape)[:, :3].sqrt()
-    if not matrix:
-        return Solution(W, P[:0, :0], rest[:, columns].clone(), std)
-    covariance = _matrix_covariance(sensor, list(of_each(linearised, sets)), W, _apart(own, turns))
+    covariance = _matrix_covariance(sensor, map(linearised, sets), W, _apart(own, turns)) if matrix else P[:0, :0]
     return Solution(W, covariance, rest[:, columns].clone(), std)
 
 
@@ -171,7 +165,7 @@ def _apart(own: Float[Tensor, "logs o"], turns: slice) -> Float[Tensor, "logs o"
 
 
 def _matrix_covariance(
-    sensor: Sensor, sets: Sequence[_Linearised], W: Float[Tensor, "3 3"], own: Float[Tensor, "logs o"]
+    sensor: Sensor, sets: Iterable[_Linearised], W: Float[Tensor, "3 3"], own: Float[Tensor, "logs o"]
 ) -> Float[Tensor, "9 9"]:
     """Covariance of W, as wide as the logs scatter beside nuisances that are as wide as the logs show."""
     sums = [sums_by_log(torch.cat([s.by_matrix, s.by_own], dim=2), s.e, s.weight, s.log, len(own)) for s in sets]
@@ -213,7 +207,9 @@ def end_samples(first: Int[Tensor, " m"], n: int) -> Int[Tensor, "m _"]:
 def window_sets(
     pool: Pool, window_s: Sequence[float], part: Part, most_samples: int, *, ends_only: bool = False
 ) -> list[tuple[Int[Tensor, " k"], int]]:
-    """Windows of each length, half overlapping, evenly chosen where there are many: first samples, and steps.
+    """First samples of the windows of each length, and their steps; half overlapping.
+
+    Where there are many, some are chosen evenly.
 
     Raises:
         DataError: a log has no window of that part that is free of gaps.

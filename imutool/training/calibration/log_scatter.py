@@ -1,4 +1,4 @@
-"""What each training log has of its own, and how far logs scatter beyond what their own unknowns explain.
+"""Unknowns of each training log, and the scatter of the logs beyond them.
 
 A log has a rest bias of its own, and nuisances: rotation, clock and lever arm between its poses and the sensor, and the tilt of
 its world. They are integrated out, which leaves a loss of each log in the parameters that all logs share.
