@@ -162,7 +162,7 @@ def _by_fit(recording: Recording) -> tuple[Imu, str]:
     import torch
 
     from imutool.bias.networks import static
-    from imutool.training import closed_form
+    from imutool.training.calibration import closed_form
     from imutool.training.training_windows import Pool
 
     pool = Pool.of([recording])

@@ -1,7 +1,8 @@
 """Hybrid bias model: rest bias + fitted effects + a neural ODE on the corrected samples.
 
-The effects are those of `imutool.sensor.effects` that the training logs support (`imutool.training.effect_selection`). They are
-linear in their parameters, fitted together by least squares with a covariance, chosen by how well logs predict one another.
+The effects are those of `imutool.sensor.effects` that the training logs support
+(`imutool.training.calibration.effect_selection`). They are linear in their parameters, fitted together by least squares with
+a covariance, chosen by how well logs predict one another.
 The neural ODE (`imutool.bias.neural_ode`) sees samples corrected for the effects. It is left out where it does not help on the
 held-out part: then debiasing is a few products a sample.
 """

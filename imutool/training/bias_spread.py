@@ -24,7 +24,8 @@ from imutool.bias_start.prior_width import USUAL_WALK
 from imutool.geometry import so3
 from imutool.inertial.stationary import white_noise
 from imutool.recording import nanoseconds
-from imutool.training import closed_form
+from imutool.training.calibration import closed_form
+from imutool.training.calibration.log_scatter import NUISANCE_STD
 from imutool.training.training_windows import Pool, corrected
 from imutool.units import SENSORS, Sensor
 
@@ -236,7 +237,7 @@ def _walked_residuals(
     broken = torch.cumsum(pool.late[begin:end] | ~trusted, dim=0)
     first = begin + first[((broken[at + n] == broken[at]) & trusted[at]).all(1)]
     first = first[:: max(1, -(-len(first) // MOST_WINDOWS))]
-    if 3 * len(first) < 3 + len(closed_form.NUISANCE_STD[sensor]) + LEAST_COMBINATIONS:
+    if 3 * len(first) < 3 + len(NUISANCE_STD[sensor]) + LEAST_COMBINATIONS:
         return None
     means = []
     for start in first + later[:, None]:

@@ -19,7 +19,7 @@ from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
-from imutool.training.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.calibration.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, without_motion
@@ -110,7 +110,7 @@ def _solved(
     network, biases = hybrid.Network(Config(remainder=False), pool.rate_hz).double(), {}
     for sensor, fit in fits.items():
         columns = parameter_columns(fit.forms, effects[sensor])
-        theta, covariance = fit.problem.solve(columns, without=without)
+        theta, covariance = fit.problem.solve(columns, without=without).theta, fit.problem.covariance(columns, without)
         network.take(sensor, effects[sensor], theta[columns], covariance)
         biases[sensor] = fit.problem.own_at(theta)[:, :3]
         if sensor == "gyro" and "accel" not in fits:

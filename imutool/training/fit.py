@@ -1,10 +1,9 @@
 """Gradient descent from a closed form: first the gyro, then the accelerometer.
 
 What a step descends on is the objective's to say (`imutool.training.objectives`), and it mixes all logs. Beside the sensor's
-weights each log has a track of its own rest bias, free but slow, so that what belongs to a run cannot be mistaken for what
-belongs to the sensor. What is kept is the end of the descent, as a running mean over its last steps, which one step's draw of
-windows cannot throw off; or the closed form it started from, if that drifts less over the longest windows of the held-out
-part. A choice among many steps would be made by the noise of that part, which may be seconds long.
+weights each log has a slow track of its own rest bias, so that what belongs to a run cannot be mistaken for the sensor's. What
+is kept is the running mean over the last steps; or the closed form, if that drifts less over the longest windows of the
+held-out part. A choice among many steps would be made by the noise of that part, which may be seconds long.
 """
 
 from __future__ import annotations
@@ -27,7 +26,8 @@ from imutool.bias.networks.threads import of_each
 from imutool.config import build
 from imutool.errors import ConfigError, DataError, NumericsError
 from imutool.recording import Recording
-from imutool.training import bias_spread, closed_form
+from imutool.training import bias_spread
+from imutool.training.calibration import closed_form
 from imutool.training.log_signals import begin_at
 from imutool.training.objectives.increments import IncrementObjective
 from imutool.training.objectives.objective import BATCH_SAMPLES, AdamW, Objective, RestBiases, WindowEndObjective, error

@@ -36,8 +36,8 @@ from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
 from imutool.training.bias_spread import TURN_ON_STD
+from imutool.training.calibration.effect_selection import LINEAR, Calibration, parameter_columns
 from imutool.training.candidates import CANDIDATES, known, left_out_effects, left_out_model, with_statistics
-from imutool.training.effect_selection import LINEAR, Calibration, parameter_columns
 from imutool.training.log_signals import without_nuisances
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool

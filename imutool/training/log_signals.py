@@ -33,8 +33,9 @@ from imutool.sensor.effect import Effect, Parameter, Stage, Theta
 from imutool.sensor.linear_form import LinearForm, linear_form
 from imutool.sensor.samples import SensorSamples
 from imutool.sensor.signals import LOAD, LOAD_TAU_S, LOADS, Load, SignalFilter, Signals
-from imutool.training.closed_form import CLOCK, LEVER, ROTATION, Integrated, Solution, integrated, minus_log_likelihood
-from imutool.training.normal_equations import Problem, Seen, linearise
+from imutool.training.calibration.closed_form import Solution
+from imutool.training.calibration.log_scatter import CLOCK, LEVER, ROTATION, Integrated, integrated, minus_log_likelihood
+from imutool.training.calibration.normal_equations import Problem, Seen, linearise
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Pool
 from imutool.units import AXES, Sensor

@@ -29,8 +29,8 @@ from imutool.mcap_io.storage.source import sha256
 from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.bias_spread import speed_of
+from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.candidates import simpler_effects
-from imutool.training.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare
 from imutool.training.log_signals import with_poses_of_sensor

@@ -33,7 +33,7 @@ from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 from imutool.training.bias_spread import TURN_ON_STD
-from imutool.training.effect_selection import PhysicsFirst
+from imutool.training.calibration.effect_selection import PhysicsFirst
 from imutool.training.fit import Training
 from imutool.training.settings import settings_of
 from imutool.units import SENSORS

@@ -34,7 +34,7 @@ from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.read import read
 from imutool.recording import Imu, Recording, seconds
-from imutool.training import closed_form
+from imutool.training.calibration import closed_form
 from imutool.training.training_windows import Pool, corrected
 
 CLIP_DEG_S = 20.0

@@ -18,7 +18,7 @@ from imutool.bias.networks.linear import Network
 from imutool.geometry import so3
 from imutool.inertial.windows import rotation_residual, whole_product
 from imutool.mcap_io.read import read
-from imutool.training import closed_form
+from imutool.training.calibration import closed_form
 from imutool.training.training_windows import Pool
 
 WINDOW_S = 1.0

@@ -14,8 +14,8 @@ from imutool.config import load
 from imutool.mcap_io.write import write
 from imutool.recording import seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
+from imutool.training.calibration.effect_selection import LINEAR, PhysicsFirst
 from imutool.training.candidates import with_statistics
-from imutool.training.effect_selection import LINEAR, PhysicsFirst
 from imutool.training.fit import Training
 from imutool.training.left_out import _score
 from imutool.training.run import train

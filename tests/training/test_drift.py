@@ -15,7 +15,7 @@ from imutool.cli.demo import made_up
 from imutool.config import load
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
-from imutool.training.effect_selection import DRIFTS
+from imutool.training.calibration.effect_selection import DRIFTS
 from imutool.training.log_signals import loaded_signals
 from imutool.training.run import train
 from imutool.training.settings import TrainSettings, settings_of

@@ -16,7 +16,7 @@ from imutool.errors import DataError
 from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
-from imutool.training.effect_selection import LINEAR, calibrate
+from imutool.training.calibration.effect_selection import LINEAR, calibrate
 from imutool.training.left_out import Contradiction, Score, beaten, check_axes, contradicting, keep
 from imutool.training.run import train
 from imutool.training.settings import settings_of

@@ -25,7 +25,7 @@ from imutool.mcap_io.write import write
 from imutool.recording import Imu, Poses, Recording, seconds
 from imutool.sensor.made_up_flight import flight
 from imutool.training.bias_spread import TURN_ON_STD
-from imutool.training.effect_selection import config_of
+from imutool.training.calibration.effect_selection import config_of
 from imutool.training.fit import Epoch, TrainSettings
 from imutool.training.log_signals import TRIADS_RAD
 from imutool.training.objectives.objective import AdamW, WindowEndObjective

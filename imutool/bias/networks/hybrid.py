@@ -67,7 +67,7 @@ class Network(BiasNetwork):
         raise ConfigError(
             "hybrid does not start from a matrix",
             where="training hybrid",
-            fix="Train it with imutool.training.run.train, or its parts with imutool.training.effect_selection",
+            fix="Train it with imutool.training.run.train, or its parts with imutool.training.calibration.effect_selection",
         )
 
     def error(self, sensor: Sensor, signals: Signals) -> Float64[np.ndarray, "n 3"]:

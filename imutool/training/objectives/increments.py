@@ -23,8 +23,8 @@ from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import step_means
-from imutool.training import closed_form
-from imutool.training.closed_form import median_per_log
+from imutool.training.calibration import closed_form
+from imutool.training.calibration.closed_form import median_per_log
 from imutool.training.objectives.objective import USUAL_SAMPLES, Objective, length
 from imutool.training.training_windows import corrected, sensors_up_to
 

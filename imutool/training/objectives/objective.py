@@ -27,7 +27,7 @@ from imutool.bias.networks.threads import of_each
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber, step_means
-from imutool.training.closed_form import median_per_log
+from imutool.training.calibration.closed_form import median_per_log
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, Windows
 from imutool.units import SENSORS, Sensor

@@ -1,10 +1,11 @@
 """Normal equations of windows between true poses, log by log, so that one can be left out.
 
 Unknowns are theta, the effect parameters that all logs share, and a few of each log: its rest bias and its nuisances
-(`imutool.training.closed_form`: rotation, clock and lever arm between poses and sensor, tilt of the poses' world). An effect of
-the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's complement),
-so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the parameters: with a
-window's residual and Jacobian (sums of pieces, `imutool.inertial.windows`), the rest is a product of matrices.
+(`imutool.training.calibration.log_scatter`: rotation, clock and lever arm between poses and sensor, tilt of the poses'
+world). An effect of the same form as a nuisance is what logs have in common. Those of a log are eliminated log by log (Schur's
+complement), so that one solve of a matrix as small as theta predicts a log from all others. Errors are linear in the
+parameters: with a window's residual and Jacobian (sums of pieces, `imutool.inertial.windows`), the rest is a product of
+matrices.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from torch import Tensor
 
 from imutool.array_types import Float, Int
 from imutool.bias.networks.threads import of_each
-from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_by_sample, huber_weight, turns_from_start
 from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
-from imutool.training.closed_form import end_samples, median_per_log, nuisance_jacobian, shown_by_logs, widest
+from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
+from imutool.training.calibration.log_scatter import covariance_by_scatter, integrated, shown_by_logs, sums_by_log, widest
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
@@ -99,6 +100,16 @@ class Problem:
         at[columns] -= covariance @ v
         return Solution(at, covariance)
 
+    def covariance(self, columns: Sequence[int], without: int | None = None) -> Float[Tensor, "c c"]:
+        """Covariance of a solution, as wide as the logs scatter, in place of the design effect."""
+        columns, logs = list(columns), [i for i in range(len(self.own)) if i != without]
+        at = torch.zeros_like(self.theta)
+        at[columns] = self.theta[columns]
+        fit = self._of(logs, self.design_effect).fit.moved(at - self.theta)
+        kept = [*columns, *range(len(self.prior), fit.g.shape[1])]
+        of_logs = integrated(fit.H[:, kept][:, :, kept], fit.g[:, kept], self.own[logs], self.own_prior, len(columns))
+        return covariance_by_scatter(of_logs, at[columns], self.prior[columns])
+
     def without(self, index: int) -> Problem:
         """The problem of all logs but one."""
         return self._of([i for i in range(len(self.own)) if i != index])
@@ -168,7 +179,10 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
     Raises:
         DataError: a log without a window that is free of gaps.
     """
-    sets, logs = _window_sets(seen, part), len(seen.pool.names)
+    judged_s, lengths_s = JUDGED_FROM_S[seen.sensor], WINDOW_S[seen.sensor]
+    found = window_sets(seen.pool, lengths_s, part, MAX_SAMPLES, ends_only=True)
+    sets = [WindowSet(*windows, s >= judged_s) for s, windows in zip(lengths_s, found, strict=True) if len(windows[0])]
+    logs = len(seen.pool.names)
     prior = torch.from_numpy(np.concatenate([np.zeros(0), *map(seen.sensors.std_of, effects)]) ** -2.0).to(seen.pool.t)
     width = widest(seen.sensor, prior) if own_prior is None else own_prior
     theta, own, settled = torch.zeros_like(prior), prior.new_zeros(logs, len(width)), False
@@ -192,32 +206,10 @@ def linearise(seen: Seen, effects: Sequence[LinearForm], part: Part, own_prior: 
         problem = Problem(theta, own, held, width, design_effect(seen.pool), FREE[seen.sensor], fit, judged)
         if step > len(sets) and settled:
             break
-        found = problem.solve(range(len(prior)))
-        settled = bool(((found.theta - theta).abs() < SETTLED * found.covariance.diagonal().sqrt()).all())
-        theta, own = found.theta, problem.own_at(found.theta)
+        to, covariance = problem.solve(range(len(prior)))
+        settled = bool(((to - theta).abs() < SETTLED * covariance.diagonal().sqrt()).all())
+        theta, own = to, problem.own_at(to)
     return problem
-
-
-def _window_sets(seen: Seen, part: Part) -> list[WindowSet]:
-    """Windows of all lengths that fit, half overlapping, evenly chosen where there are many."""
-    pool, sets = seen.pool, []
-    for length_s in WINDOW_S[seen.sensor]:
-        n = pool.samples(length_s)
-        first = pool.starts(n, part, hop=max(1, n // 2), ends_only=True)
-        if len(first):
-            evenly = first[:: max(1, -(-len(first) * n // MAX_SAMPLES))]
-            sets.append(WindowSet(evenly, n, length_s >= JUDGED_FROM_S[seen.sensor]))
-    covered = set(pool.log[sets[0].first].tolist()) if sets else set()
-    missing = [name for i, name in enumerate(pool.names) if i not in covered]
-    if missing:
-        of = "" if part == "all" else f" in the {part.replace('_', '-')} part"
-        raise DataError(
-            f"no stretch of truth without a gap{of}",
-            where=", ".join(missing),
-            expected=f"{WINDOW_S[seen.sensor][0]:g} s of it in every log",
-            fix="Leave the log out",
-        )
-    return sets
 
 
 def _prefix(
@@ -288,10 +280,4 @@ def _summed(
     usual = median_per_log(size, log, shorter)
     delta = HUBER_MEDIANS * usual[log]
     weight = huber_weight(size, delta) * 3 / delta**2 / REPEATED
-
-    def of_log(i: int) -> tuple[Float[Tensor, "k k"], Float[Tensor, " k"], Float[Tensor, ""]]:
-        w, J_i, e_i = (x[log == i] for x in (weight, J, e))
-        H, g = torch.einsum("m,mij,mik->jk", w, J_i, J_i), torch.einsum("m,mij,mi->j", w, J_i, e_i)
-        return H, g, (w * e_i.square().sum(1)).sum()
-
-    return Equations(*(torch.stack(parts) for parts in zip(*of_each(of_log, range(len(shorter))), strict=True))), usual
+    return Equations(*sums_by_log(J, e, weight, log, len(shorter))), usual

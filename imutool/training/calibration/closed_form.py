@@ -1,6 +1,6 @@
 """Closed-form calibration: robust Gauss-Newton over windows between true poses.
 
-Unknown are one matrix W of the sensor, the rest bias of each log, and the nuisances of each log (`Nuisances`): rotation, clock
+Unknown are one matrix W of the sensor, the rest bias of each log, and the nuisances of each log: rotation, clock
 and lever arm between its poses and the sensor, and the tilt of its world. The residual of a window is what integration misses
 (`imutool.inertial.windows`), its derivative is exact, Huber's weights keep outliers of the truth from pulling, and everything
 has a prior, measured against the residuals' own noise, so that what the motion does not show stays at zero.
@@ -8,12 +8,10 @@ has a prior, measured against the residuals' own noise, so that what the motion 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,23 +23,21 @@ from imutool.errors import DataError
 from imutool.geometry import so3
 from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
+from imutool.training.calibration.log_scatter import (
+    ROTATION,
+    covariance_by_scatter,
+    integrated,
+    shown_by_logs,
+    sums_by_log,
+    widest,
+)
 from imutool.training.training_windows import Part, Pool, Windows
 from imutool.units import SENSORS, Sensor
 
 W_PRIOR = 0.05  # plausible misalignment; a scale error of 0.1 is two of these
-REST_PRIOR = {"gyro": 0.1, "accel": 1.0}  # rad/s, m/s²: plausible turn-on biases
 CORRELATED = 10.0  # errors of the truth last longer than a window: this many windows are taken to say the same once
 ITERATIONS, REST_ITERATIONS = 6, 3  # the rest alone is nearly linear
 MAX_SAMPLES = 120_000  # of one window length, so that hours of logs cost no more memory than minutes
-
-
-NUISANCE_STD = {  # how far they differ from log to log, at most
-    "gyro": (0.01,) * 3 + (5e-3,),  # rotation (rad), clock (s)
-    "accel": (0.1,) * 2 + (0.01,) * 3 + (5e-3,) + (0.02,) * 3,  # tilt (m/s² of gravity), rotation, clock, lever arm (m)
-}
-ROTATION = {"gyro": slice(3, 6), "accel": slice(5, 8)}  # of a log's unknowns, of which the rest bias comes first
-CLOCK, LEVER = {"gyro": slice(6, 7), "accel": slice(8, 9)}, {"gyro": slice(7, 7), "accel": slice(9, 12)}
-NARROWER = np.geomspace(1.0, 20.0, 13)  # shares of these widths that logs may show, as divisors
 END_SAMPLES = 3  # whose mean is the rate at an end of a window
 
 
@@ -49,7 +45,7 @@ END_SAMPLES = 3  # whose mean is the rate at an end of a window
 class Solution:
     """W, and the rest bias of each log (rad/s or m/s²) with its standard deviation.
 
-    `covariance` is that of W, row by row, and empty without a matrix.
+    `covariance` is that of W, row by row, as wide as the logs scatter; it is empty without a matrix.
     """
 
     W: Float[Tensor, "3 3"]
@@ -104,22 +100,19 @@ def solve(
     """Rest biases of all logs by Gauss-Newton; with `matrix` also W on top of the model's.
 
     Without `nuisances` a rest bias is the constant that fits best, which takes the nuisances of its log as far as it can.
-
     Windows of all lengths count together, each length against its own noise: short ones show the matrix, long ones the bias.
 
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = [(first, n) for first, n in _window_sets(pool, window_s, part) if len(first)]
+    sets = [(first, n) for first, n in window_sets(pool, window_s, part, MAX_SAMPLES) if len(first)]
     rest, W, columns, known = rest.clone(), torch.zeros(3, 3).to(rest), COLUMNS[sensor], 9 if matrix else 0
-    nuisance_prior = torch.tensor(NUISANCE_STD[sensor] if nuisances else ()).to(rest) ** -2.0
-    own = torch.zeros(len(pool.names), 3 + len(nuisance_prior)).to(rest)  # rest bias, then nuisances
-    turns = ROTATION[sensor] if nuisances else slice(0, 0)
-    own_prior = torch.cat([torch.full((3,), REST_PRIOR[sensor] ** -2.0).to(rest), nuisance_prior]).repeat(len(own))
-    prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior])
+    own_prior = widest(sensor, rest)[: None if nuisances else 3]  # of the rest bias, then of nuisances
+    own, turns = torch.zeros(len(pool.names), len(own_prior)).to(rest), ROTATION[sensor] if nuisances else slice(0, 0)
+    prior = torch.cat([torch.full((known,), W_PRIOR**-2.0).to(rest), own_prior.repeat(len(own))])
     fixed: dict[int, tuple[Tensor | None, Tensor]] = {}  # by window length: carried attitudes and the bias of motion stay
 
-    def equations(of_length: tuple[Int[Tensor, " k"], int]) -> tuple[Float[Tensor, "u u"], Float[Tensor, " u"]]:
+    def linearised(of_length: tuple[Int[Tensor, " k"], int]) -> _Linearised:
         first, n = of_length
         windows = pool.windows(first, n, rest[pool.log[first]])
         if n not in fixed:
@@ -127,15 +120,15 @@ def solve(
             fixed[n] = carried, model.motion_bias(sensor, windows.segment)
         e, A = sensor_residual(model, sensor, windows, W if matrix else None, *fixed[n])
         rates, forces = (u - b[:, None] for u, b in map(windows.segment.of, SENSORS))
-        by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(nuisance_prior)]
-        apart = own.clone()
-        apart[:, turns] -= own[:, turns].mean(0)  # what the rotations of all logs share is the matrix's
-        e = e + (by_nuisance @ apart[windows.log, 3:, None])[..., 0]
-        J = _by_log(torch.cat([A.sum(1), by_nuisance], dim=2), windows.log, len(own), turns)
-        if matrix:
-            u, _ = windows.segment.of(sensor)
-            J = torch.cat([_by_matrix(A, step_means(u) if sensor == "gyro" else u), J], dim=2)
-        weight = _weight(e, windows.log, pool.least(sensor))
+        by_nuisance = nuisance_jacobian(sensor, windows, rates, forces)[..., : len(own_prior) - 3]
+        e = e + (by_nuisance @ _apart(own, turns)[windows.log, 3:, None])[..., 0]
+        u = step_means(windows.segment.of(sensor)[0]) if sensor == "gyro" else windows.segment.of(sensor)[0]
+        by_own, weight = torch.cat([A.sum(1), by_nuisance], dim=2), _weight(e, windows.log, pool.least(sensor))
+        return _Linearised(_by_matrix(A, u) if matrix else by_own[..., :0], by_own, e, weight, windows.log)
+
+    def equations(of_length: tuple[Int[Tensor, " k"], int]) -> tuple[Float[Tensor, "u u"], Float[Tensor, " u"]]:
+        by_matrix, by_own, e, weight, log = linearised(of_length)
+        J = torch.cat([by_matrix, _by_log(by_own, log, len(own), turns)], dim=2)
         return torch.einsum("m,mij,mik->jk", weight, J, J), torch.einsum("m,mij,mi->j", weight, J, e)
 
     for _ in range(ITERATIONS if matrix else REST_ITERATIONS):
@@ -149,7 +142,37 @@ def solve(
         own = own + step[known:].reshape(own.shape)
         rest[:, columns] = own[:, :3]
     P = torch.linalg.inv(H)
-    return Solution(W, P[:known, :known], rest[:, columns].clone(), P.diagonal()[known:].reshape(own.shape)[:, :3].sqrt())
+    std = P.diagonal()[known:].reshape(own.shape)[:, :3].sqrt()
+    covariance = _matrix_covariance(sensor, map(linearised, sets), W, _apart(own, turns)) if matrix else P[:0, :0]
+    return Solution(W, covariance, rest[:, columns].clone(), std)
+
+
+class _Linearised(NamedTuple):
+    """Windows of one length: derivatives by the matrix and by their log's own unknowns, residuals and weights."""
+
+    by_matrix: Float[Tensor, "m 3 p"]
+    by_own: Float[Tensor, "m 3 k"]
+    e: Float[Tensor, "m 3"]
+    weight: Float[Tensor, " m"]
+    log: Int[Tensor, " m"]
+
+
+def _apart(own: Float[Tensor, "logs o"], turns: slice) -> Float[Tensor, "logs o"]:
+    """Unknowns of each log with rotations about their mean: what the rotations of all logs share is the matrix's."""
+    out = own.clone()
+    out[:, turns] -= own[:, turns].mean(0)
+    return out
+
+
+def _matrix_covariance(
+    sensor: Sensor, sets: Iterable[_Linearised], W: Float[Tensor, "3 3"], own: Float[Tensor, "logs o"]
+) -> Float[Tensor, "9 9"]:
+    """Covariance of W, as wide as the logs scatter beside nuisances that are as wide as the logs show."""
+    sums = [sums_by_log(torch.cat([s.by_matrix, s.by_own], dim=2), s.e, s.weight, s.log, len(own)) for s in sets]
+    H, g = (torch.stack([parts[k] for parts in sums]).sum(0) for k in (0, 1))
+    theta, prior = W.flatten(), torch.full((9,), W_PRIOR**-2.0).to(W)
+    own_prior = shown_by_logs(sensor, H, g, theta, own, prior)
+    return covariance_by_scatter(integrated(H, g, own, own_prior, 9), theta, prior)
 
 
 def nuisance_jacobian(
@@ -181,85 +204,31 @@ def end_samples(first: Int[Tensor, " m"], n: int) -> Int[Tensor, "m _"]:
     return first[:, None] + torch.cat([k, n - k.flip(0)])
 
 
-def widest(sensor: Sensor, like: Tensor) -> Float[Tensor, " o"]:
-    """One over the plausible variance of each of a log's own unknowns."""
-    return torch.tensor([REST_PRIOR[sensor]] * 3 + list(NUISANCE_STD[sensor])).to(like) ** -2
+def window_sets(
+    pool: Pool, window_s: Sequence[float], part: Part, most_samples: int, *, ends_only: bool = False
+) -> list[tuple[Int[Tensor, " k"], int]]:
+    """First samples of the windows of each length, and their steps; half overlapping.
 
-
-def shown_by_logs(
-    sensor: Sensor,
-    H: Float[Tensor, "logs k k"],
-    g: Float[Tensor, "logs k"],
-    theta: Float[Tensor, " p"],
-    own: Float[Tensor, "logs o"],
-    prior: Float[Tensor, " p"],
-) -> Float[Tensor, " o"]:
-    """Prior of a log's own unknowns: as wide as the logs scatter beyond their deviations.
-
-    The restricted likelihood of all logs decides between widths up to `NUISANCE_STD`: what logs share is the effects', and
-    logs that agree keep one clock, one rotation and one lever arm. `H` and `g` are the losses of the logs about a point.
-    """
-    own_prior, p = widest(sensor, theta), len(prior)
-    for _ in range(2):
-        for part in (ROTATION[sensor], CLOCK[sensor], LEVER[sensor]):
-            if part.start < part.stop:
-                tried = own_prior.repeat(len(NARROWER), 1)
-                tried[:, part] = torch.from_numpy(NARROWER[:, None] ** 2).to(tried) * widest(sensor, theta)[part]
-                own_prior = tried[minus_log_likelihood(integrated(H, g, own, tried[:, None], p), theta, prior).argmin()]
-    return own_prior
-
-
-class Integrated(NamedTuple):
-    """Losses of logs with each log's own unknowns integrated out."""
-
-    S: Float[Tensor, "*batch logs p p"]
-    v: Float[Tensor, "*batch logs p"]
-    c: Float[Tensor, "*batch logs"]
-
-
-def integrated(
-    H: Float[Tensor, "*#batch k k"], g: Float[Tensor, "*#batch k"], own: Tensor, own_prior: Tensor, p: int
-) -> Integrated:
-    """Integrate out a log's own unknowns, which follow p parameters that the logs share."""
-    A, b = H[..., p:, p:] + torch.diag_embed(own_prior), g[..., p:] + own_prior * own
-    X, y = torch.linalg.solve(A, torch.cat([H[..., p:, :p].expand(*A.shape[:-1], p), b[..., None]], -1)).split((p, 1), -1)
-    S, v = H[..., :p, :p] - H[..., :p, p:] @ X, g[..., :p] - (H[..., :p, p:] @ y)[..., 0]
-    c = torch.logdet(A) - own_prior.log().sum(-1) + (own_prior * own.square()).sum(-1) - (b * y[..., 0]).sum(-1)
-    return Integrated(S, v, c)
-
-
-def minus_log_likelihood(logs: Integrated, theta: Float[Tensor, " p"], prior: Float[Tensor, " p"]) -> Float[Tensor, "*batch"]:
-    """Twice the negative logarithm, but for a constant, with all unknowns integrated out."""
-    S, v = torch.diag(prior) + logs.S.sum(-3), prior * theta + logs.v.sum(-2)
-    L, failed = torch.linalg.cholesky_ex(S)  # one factor for both terms: a third of the time of logdet and solve
-    whitened = torch.linalg.solve_triangular(L, v[..., None], upper=False)
-    logdet = 2.0 * torch.diagonal(L, dim1=-2, dim2=-1).log().sum(-1)
-    found = logs.c.sum(-1) + logdet - whitened.square().sum((-2, -1))
-    return torch.where(failed == 0, found, math.inf)  # rounding alone makes S indefinite
-
-
-def _window_sets(pool: Pool, window_s: Sequence[float], part: Part) -> list[tuple[Int[Tensor, " k"], int]]:
-    """First samples of the windows of each length, and the length in samples.
+    Where there are many, some are chosen evenly.
 
     Raises:
         DataError: a log has no window of that part that is free of gaps.
     """
-    sets = [_some(pool.starts(n, part, hop=max(1, n // 2)), n) for n in map(pool.samples, window_s)]
-    seen = torch.cat([pool.log[first] for first, _ in sets])
-    missing = [name for i, name in enumerate(pool.names) if not bool((seen == i).any())]
+    sets = []
+    for n in map(pool.samples, window_s):
+        first = pool.starts(n, part, hop=max(1, n // 2), ends_only=ends_only)
+        sets.append((first[:: max(1, -(-len(first) * n // most_samples))], n))
+    covered = torch.cat([pool.log[first] for first, _ in sets])
+    missing = [name for i, name in enumerate(pool.names) if not bool((covered == i).any())]
     if missing:
-        where = f"the {part.replace('_', '-')} part of {', '.join(missing)}"
+        of = "" if part == "all" else f" in the {part.replace('_', '-')} part"
         raise DataError(
-            f"no stretch of {min(window_s):g} s of truth without a gap in {where}",
-            expected="truth that covers at least one window",
-            fix="Shorten the windows (settings gyro_window_s, accel_window_s), or leave the log out",
+            f"no stretch of truth without a gap{of}",
+            where=", ".join(missing),
+            expected=f"{min(window_s):g} s of it in every log",
+            fix="Leave the log out; or shorten gyro_window_s and accel_window_s, if you set them",
         )
     return sets
-
-
-def _some(first: Int[Tensor, " m"], n: int) -> tuple[Int[Tensor, " k"], int]:
-    """At most `MAX_SAMPLES` of samples, evenly chosen."""
-    return first[:: max(1, -(-len(first) * n // MAX_SAMPLES))], n
 
 
 def _by_matrix(A: Float[Tensor, "m n 3 3"], u: Float[Tensor, "m n 3"]) -> Float[Tensor, "m 3 9"]:

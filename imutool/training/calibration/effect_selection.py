@@ -3,8 +3,8 @@
 Effects (`imutool.sensor.effects`) are shared by all logs; rest bias and tilt are each log's own.
 Scale and misalignment need no evidence: their prior (`SensorPrior`) shrinks them as far as the motion does not show them.
 Forward selection of the others: an effect is chosen by how well the other logs predict each log's long windows
-(`imutool.training.normal_equations`), and refused where most logs do not agree or chance explains it. A parameter that the
-motion does not show stays at its prior, and is named.
+(`imutool.training.calibration.normal_equations`), and refused where most logs do not agree or chance explains it.
+A parameter that the motion does not show stays at its prior, and is named.
 
 `hybrid` chooses effects on the training part, fits them to whole logs, and trains the neural ODE on what they leave.
 """
@@ -31,10 +31,10 @@ from imutool.recording import Imu, Recording
 from imutool.sensor import catalogue
 from imutool.sensor.linear_form import LinearForm
 from imutool.sensor.signals import Load, Signals
-from imutool.training.closed_form import widest
+from imutool.training.calibration.log_scatter import widest
+from imutool.training.calibration.normal_equations import Problem, Seen, linearise
 from imutool.training.fit import Epoch, note
 from imutool.training.log_signals import effects_turned_alike, loaded_signals, signals_of
-from imutool.training.normal_equations import Problem, Seen, linearise
 from imutool.training.settings import SensorPrior, TrainSettings
 from imutool.training.training_windows import Part, Pool
 from imutool.units import SENSORS, Sensor
@@ -109,7 +109,7 @@ def calibrate(
     if names is None and len(gains) < len(effects):
         effects = tuple(effect for effect in effects if effect.name in gains)
         problem = linearise(seen, effects, part, every.own_prior)
-    theta, covariance = problem.solve(range(len(problem.theta)))
+    theta, covariance = problem.solve(range(len(problem.theta))).theta, problem.covariance(range(len(problem.theta)))
     own = problem.own_at(theta)
     return Calibration(
         tuple(effect.name for effect in effects),

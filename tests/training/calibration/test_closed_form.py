@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from imutool.bias.networks import linear
 from imutool.errors import DataError
 from imutool.recording import Imu, Poses, Recording
-from imutool.training import closed_form
-from imutool.training.closed_form import CLOCK, NUISANCE_STD, ROTATION, Solution, shown_by_logs, solve
+from imutool.training.calibration import closed_form
+from imutool.training.calibration.closed_form import Solution, solve
+from imutool.training.calibration.log_scatter import CLOCK, NUISANCE_STD, ROTATION, shown_by_logs
 from imutool.training.training_windows import Pool
 from imutool.units import Sensor
 
@@ -200,7 +201,7 @@ def test_a_log_whose_training_part_has_no_truth_is_named(flights: list[Recording
     holed = flights[1]
     for start in np.arange(0.05, 0.8 * DURATION_S, 0.45):
         holed = without_truth(holed, start, start + 0.3)
-    with pytest.raises(DataError, match=r"no stretch of 0.5 s of truth without a gap in the train part of exact_2"):
+    with pytest.raises(DataError, match=r"exact_2: no stretch of truth without a gap in the train part; expected 0.5 s"):
         calibrate([flights[0], holed])
 
 

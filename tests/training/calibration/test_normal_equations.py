@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from imutool.training.normal_equations import Equations, Problem
+from imutool.training.calibration.log_scatter import USUAL_SQUARES
+from imutool.training.calibration.normal_equations import Equations, Problem
 
-LOGS, SHARED, OWN = 4, 5, 2
+LOGS, SHARED, OWN, DRAWS = 4, 5, 2, 200
 ROUNDING = 1e-10
 Data = list[tuple[torch.Tensor, torch.Tensor]]
 
@@ -111,3 +114,36 @@ def test_the_covariance_is_the_inverse_of_the_information(data: Data) -> None:
         H[where[SHARED:], where[SHARED:]] += OWN_PRIOR
     expected = torch.linalg.inv(H)[:SHARED, :SHARED]
     torch.testing.assert_close(made.solve(range(SHARED)).covariance, expected, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("noise", [0.4, 1.0, 2.5])
+def test_the_covariance_follows_the_scatter_of_the_logs(noise: float) -> None:
+    """It allows for errors of another size than the solution takes them for; squares of the usual size count as well."""
+    generator = torch.Generator().manual_seed(3)
+    squares, sizes = [], []
+    for _ in range(DRAWS):
+        theta = torch.randn(SHARED, generator=generator, dtype=torch.float64) / PRIOR.sqrt()
+        data = []
+        for _ in range(LOGS):
+            J = torch.randn(40, SHARED + OWN, generator=generator, dtype=torch.float64)
+            own = torch.randn(OWN, generator=generator, dtype=torch.float64) / OWN_PRIOR.sqrt()
+            r = noise * torch.randn(40, generator=generator, dtype=torch.float64) - J @ torch.cat([theta, own])
+            data.append((J / 2.0**0.5, r / 2.0**0.5))
+        zero = problem(data, torch.zeros(SHARED).double(), torch.zeros(LOGS, OWN).double())
+        made = replace(zero, design_effect=2.0)
+        found = made.solve(range(SHARED))
+        error = found.theta - theta
+        squares.append(float(error @ torch.linalg.solve(found.covariance, error)))
+        sizes.append(float(torch.linalg.solve(found.covariance, made.covariance(range(SHARED))).trace()))
+    freedom = SHARED * (LOGS - 1)
+    size = (freedom * noise**2 + USUAL_SQUARES) / (freedom + USUAL_SQUARES - 2.0)
+    assert sum(squares) / sum(sizes) == pytest.approx(noise**2 / size, rel=0.25)
+    assert sum(squares) / (DRAWS * SHARED) == pytest.approx(noise**2 / made.design_effect, rel=0.25)  # without the scatter
+
+
+def test_a_log_on_its_own_counts_in_full(data: Data) -> None:
+    made = problem(data, torch.zeros(SHARED).double(), torch.zeros(LOGS, OWN).double())
+    alone = replace(made.alone(1), design_effect=2.0)
+    expected = replace(alone._of([0], 2.0), design_effect=1.0).solve(range(SHARED))
+    torch.testing.assert_close(alone.covariance(range(SHARED)), expected.covariance, rtol=0, atol=ROUNDING)
+    assert made.covariance([]).shape == (0, 0)

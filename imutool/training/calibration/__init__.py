@@ -1,0 +1,1 @@
+"""Calibration in closed form: least squares over windows between true poses, log by log."""
