@@ -28,13 +28,14 @@ from ._table_times import join_gps_weeks, read_serial_days
 
 NO_NUMBERS = "holds no columns of numbers"
 MAGIC = {  # the first bytes of a kind of file; behind 512 bytes of a user's own in HDF5
-    "mat": b"MATLAB 5.0 MAT-file",
     "hdf5": b"\x89HDF\r\n\x1a\n",
     "parquet": b"PAR1",
     "feather": b"ARROW1\0\0",  # also Arrow's own
     "npy": b"\x93NUMPY",
     "sheets": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",  # of old Excel
 }
+MAT = (b"\x00\x01IM", b"\x01\x00MI")  # version 5 and the order of bytes, behind a text that is the writing program's own
+MAT_AT = slice(124, 128)
 ZIP = b"PK\x03\x04"
 SHEETS = {"xl/workbook.xml": "sheets", "xl/workbook.bin": "other sheets", "content.xml": "other sheets"}  # members of a zip
 
@@ -44,6 +45,8 @@ def kind_of(head: bytes, path: Path) -> str:
     for kind, magic in MAGIC.items():
         if head.startswith(magic) or (kind == "hdf5" and head[512:].startswith(magic)):
             return kind
+    if head[MAT_AT] in MAT:
+        return "mat"
     if head.startswith(ZIP):
         names = _members(path) or ({*SHEETS} if path.suffix.lower() == ".xlsx" else set())  # cut off
         if sheets := next((kind for name, kind in SHEETS.items() if name in names), ""):

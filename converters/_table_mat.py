@@ -1,4 +1,4 @@
-"""MATLAB's .mat files: arrays of structures, labels of columns; objects are left out."""
+"""MATLAB's .mat files: structures, labels of columns, bodies of Qualisys; no objects."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from imutool.errors import DataError, required
 
+from ._table_mocap import read_mocap_mat
 from ._table_text import Columns
 
 LABELS = re.compile("head|label|col|field|channel", re.IGNORECASE)  # in the name of texts that name columns
@@ -41,6 +42,8 @@ def load_mat(path: Path, columns: Columns) -> None:
         if not has_objects:
             raise DataError(f"cannot be read as a .mat file ({error})", where=path) from error
         content = {}
+    if read_mocap_mat(content, columns, path):
+        return
     columns.has_structures = True
     for name, value, labels in _flat(content):
         if labels:

@@ -1,4 +1,4 @@
-"""Exports of motion captures: OptiTrack Motive, Vicon, Qualisys.
+"""Exports of motion captures: OptiTrack Motive, Vicon, Qualisys (text and .mat).
 
 Each body becomes the columns `BODY/x [mm]`, ..., `BODY/qw`, ... beside one `time [s]`. Motive and Vicon write a quaternion
 where they are asked to; Qualisys writes a matrix, column by column.
@@ -10,6 +10,7 @@ import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,9 +44,39 @@ def read_mocap(text: str, columns: Columns, path: Path) -> bool:
         bodies = _qualisys(rows, columns, path)
     else:
         bodies = (_motive if re.match(MOTIVE, text.lstrip("\ufeff")) else _vicon)(rows, columns)
+    _name_bodies(bodies, columns)
+    return True
+
+
+def read_mocap_mat(content: dict[str, Any], columns: Columns, path: Path) -> bool:
+    """Add the rigid bodies of a .mat of Qualisys; False for any other content.
+
+    A measurement is a structure with `FrameRate` and `RigidBodies`: positions in mm (bodies, 3, frames), matrices (bodies, 9,
+    frames) column by column; of a single body without the first dimension.
+
+    Raises:
+        DataError: a matrix that does not rotate.
+    """
+    measured = [value for value in content.values() if isinstance(value, dict) and {"FrameRate", "RigidBodies"} <= value.keys()]
+    body = measured[0]["RigidBodies"] if measured else {}
+    if not (isinstance(body, dict) and {"Name", "Positions", "Rotations"} <= body.keys()):
+        return False
+    rate, frames = float(measured[0]["FrameRate"]), np.shape(body["Positions"])[-1]
+    names = [str(name) for name in np.atleast_1d(body["Name"])]
+    positions, rotations = (np.reshape(body[key], (len(names), -1, frames)) for key in ("Positions", "Rotations"))
+    columns.add("time [s]", np.arange(frames) / rate, "s")
+    columns.remarks.notes.append(f"a measurement of Qualisys at {rate:g} Hz, frames counted from 0 s, positions in mm")
+    columns.is_mocap = True
+    for name, position, rotation in reversed([*zip(names, positions, rotations, strict=True)]):
+        q_wxyz = of_matrices(rotation.T.reshape(-1, 3, 3).transpose(0, 2, 1), path)
+        _add_body(columns, name, position.T, q_wxyz[:, [1, 2, 3, 0]], "mm")
+    _name_bodies(names, columns)
+    return True
+
+
+def _name_bodies(bodies: list[str], columns: Columns) -> None:
     if len(bodies) > 1:
         columns.remarks.notes.append(f"bodies in it: {', '.join(bodies)}; the first counts, and a map may name another")
-    return True
 
 
 def _motive(rows: list[list[str]], columns: Columns) -> list[str]:

@@ -61,6 +61,7 @@ class Columns:
     remarks: Remarks = field(default_factory=Remarks)
     sources: dict[str, str] = field(default_factory=dict)
     has_structures: bool = False  # whose fields follow a dot, which in the name of a plain table's column makes no group
+    is_mocap: bool = False  # the poses of a motion capture, whatever the file's name
 
     def add(self, name: str, array: Any, unit: str = "") -> None:
         """Take in an array of numbers of one, two or three dimensions."""

@@ -36,6 +36,7 @@ NOT_SEEN = 1e3  # m/s²: deviation of the accelerometer's bias from poses withou
 WORLD_TILT_STD = np.array([0.0] * 3 + [0.1] * 3)  # m/s²: half a degree, as of EuRoC's second Vicon room
 STEP_S = 0.1  # over which turns of poses and gyro are compared
 JUMP_RAD, JUMP_MEDIANS, JUMP_SHARE = np.deg2rad(5.0), 10.0, 0.2  # as `imutool info` counts jumps of poses
+BRIDGED_S = 0.5  # longest gap of the poses over which turns are compared
 LOST = 2.5  # median periods, beyond which samples are lost
 MOUNT_STD = 0.05  # rad: plausible rotation of markers that were meant to be straight
 SAME = 100.0  # samples whose poses have the same error
@@ -93,13 +94,15 @@ def from_truth(model: BiasModel, recording: Recording, truth_s: float = TRUTH_S)
 def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
     """Samples over which the poses turn and the gyro does not.
 
-    The gyro was clipped, samples are lost, or the poses jump: no bias mends that, and a path keeps the error to its end.
+    The gyro was clipped, samples are lost, or the poses jump: no bias mends that, and a path keeps the error to its end. Poses
+    often jump where some are missing, so turns over a short gap of the poses are compared, too.
     """
     t, (poses, valid) = seconds(imu.t_ns, int(imu.t_ns[0])), truth.at(imu.t_ns)
     dt, out = np.diff(t), np.zeros(len(t), bool)
     first = np.arange(0, len(t), max(1, round(STEP_S / median(dt)))) if len(dt) else np.zeros(1, int)
-    begin, end = first[:-1], first[1:]
-    known = valid[begin] & valid[end]
+    step = np.flatnonzero(valid[first])
+    begin, end = first[step[:-1]], first[step[1:]]
+    known = (np.diff(step) == 1) | (t[end] - t[begin] < BRIDGED_S)
     if known.any():
         turned = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro[:-1] * dt[:, None], axis=0)])
         seen, span, q = turned[end] - turned[begin], (t[end] - t[begin])[:, None], poses.q_wb_wxyz
@@ -108,7 +111,7 @@ def poses_turn_alone(imu: Imu, truth: Poses) -> Bool[np.ndarray, " n"]:
         most = np.maximum(JUMP_SHARE * np.linalg.norm(seen, axis=1), max(JUMP_RAD, JUMP_MEDIANS * median(misfit[known])))
         clipped = np.logical_or.reduce([at_limit(column) for column in imu.gyro.T])[:-1]
         lost = np.logical_or.reduceat(clipped | (dt > LOST * median(dt)), begin)
-        out[: end[-1]] = np.repeat(known & (lost | (misfit > most)), np.diff(first))
+        out[begin[0] : end[-1]] = np.repeat(known & (lost | (misfit > most)), end - begin)
     return out
 
 

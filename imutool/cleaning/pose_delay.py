@@ -12,7 +12,7 @@ from imutool.cleaning.samples import STEP_NS, STEP_S, Motion
 from imutool.cleaning.truth import Truth, turning
 from imutool.cleaning.unit_evidence import POSES_APART_NS
 from imutool.recording import seconds
-from imutool.recording.columns import median
+from imutool.recording.columns import median, quantile
 
 MOST_POSES = 2000  # evenly taken from a longer log
 LONGEST_DELAY_S, FINE_S = 2.0, 0.01
@@ -20,6 +20,7 @@ SLOW_S = 1.0  # length of the turns that find the delay: in steps of 0.1 s a fas
 FINE_LAGS_S = FINE_S * np.arange(-12, 13)
 LEAST_CORRELATION, WEAK = 0.8, 0.5  # of the whole log, and of a part
 LEAST_SHARED, MOST_STEPS = 300, 72_000  # steps of 0.1 s that two clocks share, and of a log that is searched for them
+SHARES = 1.0, 0.95  # of the turns that count with their own length; longer ones, as where markers are exchanged, are cut to it
 CERTAIN = 6.0  # standard deviations of Fisher's z; of 210 pairs of unrelated logs the best by chance had 5.3
 DELAY_PARTS, FEWEST_PARTS = 8, 4  # parts whose own lags show how sure the delay is
 SCALE_STEPS, GAUSS = 20, 1.4  # steps to Student's scale of a few parts, and by how much it is below a Gaussian's deviation
@@ -56,26 +57,30 @@ def pose_delay(motion: Motion, truth: Truth) -> Delay | None:
     """Delay of the poses' stamps by the lengths of the rates; None where it is not shown.
 
     Where no delay up to `LONGEST_DELAY_S` fits, the poses may be on a clock of their own. The gyro's median is its bias, but
-    for a body that turns on and on about one axis: where nothing fits, no bias is taken off.
+    for a body that turns on and on about one axis: where nothing fits, no bias is taken off. Where still nothing fits, the
+    longest turns are cut, since a few jumps of the poses hide the motion.
     """
     bias = median(motion.table()[1][:, :3])
-    near = _near_delay(motion, truth, bias)
-    return near or _far_delay(motion, truth, bias) or _far_delay(motion, truth, np.zeros(3))
+    for share in SHARES:
+        near = _near_delay(motion, truth, bias, share)
+        if found := near or _far_delay(motion, truth, bias, share) or _far_delay(motion, truth, np.zeros(3), share):
+            return found
+    return None
 
 
-def _far_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> Delay | None:
+def _far_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"], share: float) -> Delay | None:
     """Delay of any size, of poses that may be on a clock of their own."""
-    apart_s = _clock_difference(motion, truth, bias)
+    apart_s = _clock_difference(motion, truth, bias, share)
     if apart_s is None:
         return None
-    found = _near_delay(motion, truth._replace(t_ns=truth.t_ns - round(apart_s * 1e9)), bias)
+    found = _near_delay(motion, truth._replace(t_ns=truth.t_ns - round(apart_s * 1e9)), bias, share)
     if found is None:
         return None
     step = found.step and Step(apart_s + found.step.before_s, apart_s + found.step.after_s, found.step.at_ns)
     return Delay(apart_s + found.seconds, found.std_s, step)
 
 
-def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> float | None:
+def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"], share: float) -> float | None:
     """Seconds from the IMU's clock to that of the poses, by the lengths of the rates at every lag.
 
     None if chance explains the best lag.
@@ -86,8 +91,8 @@ def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3
     count = int(true_s[-1] / STEP_S) + 1, int(step[-1] - step[0]) + 1
     if not all(LEAST_SHARED <= n <= MOST_STEPS for n in count):
         return None
-    true = np.interp(STEP_S * np.arange(count[0]), true_s, np.linalg.norm(rate, axis=1))
-    gyro = np.interp(step[0] + np.arange(count[1]), step, np.linalg.norm(mean[:, :3] - bias, axis=1))
+    true = np.interp(STEP_S * np.arange(count[0]), true_s, _cut(np.linalg.norm(rate, axis=1), share))
+    gyro = np.interp(step[0] + np.arange(count[1]), step, _cut(np.linalg.norm(mean[:, :3] - bias, axis=1), share))
     from imutool.inertial.correlation import cross_correlation  # scipy, which poses on the IMU's clock never need
 
     found = cross_correlation(gyro, true, LEAST_SHARED)
@@ -97,12 +102,17 @@ def _clock_difference(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3
     return 1e-9 * (int(first[0]) - start_ns) + STEP_S * (lag - int(step[0]) - 0.5)
 
 
-def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"]) -> Delay | None:
+def _cut(lengths: Float64[np.ndarray, "*rows n"], share: float) -> Float64[np.ndarray, "*rows n"]:
+    """Lengths, those beyond a share of all as long as its longest."""
+    return lengths if share == 1.0 or not lengths.size else np.minimum(lengths.T, quantile(lengths.T, share)).T
+
+
+def _near_delay(motion: Motion, truth: Truth, bias: Float64[np.ndarray, "3"], share: float) -> Delay | None:
     """Delay of at most `LONGEST_DELAY_S`, and of less in a short log."""
     period_ns = max(STEP_NS, int(median(np.diff(truth.t_ns))))  # poses at 25 Hz are 80 and 120 ms apart here
     apart = max(1, round(SLOW_S * 1e9 / period_ns)), 1
     for longest_s, fewest, most_parts in SEARCHES:
-        slow, fast = (_Turns.of(motion, truth, n, period_ns, bias, longest_s) for n in apart)
+        slow, fast = (_Turns.of(motion, truth, n, period_ns, bias, longest_s, share) for n in apart)
         count = min(most_parts, min(len(slow.size) + fewest, len(fast.size)) // fewest)  # of the slow ones a log holds fewer
         if count >= FEWEST_PARTS:
             return _searched(slow, fast, longest_s, count, motion.middle_ns)
@@ -168,17 +178,25 @@ def _stepped(
 class _Turns(NamedTuple):
     """Turns between poses, and the gyro's mean in each step.
 
-    A turn has its size (rad/s), its beginning and its end (s, on the IMU's clock).
+    A turn has its size (rad/s), its beginning and its end (s, on the IMU's clock). `share` is of the turns that are not cut.
     """
 
     size: Float64[np.ndarray, " n"]
     first_s: Float64[np.ndarray, " n"]
     last_s: Float64[np.ndarray, " n"]
     gyro: StepIntegral
+    share: float
 
     @classmethod
     def of(
-        cls, motion: Motion, truth: Truth, apart: int, period_ns: int, bias: Float64[np.ndarray, "3"], longest_s: float
+        cls,
+        motion: Motion,
+        truth: Truth,
+        apart: int,
+        period_ns: int,
+        bias: Float64[np.ndarray, "3"],
+        longest_s: float,
+        share: float,
     ) -> _Turns:
         """Turns between poses that are `apart` rows apart, as far as the gyro covers them at every delay."""
         first, last, rate = turning(truth, apart)
@@ -186,12 +204,12 @@ class _Turns(NamedTuple):
         use, first_s, last_s = usable(first, last, motion.middle_ns, step, POSES_APART_NS + (apart - 1) * period_ns)
         inside = (first_s > longest_s + STEP_S * step[0]) & (last_s + longest_s < STEP_S * (step[-1] + 1))
         gyro = StepIntegral.of(step, mean[:, :3] - bias)
-        return cls(np.linalg.norm(rate[use[inside]], axis=1), first_s[inside], last_s[inside], gyro)
+        return cls(_cut(np.linalg.norm(rate[use[inside]], axis=1), share), first_s[inside], last_s[inside], gyro, share)
 
     def correlations(self, lags: Float64[np.ndarray, " l"], count: int) -> Float64[np.ndarray, "l p"]:
         """Correlations with the gyro at each lag: of all turns, and of each of `count` parts of the log."""
         means = (self.gyro.between(self.first_s - lag, self.last_s - lag) for lag in lags)
-        measured = np.stack([np.linalg.norm(mean, axis=1) for mean in means])
+        measured = _cut(np.stack([np.linalg.norm(mean, axis=1) for mean in means]), self.share)
         parts = zip(np.array_split(self.size, count), np.array_split(measured, count, axis=1), strict=True)
         return np.stack([_correlations(self.size, measured), *(_correlations(*part) for part in parts)], axis=1)
 

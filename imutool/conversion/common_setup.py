@@ -116,8 +116,8 @@ def fitted_to(path: Path, common: Corrections) -> Corrections | None:
         turned = None if _is_identity(common.body.turn) else body_of(log, common.pose_topic, common.body.turn)
         frame_id = next(log.pose_batches(common.pose_topic)).frame_id
         copies = frames_of_copies(log, common.pose_topic)
-    said = pose_notes(common.world, common.quaternions, common.unit, common.late_ns, turned)
-    notes[common.pose_topic] = f"{SAID}, {'; '.join(said)}"
+    if said := pose_notes(common.world, common.quaternions, common.unit, common.late_ns, turned):
+        notes[common.pose_topic] = f"{SAID}, {'; '.join(said)}"
     body = turned or NOT_TURNED
     return replace(common, frame_id=frame_id, body=body, copies=copies, reflected=own_types, notes=notes)
 

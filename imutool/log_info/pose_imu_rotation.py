@@ -25,6 +25,7 @@ LEAST_EXPLAINED = 0.5  # of the gyro's motion, for a rotation to be reported
 UNLIKE_RAD_S = 0.1  # rms that poses leave of the gyro's motion; EuRoC, TUM-VI and FETCH explain at least 91 %
 JUMP_DEG, JUMP_MEDIANS, JUMP_SHARE = 5.0, 10.0, 0.2  # misfit of a turn in 0.1 s; by the usual misfit; of the gyro's turn
 LEAST_JUMPS_DEG = 15.0  # their sum, below which one is no news
+MOST_JUMPS, REFITS = 0.1, 4  # share of the turns up to which jumps are left out, and fits that find them
 UNSURE_SHARE, UNSURE_DEG = 0.1, (1.0, 3.0)  # of a rotation, within these: its standard deviation, if it is not reported
 TURNED_DEG = 4.0  # more than a mount that was meant to be straight; EuRoC, TUM-VI and BROAD have up to 1.5
 CORRECTION = "imutool convert LOG OUT --fix corrects it"
@@ -50,7 +51,7 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     """Agreement of the turns of poses with the gyro; None where the two share too little motion.
 
     gyro = b + R omega, with the constant bias b and rotation R that fit best (Kabsch), over intervals of a tenth of a second
-    without a gap of the IMU.
+    without a gap of the IMU. A few jumps of the poses are counted, and left out of all other figures.
     """
     if len(imu) < LEAST_TURNS or len(poses.t_ns) < LEAST_TURNS:
         return None
@@ -66,22 +67,28 @@ def agreement(poses: Truth, imu: Imu) -> Agreement | None:
     for axis, w in enumerate(imu.gyro.T):
         turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * (w[1:] + w[:-1]) / 2.0)])
         mean[:, axis] = (np.interp(end, t, turned) - np.interp(begin, t, turned)) / (end - begin)
-    gyro, omega = mean - mean.mean(axis=0), rate[inside] - rate[inside].mean(axis=0)
-    motion = float(np.sqrt((gyro**2).sum(axis=1).mean()))
+    length_s, kept, jumps = end - begin, np.ones(len(begin), bool), np.zeros(0)
+    for _ in range(REFITS):
+        gyro, omega = mean - mean[kept].mean(axis=0), rate[inside] - rate[inside][kept].mean(axis=0)
+        turn = best_rotation(gyro[kept], omega[kept])
+        misfit = np.linalg.norm(gyro - omega @ turn.T, axis=1)
+        off_deg = np.degrees(misfit * length_s)
+        clear = JUMP_SHARE * np.linalg.norm(gyro, axis=1) < misfit  # else a scale or a clock may be off
+        jumped = clear & (off_deg > max(JUMP_DEG, JUMP_MEDIANS * median(off_deg)))
+        jumps = off_deg[jumped] if off_deg[jumped].sum() > LEAST_JUMPS_DEG else np.zeros(0)
+        if not len(jumps) or len(jumps) > MOST_JUMPS * len(kept):
+            break
+        kept = ~jumped
+    motion = float(np.sqrt((gyro[kept] ** 2).sum(axis=1).mean()))
     if motion < LEAST_RATE_RAD_S:
         return None
-    turn = best_rotation(gyro, omega)
-    misfit = np.linalg.norm(gyro - omega @ turn.T, axis=1)
-    rms = float(np.sqrt((misfit**2).mean()))
+    rms = float(np.sqrt((misfit[kept] ** 2).mean()))
     explained = max(0.0, 1.0 - (rms / motion) ** 2)
-    body = rotation_deg(turn, gyro, omega, float(end[-1] - begin[0])) if explained > LEAST_EXPLAINED else None
+    seen = explained > LEAST_EXPLAINED
+    body = rotation_deg(turn, gyro[kept], omega[kept], float(end[-1] - begin[0])) if seen else None
     if body is not None and body.std_deg.max() >= np.clip(UNSURE_SHARE * np.linalg.norm(body.deg), *UNSURE_DEG):
         body = None
-    off_deg = np.degrees(misfit * (end - begin))
-    clear = JUMP_SHARE * np.linalg.norm(gyro, axis=1) < misfit  # else a scale or a clock may be off
-    jumps_deg = off_deg[clear & (off_deg > max(JUMP_DEG, JUMP_MEDIANS * median(off_deg)))]
-    jumps = len(jumps_deg) if jumps_deg.sum() > LEAST_JUMPS_DEG else 0
-    return Agreement(rms, explained, body, jumps, float(jumps_deg.max()) if jumps else 0.0)
+    return Agreement(rms, explained, body, len(jumps), float(jumps.max(initial=0.0)))
 
 
 def _has_gap(

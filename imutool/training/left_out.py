@@ -284,7 +284,6 @@ def _score(log: Recording, model: str, start: str, imu: Imu, alone: Bool[np.ndar
 
 def _turned_as_poses(imu: Imu, truth: Poses, rows: Bool[np.ndarray, " n"]) -> Imu:
     """Samples whose gyro turns as the poses do in some rows, by the rule of `dead_reckon`."""
-    (poses, valid), dt = truth.at(imu.t_ns), np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))
+    poses, dt = truth.at(imu.t_ns)[0], np.diff(seconds(imu.t_ns, int(imu.t_ns[0])))  # interpolated over gaps
     turns = quaternion.log(quaternion.multiply(quaternion.inverse(poses.q_wb_wxyz[:-1]), poses.q_wb_wxyz[1:]))
-    replaced = (rows[:-1] & valid[:-1] & valid[1:])[:, None]
-    return replace(imu, gyro=np.concatenate([np.where(replaced, turns / dt[:, None], imu.gyro[:-1]), imu.gyro[-1:]]))
+    return replace(imu, gyro=np.concatenate([np.where(rows[:-1, None], turns / dt[:, None], imu.gyro[:-1]), imu.gyro[-1:]]))

@@ -218,8 +218,9 @@ def _drift_first(
 
 def helps(before: LogErrors, after: LogErrors) -> bool:
     """Whether a descent lowers a sensor's errors beyond the scatter of logs, and harms none."""
+    scattered = all(len(errors) > 1 for errors in before.values())  # a single log shows what fits its own motion
     harm = max(float(np.mean(after[sensor] - before[sensor])) for sensor in before)
-    return harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
+    return scattered and harm < LEAST_GAIN and any(beaten(before[sensor], after[sensor], SURELY) for sensor in before)
 
 
 def _log_errors(training: Training) -> LogErrors:

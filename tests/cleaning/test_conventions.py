@@ -260,6 +260,21 @@ def test_one_part_that_errs_does_not_make_a_delay_unsure(seed: int) -> None:
     assert 5.0 * found.std_s < 0.08
 
 
+@pytest.mark.parametrize("late_s", [0.3, -3.1, 1e5])
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_that_jump_some_times_do_not_hide_their_delay(seed: int, late_s: float) -> None:
+    """Markers are exchanged for 0.3 s, nine times in two minutes: turns by 2.5 rad that the gyro does not show."""
+    imu, poses = turned(waves(120.0, (0.5, 0.4, 0.6), seed))
+    truth = of_poses("/truth", poses)
+    assert truth is not None
+    jumps = 2.5 * np.isin(np.arange(len(truth.t_ns)) % 130, (50, 51, 52))[:, None] * [0.0, 0.6, 0.8]
+    q_wxyz = (Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(jumps)).as_quat(scalar_first=True)
+    other = truth._replace(t_ns=truth.t_ns + round(late_s * 1e9), q_wb_wxyz=q_wxyz)
+    found = judge(motion_of(imu), other, 1.0).delay
+    assert found is not None
+    assert found.seconds == pytest.approx(late_s, abs=0.02)
+
+
 @pytest.mark.parametrize(
     ("length_s", "late_s", "accuracy_s"), [(21.0, 0.35, 0.012), (21.0, -1.2, 0.012), (10.0, 0.12, 0.05), (10.0, -0.3, 0.05)]
 )

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from imutool import registry
 from imutool.api.models import debias as debias_log
 from imutool.cleaning.pose_quaternions import MISREAD, OTHER_WORLD
-from imutool.conversion.common_setup import shared
+from imutool.conversion.common_setup import fitted_to, shared
 from imutool.conversion.corrections import RECORD, Corrections
 from imutool.conversion.run import convert
 from imutool.errors import LogError
@@ -484,3 +484,12 @@ def test_a_drivers_json_that_is_turned_against_the_poses_keeps_its_axes(made: Re
     turn, true = (Rotation.from_quat(q.copy(), scalar_first=True) for q in (right.truth.q_wb_wxyz, made.truth.q_wb_wxyz))
     assert (turn * (true * Rotation.from_matrix(P.T)).inv()).magnitude().max() < 1e-7
     assert inspect(tmp_path / "right.mcap").warnings == []
+
+
+def test_poses_of_which_the_other_logs_agree_on_nothing_get_no_note(tmp_path: Path) -> None:
+    """All IMUs are read alike, and each motion capture had a clock of its own."""
+    write(flight(3, duration_s=2.0), tmp_path / "log.mcap")
+    flipped = np.stack([np.eye(3), -np.eye(3)])
+    found = fitted_to(tmp_path / "log.mcap", Corrections({"/imu0": flipped}, pose_topic="/ground_truth/pose"))
+    assert found is not None
+    assert found.notes == {"/imu0": "units and axes are now as in the other logs"}

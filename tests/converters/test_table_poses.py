@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from imutool.converters import table
@@ -75,6 +76,22 @@ EXPORTS = {
 }
 
 
+def write_qualisys_mat(path: Path, bodies: int) -> None:
+    """A measurement as Qualisys saves it: a text of its own in the header, bodies in mm, matrices column by column."""
+    turned = MATRICES.transpose(2, 1, 0).reshape(9, COUNT)
+    turned[:, 2], place = np.nan, np.where(np.arange(COUNT) == 2, np.nan, 1000.0 * P_M.T)  # out of sight
+    other = np.zeros((3, COUNT)), np.tile(np.eye(3).reshape(9, 1), COUNT)
+    rigid = {
+        "Bodies": float(bodies),
+        "Name": np.array(["drone", "table"][:bodies], dtype=object),
+        "Positions": np.stack([place, other[0]][:bodies]),
+        "Rotations": np.stack([turned, other[1]][:bodies]),
+    }
+    savemat(path, {path.stem: {"File": "walk.qtm", "Frames": float(COUNT), "FrameRate": 100.0, "RigidBodies": rigid}})
+    saved = path.read_bytes()
+    path.write_bytes(b"QTM_ver 2.10, Level 5 MAT-file".ljust(124, b"\0") + saved[124:])
+
+
 def read(folder: Path) -> MessageLog:
     return table.read_sequence(table.sequences(folder)[0])
 
@@ -91,6 +108,21 @@ def test_an_export_of_a_motion_capture_beside_an_imu_is_its_truth_in_metres(tmp_
     np.testing.assert_allclose(poses.t_ns, 1e9 * T_S[seen], atol=1.0)
     assert log.kinds == {"/ground_truth/pose": "truth"}
     assert log.remarks.losses == []
+
+
+@pytest.mark.parametrize("bodies", [1, 2])
+def test_a_measurement_of_qualisys_saved_for_matlab_is_the_truth_of_the_sensors_beside_it(tmp_path, bodies):
+    write_qualisys_mat(tmp_path / "walk_7.mat", bodies)
+    (tmp_path / "gyroscope.txt").write_text("time [s],x (rad/s),y (rad/s),z (rad/s)\n" + rows(T_S, GYRO))
+    (tmp_path / "accelerometer.txt").write_text("time [s],x (m/s^2),y (m/s^2),z (m/s^2)\n" + rows(T_S, ACCEL))
+    log = read(tmp_path)
+    poses, seen = log.poses["/ground_truth/pose"], np.arange(COUNT) != 2
+    np.testing.assert_allclose(poses.p_wb, P_M[seen], atol=1e-9)
+    np.testing.assert_allclose(np.abs((poses.q_wb_wxyz * XYZW[seen][:, [3, 0, 1, 2]]).sum(axis=1)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(poses.t_ns, 1e9 * T_S[seen], atol=1.0)
+    assert log.kinds == {"/ground_truth/pose": "truth"}
+    assert log.remarks.losses == []
+    assert any("bodies in it: drone, table" in note for note in log.remarks.notes) == (bodies > 1)
 
 
 @pytest.mark.parametrize("rotation", ["angles of Vicon", "angles of Motive"])

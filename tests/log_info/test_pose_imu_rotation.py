@@ -111,3 +111,18 @@ def test_poses_that_jump_are_named(sizes_deg: tuple[float, ...], warned: bool) -
     if warned:
         assert abs(found.largest_jump_deg - abs(sizes_deg[0])) < 1.0
         assert f"that the gyro does not show, {'once' if len(sizes_deg) == 1 else f'{len(sizes_deg)} times'}:" in said[0]
+
+
+def test_a_few_large_jumps_hide_neither_the_motion_nor_the_mount() -> None:
+    """Markers are exchanged four times, for one pose each: turns of 26 rad/s beside a motion of 1 rad/s."""
+    truth = poses()
+    swapped = np.radians(150.0) * (np.arange(len(truth.t_ns)) % 70 == 40)
+    R = Rotation.from_quat(truth.q_wb_wxyz, scalar_first=True) * Rotation.from_rotvec(swapped[:, None] * [0.6, 0.0, 0.8])
+    found = agreement(truth._replace(q_wb_wxyz=R.as_quat(scalar_first=True)), imu())
+    assert found is not None
+    assert found.explained > 0.999
+    assert found.jumps == 8
+    assert found.turned is not None
+    assert np.abs(found.turned.deg - MOUNT.as_rotvec(degrees=True)).max() < 5 * found.turned.std_deg.max()
+    (warning,) = motion_warnings("/mocap", found.explained, found.rms_rad_s, found.jumps, found.largest_jump_deg)
+    assert "turn by up to 150° in 0.1 s that the gyro does not show, 8 times" in warning

@@ -6,18 +6,21 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from support.switchings_on import Switchings, log
 
 from imutool.bias import model_file
 from imutool.bias_start.bias_from_truth import poses_turn_alone
 from imutool.config import load
+from imutool.geometry import quaternion
+from imutool.inertial.strapdown import along_truth
 from imutool.mcap_io.write import write
 from imutool.recording import seconds
 from imutool.sensor.made_up_flight import FlightSettings, TriadSettings, flight
 from imutool.training.calibration.effect_selection import LINEAR, PhysicsFirst
 from imutool.training.candidates import with_statistics
 from imutool.training.fit import Training
-from imutool.training.left_out import _score
+from imutool.training.left_out import _score, _turned_as_poses
 from imutool.training.run import train
 from imutool.training.settings import settings_of
 from imutool.training.training_windows import Pool
@@ -64,3 +67,20 @@ def test_turns_that_the_gyro_does_not_show_count_for_no_candidate() -> None:
     )
     assert shown.aoe_deg > 10.0
     assert hidden.aoe_deg < 0.5
+
+
+@pytest.mark.parametrize("hidden_s", [0.0, 0.15, 0.25])
+def test_poses_that_jump_and_come_back_cost_no_candidate_more_than_the_jump(hidden_s: float) -> None:
+    """Markers are exchanged for two seconds; the motion capture sees none of them for a moment before."""
+    perfect = TriadSettings(
+        noise_density=0.0, walk_density=0.0, typical_bias=0.0, turn_on_bias=0.0, warm_up=0.0, scale=0.0, misalignment_rad=0.0
+    )
+    made = flight(3, FlightSettings(gyro=perfect, accel=perfect), duration_s=30.0)
+    t = seconds(made.truth.t_ns, int(made.imu.t_ns[0]))
+    away = np.radians(150.0) * ((t > 12.0) & (t < 14.0))[:, None] * [0.6, 0.0, 0.8]
+    jumped = quaternion.multiply(made.truth.q_wb_wxyz, quaternion.exp(away))
+    truth = replace(made.truth, q_wb_wxyz=jumped).rows((t < 12.0 - hidden_s) | (t > 12.0))
+    rows = poses_turn_alone(made.imu, truth)
+    path, true, _ = along_truth(_turned_as_poses(made.imu, truth, rows), made.truth, "made")
+    off = quaternion.log(quaternion.multiply(quaternion.inverse(path.q_wb_wxyz), true.q_wb_wxyz))
+    assert np.degrees(np.linalg.norm(off[path.t_ns > made.truth.t_ns[-1] - 10**10], axis=1)).max() < 5.0

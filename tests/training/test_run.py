@@ -426,6 +426,8 @@ def test_helps_asks_for_a_gain_beyond_the_scatter_of_logs_and_no_harm_to_the_oth
     assert not helps(before, {"gyro": before["gyro"] + 0.1 * alike, "accel": before["accel"]}), "too little"
     assert not helps(before, {"gyro": before["gyro"] + alike, "accel": before["accel"] + 0.1}), "harm"
     assert not helps(before, before)
+    single, better = ({key: value[:1] + gain for key, value in before.items()} for gain in (0.0, 2.0 * alike[0]))
+    assert not helps(single, better), "a single log shows no scatter"
 
 
 def test_static_is_not_trained(tmp_path: Path) -> None:
