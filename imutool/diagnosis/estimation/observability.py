@@ -212,8 +212,8 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects beside which noise is measured: second orders and shares would leave too little."""
-    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant != SHARED]
+    """Effects beside which noise is measured: second orders, shares and further steps would leave too little."""
+    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, *ONCE_MORE)]
 
 
 def exclude_each_other(a: Effect, b: Effect) -> bool:
