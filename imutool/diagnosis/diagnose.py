@@ -207,7 +207,7 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         clock = selection.fitted.chosen[: selection.always]
         closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis), clock)
     except ImutoolError as error:
-        why = f"How much closer it comes is computed, not simulated again: {error}"
+        why = f"The gain is computed, not measured with a second simulation. Reason: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
 

@@ -226,7 +226,7 @@ def test_a_residual_above_the_noise_is_never_called_nothing() -> None:
             "always, most with angular rate above 0.4 rad/s",
             "The gyro differs throughout, most with angular rate above 0.4 rad/s: it",
         ),
-        ("intermittent", "no regime: it comes and goes", "The gyro differs off and on: it"),
+        ("intermittent", "no regime: it comes and goes", "The gyro differs from time to time: it"),
         ("regime", "when turning", "The gyro differs when turning: it"),
         ("regime", "after 30 s", "The gyro differs after 30 s: it"),
         ("everywhere", "always, most in the first 43 s", "The gyro differs throughout, most in the first 43 s: it"),

@@ -212,7 +212,7 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects beside which noise is measured: second orders, shares and further steps would leave too little."""
+    """Effects beside which noise is measured: further steps or orders would leave too little."""
     return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, *ONCE_MORE)]
 
 

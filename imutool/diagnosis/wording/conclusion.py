@@ -261,7 +261,7 @@ def _regime(located: Sequence[Located], signal: str) -> str:
     if place.extent == "everywhere":
         return f" throughout{regime.removeprefix('always')}"
     if place.extent == "intermittent":
-        return " off and on"
+        return " from time to time"
     word = regime.split()[0].lower()
     starts = {
         "when",
