@@ -59,7 +59,7 @@ from imutool.recording import Recording
 from imutool.sensor import catalogue
 from imutool.sensor.channels import with_channels
 from imutool.sensor.effect import Effect
-from imutool.sensor.effects import clock_wander, gyro_bias_drift
+from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step
 
 SHOWN_BY_SAMPLES = {"saturation", "quantization"}  # without any fit: `stamps`
 NEEDS_POSES = clock_wander.EFFECT.name  # one clock cannot wander against itself
@@ -207,7 +207,7 @@ def _resimulated(diagnosis: Diagnosis, logs: Sequence[WhitenedImu], selection: S
         clock = selection.fitted.chosen[: selection.always]
         closer = resimulate(logs, sim, summarize.physics_of_fitted_time(logs, selection, diagnosis), clock)
     except ImutoolError as error:
-        why = f"How much closer it comes is computed, not simulated again: {error}"
+        why = f"The gain is computed, not measured with a second simulation. Reason: {error}"
         return replace(diagnosis, remarks=(*diagnosis.remarks, why, *simulator_remarks(sim)))
     return replace(diagnosis, closer=closer)
 
@@ -230,7 +230,7 @@ def candidates_for(pairs: Sequence[Pair]) -> tuple[Effect, ...]:
     effects = [effect for effect in catalogue.diagnosed() if thinkable(effect) and effect.name not in left_out]
     effects = in_forms(effects, exact=exact)
     end_s = max(float(pair.stamp_s[-1]) for pair in pairs)
-    effects = [*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)]
+    effects = [*gyro_bias_step.repeated([*gyro_bias_drift.within(clock_wander.with_knots(effects, end_s), end_s)])]
     biases = [np.median(pair.real - expected(pair, ()), axis=0) for pair in pairs]
     of_reference = timestamps.jitter(pairs) if exact else (SMOOTHED,)
     return (*effects, *of_reference, *timestamps.soft_limits(pairs, biases))

@@ -281,4 +281,4 @@ def _refuse_unlike(
     if log.whiten.band is not None:
         off = log.whiten.band(off)
     if (np.sqrt((off[rows] ** 2).mean(axis=0)) > AS_GOOD * noise_floor([log])).any():
-        raise DataError("a simulation along its poses is not the simulation that was given", where=sim.name)
+        raise DataError("a simulation along its poses gives other samples than it has", where=sim.name)

@@ -34,8 +34,9 @@ def start_values(findings: Sequence[Finding], candidates: Sequence[Effect]) -> C
     found = dict[str, tuple[Effect, Theta]]()
     for finding in findings:
         alike = [effect for effect in candidates if effect.name == finding.effect and finding.effect not in NO_EFFECT]
+        alike = [effect for effect in alike if effect.key not in found]  # what acts once more has a finding of its own
         effect = max(alike, key=partial(_likeness, finding), default=None)
-        if effect is not None and effect.key not in found:
+        if effect is not None:
             found[effect.key] = _started(effect, finding.parameters)
     return tuple(found.values())
 

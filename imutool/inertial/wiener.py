@@ -49,12 +49,12 @@ class _Shared(NamedTuple):
 class NoiseLeft(NamedTuple):
     """One-sided density of the noise that a filter leaves, by frequency: a motion hides it.
 
-    `unshared` is the deviation of what a recording does not share of a sample before the filter: no noise is larger.
+    `most` bounds the deviation of a sample's noise before the filter: what a recording does not share, and what is filtered.
     """
 
     f_hz: Float64[np.ndarray, " f"]
     density: Float64[np.ndarray, "f k"]
-    unshared: Float64[np.ndarray, " k"] | float = np.inf
+    most: Float64[np.ndarray, " k"] | float = np.inf
 
 
 def wiener_filter(
@@ -94,7 +94,9 @@ def denoised(
     if of_poses and shared is None:
         return x, NoiseLeft(stft.f, np.zeros((len(stft.f), x.shape[1])))
     density = 2.0 / (rate_hz * float((stft.win**2).sum()))  # one-sided, of a square of the parts
-    all_of_it = density * (np.abs(parts) ** 2).mean(axis=1)
+    inside = slice(stft.lower_border_end[1], stft.upper_border_begin(len(mirrored))[1])  # beyond, a motion is cut off
+    all_of_it = density * (np.abs(parts[:, inside]) ** 2).mean(axis=1)
+    top = density * _top_power(parts, settings)
     std, untold = _noise_std(parts, with_recorded, settings, white=not of_poses)
     std = std[:, None]
     parts /= std
@@ -112,12 +114,13 @@ def denoised(
         gain *= ~_apart(shared, settings)[:, None]
     clean = stft.istft(np.moveaxis(gain * parts * std, 1, 2), k1=n + 2 * size, f_axis=0, t_axis=2)
     left = density * (std[:, 0] ** 2) * (gain**2).mean(axis=1) * noise[:, 0]
-    unshared: Float64[np.ndarray, " k"] | float = np.inf
-    left = np.where(untold, 2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, left)
+    most: Float64[np.ndarray, " k"] | float = np.inf
+    left = np.where(untold, np.minimum(2.0 * (CALM * white_noise(x)) ** 2 / rate_hz, top), left)
     if with_recorded is not None:  # noise is not shared: a vibration looks like white noise, and a recording shares it
-        most = uniform_filter1d(all_of_it, settings.short_time_parts, axis=0, mode="nearest")
-        left, unshared = np.minimum(left, own := with_recorded.own * most), np.sqrt(trapezoid(own, stft.f, axis=0))
-    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left, unshared)
+        unshared = with_recorded.own * uniform_filter1d(all_of_it, settings.short_time_parts, axis=0, mode="nearest")
+        filtered = np.where(untold, top * rate_hz / 2.0, trapezoid(density * std[:, 0] ** 2, stft.f, axis=0))
+        left, most = np.minimum(left, unshared), np.sqrt(np.minimum(trapezoid(unshared, stft.f, axis=0), filtered))
+    return np.asarray(line + clean[size : size + n]), NoiseLeft(stft.f, left, most)
 
 
 def _line(x: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "n k"]:
@@ -184,8 +187,7 @@ def _noise_std(
     filter takes none of it.
     """
     power = np.median(np.abs(parts) ** 2, axis=1) / np.log(2.0)  # a shock is no noise of other times
-    top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
-    out, untold = np.tile(np.median(top, axis=(0, 1)) / np.log(2.0), (len(parts), 1)), np.zeros(top.shape[2], bool)
+    out, untold = np.tile(_top_power(parts, settings), (len(parts), 1)), np.zeros(parts.shape[2], bool)
     for k, (column, unexplained) in enumerate(zip(shared.shared.T, shared.own.T, strict=True) if shared is not None else ()):
         own = np.flatnonzero(_apart(column, settings))
         beyond_chance = column.sum() > settings.short_time_parts  # frequencies whose means overlap
@@ -198,6 +200,12 @@ def _noise_std(
             most = unexplained * uniform_filter1d(power[:, k], settings.short_time_parts, mode="nearest")
             out[column, k] = np.clip(most[column], NO_NOISE * power[:, k].max(), out[column, k])
     return np.asarray(np.sqrt(np.maximum(out, 1e-300))), untold
+
+
+def _top_power(parts: Parts, settings: WienerSettings) -> Float64[np.ndarray, " k"]:
+    """Power of the parts at the top of the spectrum, by signal: no white noise has more."""
+    top = np.abs(parts[int(settings.noise_band * len(parts)) :]) ** 2
+    return np.asarray(np.median(top, axis=(0, 1)) / np.log(2.0))
 
 
 def _apart(shared: Bool[np.ndarray, "f ..."], settings: WienerSettings) -> Bool[np.ndarray, "f ..."]:

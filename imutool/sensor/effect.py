@@ -30,6 +30,7 @@ from imutool.sensor.signals import Signals
 from imutool.units import AXES, Three
 
 Kind = Literal["catalogue", "driven", "unknown"]
+ONCE_MORE = ("second", "third")  # variants of an effect that acts several times, each beside the one before
 Theta = Float64[np.ndarray, "_"]  # effects that act together have parameters of their own, so this length binds no other
 
 
@@ -101,8 +102,7 @@ class Effect:
     trained: a bias model can have it: its error follows from the sensor's own samples and is linear in all parameters but those
         `fixed_in_training`.
     diagnosed: a diagnosis may find it.
-    basis: the terms of a trained effect, where `forward` for one parameter at a time would be slow; the same numbers.
-    fast: a trained effect for given parameters, where `forward` would be slow; the same numbers.
+    basis, fast: the terms of a trained effect, and it for given parameters, where `forward` would be slow; the same numbers.
     lagless: `forward` with its gain and without its lag.
     of_time: what it adds depends on time alone, as the walk of a bias does.
     reached: share of the amplitudes that shows in a log, by the last parameter, a time constant. A fit moves this share: of a

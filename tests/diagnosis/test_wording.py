@@ -162,7 +162,29 @@ def test_a_drift_whose_end_the_log_does_not_show_is_told_as_a_rate(tau: Estimate
 def test_a_curve_of_which_no_number_is_distinguished_still_has_a_sentence() -> None:
     curve = replace(diagnoses.NAMELESS.findings[0].curve, variable="t")
     drift = finding("drift", {"c0": Estimate(0.1, 1.0, "m")}, equation="y += curve(t)", curve=curve)
-    assert named_sentence(diagnoses.ARM, drift).startswith("it shows drift, y += curve(t); c0 not distinguished")
+    assert named_sentence(diagnoses.ARM, drift).startswith("it drifts along a smooth curve of the time; c0 not distinguished")
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameters", "words"),
+    [
+        ("actuator_delay", {"delay": Estimate(0.007, 1e-4, "s")}, "the effort acts 7.00 ± 0.10 ms after it is commanded"),
+        ("actuator_delay", {"delay": Estimate(-0.007, 1e-4, "s")}, "the effort is logged 7.00 ± 0.10 ms after it acts"),
+        ("gravity", {"magnitude": Estimate(-0.03, 1e-3, "m/s^2")}, "gravity differs from the 9.81 m/s² that poses are given, "),
+    ],
+)
+def test_a_sentence_says_what_a_sign_or_a_reference_means(effect: str, parameters: dict[str, Estimate], words: str) -> None:
+    """A negative delay acted before it was commanded, and true poses had a gravity."""
+    assert named_sentence(diagnoses.BOTH, finding(effect, parameters)).startswith(words)
+
+
+def test_an_effect_that_acts_several_times_is_named_once() -> None:
+    step = finding("gyro_bias_step", {"x": Estimate(0.01, 1e-4, "rad/s")}, "gyro")
+    said = headline(replace(diagnoses.BOTH, findings=(diagnoses.LEVER_ARM, step, step)))
+    assert said.startswith(
+        "Three effects separate the recording from the true poses: lever_arm (accel) and gyro_bias_step (gyro)"
+    )
+    assert "gyro_bias_step (gyro) twice; together they remove" in said
 
 
 @pytest.mark.parametrize(
@@ -204,7 +226,7 @@ def test_a_residual_above_the_noise_is_never_called_nothing() -> None:
             "always, most with angular rate above 0.4 rad/s",
             "The gyro differs throughout, most with angular rate above 0.4 rad/s: it",
         ),
-        ("intermittent", "no regime: it comes and goes", "The gyro differs off and on: it"),
+        ("intermittent", "no regime: it comes and goes", "The gyro differs from time to time: it"),
         ("regime", "when turning", "The gyro differs when turning: it"),
         ("regime", "after 30 s", "The gyro differs after 30 s: it"),
         ("everywhere", "always, most in the first 43 s", "The gyro differs throughout, most in the first 43 s: it"),

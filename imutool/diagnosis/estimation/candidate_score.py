@@ -15,7 +15,7 @@ import numpy as np
 from imutool.array_types import Float, Float64, Int64
 from imutool.diagnosis.estimation.gauss_newton import Fit, direction, fit
 from imutool.diagnosis.estimation.jacobians import Chosen, ForwardPass, effect_jacobian, priors
-from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, with_free
+from imutool.diagnosis.estimation.observability import WANDER, exclude_each_other, may_act, with_free
 from imutool.diagnosis.estimation.significance import log_p_value
 from imutool.diagnosis.estimation.trial.effect_forms import low_pass_with
 from imutool.diagnosis.estimation.trial.lag_start import lag_taken_back
@@ -185,7 +185,8 @@ class Candidates:
         if self.score is None or self.score.now is not now:
             self.score, self.scores = CandidateScore(self.logs, now), {}
         derived = self._derived(now)
-        allowed = [effect for effect in candidates if not any(exclude_each_other(effect, other) for other, _ in now.chosen)]
+        allowed = [effect for effect in candidates if may_act(effect, now.keys)]
+        allowed = [effect for effect in allowed if not any(exclude_each_other(effect, other) for other, _ in now.chosen)]
         self._derive(self.score, [effect for effect in allowed if effect.key not in {**derived, **self.scores}], derived)
         guesses = [(-np.inf if count is None else self._guess(self.score, effect, derived).log_p, effect) for effect in allowed]
         best, enough = list[Scored](), max(count or 0, 1)

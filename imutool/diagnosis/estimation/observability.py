@@ -18,7 +18,7 @@ from imutool.diagnosis.estimation.significance import bic, parameter_cost
 from imutool.diagnosis.estimation.whitening import WhitenedLog
 from imutool.diagnosis.settings import SearchSettings
 from imutool.recording import GRAVITY_M_S2
-from imutool.sensor.effect import Effect, Theta
+from imutool.sensor.effect import ONCE_MORE, Effect, Theta
 from imutool.sensor.effects import low_pass, vibration
 from imutool.sensor.effects.gyro_hysteresis import play
 
@@ -212,18 +212,28 @@ def unidentified(effect: Effect, theta: Theta, std: Theta, *, curve: bool) -> It
 
 
 def for_noise(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects beside which noise is measured: second orders and shares would leave too little."""
-    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant != SHARED]
+    """Effects beside which noise is measured: further steps or orders would leave too little."""
+    return [effect for effect in effects if effect.name != LOW_PASSES[1] and effect.variant not in (SHARED, *ONCE_MORE)]
 
 
 def exclude_each_other(a: Effect, b: Effect) -> bool:
     """Whether two effects never act together.
 
-    Variants of one effect on one sensor do not, nor what replaces another.
+    Variants of one effect on one sensor do not, but for what acts several times, nor what replaces another.
     """
+    if a.key != b.key and a.name == b.name and {a.variant, b.variant} <= {"", *ONCE_MORE}:
+        return False
     one_sensor = a.sensors == b.sensors or bool(set(a.sensors) & set(b.sensors))
     variants = a.kind == b.kind == "catalogue" and a.name == b.name and one_sensor
     return a.key == b.key or variants or a.name in REPLACES.get(b.name, ()) or b.name in REPLACES.get(a.name, ())
+
+
+def may_act(effect: Effect, keys: Sequence[str]) -> bool:
+    """Whether an effect may come in: one that acts once more follows the one before."""
+    if effect.variant not in ONCE_MORE:
+        return True
+    before = ("", *ONCE_MORE)[ONCE_MORE.index(effect.variant)]
+    return (f"{effect.name}:{before}" if before else effect.name) in keys
 
 
 def beyond_the_band(effect: Effect, theta: Theta, logs: Sequence[WhitenedLog], settings: SearchSettings) -> bool:

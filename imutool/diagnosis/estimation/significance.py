@@ -76,13 +76,31 @@ def parameter_cost(like: Fit, chosen: Chosen) -> float:
 
 
 def gain_of(whole: Fit, k: int, iterations: int | None = None) -> tuple[float, float]:
-    """Squares that leaving an effect out costs, at most, and those that no walk of a bias saves."""
-    without = fit(whole.logs, (*whole.chosen[:k], *whole.chosen[k + 1 :]), part=whole.part, iterations=iterations, near=whole)
+    """Squares that leaving an effect out costs, at most, and those that no walk of a bias saves.
+
+    What acts several times (two drifts, three steps) may be a walk as a whole, and any of it be needed beside the rest. So
+    all of it together, with as many parameters, has to be as unlikely by chance.
+    """
+    gain, saved = _gain_without(whole, [k], iterations)
+    same = [j for j, (effect, _) in enumerate(whole.chosen) if effect.name == whole.chosen[k][0].name and effect.of_time]
+    if len(same) > 1 and iterations is None:
+        numbers = sum(len(whole.chosen[j][1]) for j in same)
+        together = log_p_value(_gain_without(whole, same, iterations)[1], numbers)
+        saved = saved if together < -TAIL else min(saved, gain_for(together, len(whole.chosen[k][1])))
+    return gain, saved
+
+
+def _gain_without(whole: Fit, left_out: Sequence[int], iterations: int | None) -> tuple[float, float]:
+    """Squares that leaving some effects out costs, at most, and those that no walk of a bias saves."""
+    chosen = tuple(entry for j, entry in enumerate(whole.chosen) if j not in left_out)
+    without = fit(whole.logs, chosen, part=whole.part, iterations=iterations, near=whole)
     jumps = any(effect.jumps for effect, _ in without.chosen)  # what moves a signal a little wins single samples at an edge
     gain = (without.objective - whole.objective) / (whole.settings.between_samples**2 if jumps else 1.0)
     if iterations is not None:
         return gain, gain
-    explained, left = (squares_of_walk(one, whole, of_any_speed=whole.chosen[k][0].of_time) for one in (without, whole))
+    explained, left = (
+        squares_of_walk(one, whole, of_any_speed=whole.chosen[left_out[0]][0].of_time) for one in (without, whole)
+    )
     return gain, gain - max(0.0, explained - left)
 
 

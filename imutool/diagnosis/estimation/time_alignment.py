@@ -181,7 +181,7 @@ def _simulated(
     even = np.asarray(make_interp_spline(t_sim, samples, k=3)(t_s))
     recorded = None if own_poses else recorded_at(real.imu, t_s, start_ns, even[:, :3])  # shares no errors of poses either
     clean, left = denoised(even, 1.0 / period_s, settings.alignment, recorded)
-    noise = np.minimum(noise, left.unshared)  # a vibration looks like white noise, and a recording shares it
+    noise = np.minimum(noise, left.most)  # a vibration looks like white noise, and a recording shares it
     clean = refined(clean, white_noise(np.concatenate([real.imu.gyro, real.imu.accel], axis=1)))
     t_s = np.linspace(t_s[0], t_s[-1], len(clean))
     alpha = np.asarray(make_interp_spline(t_s, clean[:, :3], k=5)(t_s, 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
@@ -20,8 +19,7 @@ from imutool.sensor.samples import SensorSamples
 from imutool.units import ASCII_UNITS, SENSORS, UNITS, Sensor
 
 SHARES = (0.999, 0.99, 0.97, 0.9, 0.8)  # of the largest reading, where a soft limit is looked for
-LEAST_VALUES = 3  # of a grid
-LEAST_ROWS = 100
+LEAST_VALUES, LEAST_ROWS = 3, 100  # of a grid
 READ, NOISY = 0.999, 6.0  # of the readings are no glitch; deviations of a sample by which noise goes beyond a limit
 UNEVEN = "stamps jitter, samples do not"
 
@@ -31,8 +29,8 @@ def even(
 ) -> tuple[Float64[np.ndarray, " n"], int]:
     """Stamps of an even clock fitted to the stamps, and the number of missing samples.
 
-    The period is the one in which the stamps agree best, which samples that are missing do not change; a running median of what
-    each stamp counts, less its number, says which samples those are though every stamp jitters.
+    The period is the one in which the stamps agree best: missing samples do not change it. A running median of what each stamp
+    counts, less its number, says which are missing though every stamp jitters.
     """
     k = np.arange(len(stamp_s), dtype=np.float64)
     since = stamp_s - stamp_s[0]
@@ -162,19 +160,21 @@ def limits(real: Float64[np.ndarray, "n 6"], settings: TimestampSettings = DEFAU
 
 
 def soft_limits(pairs: Sequence[Pair], biases: Sequence[Float64[np.ndarray, "6"]]) -> tuple[Effect, ...]:
-    """Saturation with noise on top, bias included: a sensor reads beyond it by noise alone."""
+    """Saturation with noise on top, the bias ahead of it or, if a sensor corrects it, behind."""
     candidates = []
     for k, signal in enumerate(SENSORS):
         if any(signal in limits(pair.real, pair.settings.timestamps) for pair in pairs):
             continue
         part = slice(3 * k, 3 * k + 3)
-        clip, real = _Clip(k, np.mean([b[part] for b in biases], axis=0)), [pair.real[:, part] for pair in pairs]
-        most = float(max(np.abs(x).max() for x in real))
-        least = max(float(np.max(np.quantile(np.abs(x), READ) - NOISY * white_noise(x))) for x in real)
-        limit = Parameter(f"{signal}_limit", UNITS[signal], most, positive=True, null_value=np.inf, step=1e-4, least=least)
-        text, starts = f"{signal} = clip({signal}, -L, L)", starts_at(*([share * most] for share in SHARES))
-        effect = Effect("saturation", Stage.CONVERTER, (signal,), text, (limit,), "the limit is reached", clip, False, starts)
-        candidates.append(replace(effect, variant=("", "accel")[k]))
+        bias = np.mean([b[part] for b in biases], axis=0)
+        for ahead, variant in ((bias, ("", "accel")[k]), (0.0 * bias, f"corrected {signal}")):
+            real = [pair.real[:, part] - bias + ahead for pair in pairs]
+            most = float(max(np.abs(x).max() for x in real))
+            least = max(float(np.max(np.quantile(np.abs(x), READ) - NOISY * white_noise(x))) for x in real)
+            L = Parameter(f"{signal}_limit", UNITS[signal], most, positive=True, null_value=np.inf, step=1e-4, least=least)
+            starts, text = starts_at(*([share * most] for share in SHARES)), f"{signal} = clip({signal}, -L, L)"
+            given = "saturation", Stage.CONVERTER, (signal,), text, (L,), "the limit is reached", _Clip(k, ahead), False, starts
+            candidates.append(Effect(*given, variant=variant))
     return tuple(candidates)
 
 

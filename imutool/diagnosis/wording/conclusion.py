@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
@@ -29,6 +30,7 @@ WIDE = 40  # letters of a value in a table
 AS_BEFORE = 2e-3  # relative change of a root mean square below which it is `as before`
 CERTAIN = 1e-9  # p-value below which no number is given
 COUNTS = ("No effect", "One effect", "Two effects", "Three effects", "Four effects", "Five effects")
+TIMES = {2: " twice", 3: " three times"}  # that an effect acts, as the step of a bias
 MEASURE = "Removes: share of the squared misfit above the noise, on time that no fit has seen."
 
 
@@ -185,12 +187,14 @@ def _only_finding(d: Diagnosis) -> str:
 
 def _all_findings(d: Diagnosis) -> str:
     """Names of several findings, strongest first, and the gain of all of them."""
-    count, labels = len(d.findings), [f"{label(finding)} ({finding.signal})" for finding in d.findings]
-    shown = labels if count <= FULL + 1 else [*labels[:FULL], f"{count - FULL} smaller ones"]
+    count, labels = len(d.findings), Counter(f"{label(finding)} ({finding.signal})" for finding in d.findings)
+    shown = [f"{text}{TIMES.get(times, '')}" for text, times in labels.items()]
+    if len(shown) > FULL + 1:
+        shown = [*shown[:FULL], f"{count - sum([*labels.values()][:FULL])} smaller ones"]
     number = COUNTS[count] if count < len(COUNTS) else f"{count} effects"
     other = reference(d) if d.sim is not None or len(d.real) == 1 else "their true poses"
     text = f"{number} separate the recording{'s' if len(d.real) > 1 else ''} from {other}: "
-    text += f"{', '.join(shown[:-1])} and {shown[-1]}"
+    text += f"{', '.join(shown[:-1])}{' and ' if len(shown) > 1 else ''}{shown[-1]}"
     touched = {part for finding in d.findings for part in signals(finding.signal) if has_gain(finding)}
     gains = [
         f"{percent(closer.share)} of the misfit of {_the(signal)}"
@@ -257,7 +261,7 @@ def _regime(located: Sequence[Located], signal: str) -> str:
     if place.extent == "everywhere":
         return f" throughout{regime.removeprefix('always')}"
     if place.extent == "intermittent":
-        return " off and on"
+        return " from time to time"
     word = regime.split()[0].lower()
     starts = {
         "when",

@@ -46,6 +46,12 @@ def _delay(w: Words) -> str:
     return f"{w.it} {'comes before' if w.main.sign < 0 else 'lags'} {w.other} by {w.main.size}"
 
 
+def _actuator_delay(w: Words) -> str:
+    """A command that acts late; or an effort that is measured, and logged late."""
+    what, when = ("is logged", "acts") if w.main.sign < 0 else ("acts", "is commanded")
+    return f"the effort {what} {w.main.size} after it {when}"
+
+
 def _clock_skew(w: Words) -> str:
     """Skew t (1 + eps): eps > 0 puts more motion between two stamps than they say."""
     return f"the clock of the recording runs {'slow' if w.main.sign > 0 else 'fast'} by {w.main.size}"
@@ -89,6 +95,7 @@ CONVENTIONS = {  # gain of an axis that is off by nothing but a convention, by s
     ("accel", 1.0 / GRAVITY_M_S2): "so it is in g instead of m/s²",
     ("accel", GRAVITY_M_S2): "so the other is in g instead of m/s²",
 }
+OF_POSES = f"the {GRAVITY_M_S2:g} m/s² that poses are given"  # which know none of their own: the place on Earth has another
 OF_CONVENTION = 0.03  # of such a gain: the scale of an uncalibrated sensor
 
 
@@ -155,8 +162,8 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "gyro_misalignment": "its axes are not square: one shows on another by {w.main}",
     "accel_misalignment": "its axes are not square: one shows on another by {w.main}",
     "gyro_g_sensitivity": "{w.it} feels the specific force, with {w.main}",
-    "gyro_quadratic": "{w.it} bends with the square of the rate, by {w.main}",
-    "accel_quadratic": "{w.it} bends with the square of the specific force, by {w.main}",
+    "gyro_quadratic": "its error grows with the square of the rate, by {w.main}",
+    "accel_quadratic": "its error grows with the square of the specific force, by {w.main}",
     "gyro_bias_drift": _bias_drift,
     "accel_bias_drift": _bias_drift,
     "gyro_bias_step": _bias_step,
@@ -178,30 +185,30 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "second_order_low_pass": "{w.it} is too slow for fast motion, {w.main.labelled} (second-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",
-    "gravity": "gravity differs from that of {w.other}, {w.main.labelled}",
+    "gravity": lambda w: f"gravity differs from {OF_POSES if 'poses' in w.other else f'that of {w.other}'}, {w.main.labelled}",
     "earth_rotation": "{w.it} feels the Earth turn, {w.main.labelled}",
     "vibration": "{w.it} vibrates at {w.main}",
     "mount_resonance": _mount_resonance,
     "temperature": "{w.it} follows the temperature, with {w.main}",
     "dropped_samples": "samples are missing, {w.main.labelled}",
-    "timestamp_jitter": "samples are late by turns, {w.main.labelled}",
+    "timestamp_jitter": "its time stamps jitter, {w.main.labelled}",
     "reference_error": _reference_error,
     "reference_smoothing": "the true poses are smoothed, and slower than the body, by {w.main.labelled}",
     "wrong_unit": _wrong_unit,
-    "left_handed": "its axes are those of the other hand: {w.finding.equation}",
+    "left_handed": "its axes are left-handed: {w.finding.equation}",
     "permuted_axes": "its axes are in another order: {w.finding.equation}",
     "gain": "its gain is {w.main} of that of {w.other}",
     "offset": "{w.it} reads a constant {w.main} too much",
     "delay": _delay,
     "dead_band": "{w.it} stays still within {w.main} of rest",
-    "drift": "{w.it} drifts by {w.main}",
+    "drift": lambda w: f"{w.it} drifts {'along a smooth curve of the time' if w.finding.curve else f'by {w.main}'}",
     "friction": "{w.it} is held back by friction of {w.main}, which turns with the sign of the motion",
     "coulomb_friction": "{w.it} lacks dry friction of {w.main}",
     "viscous_friction": "{w.it} lacks friction that grows with the velocity, by {w.main}",
     "stribeck_friction": "{w.it} lacks friction near rest, {w.main.labelled}",
     "payload": "the arm carries {w.main} that the simulation does not know",
     "rotor_inertia": "the rotor has an inertia of {w.main} that the simulation lacks",
-    "actuator_delay": "the effort acts {w.main} after it is commanded",
+    "actuator_delay": _actuator_delay,
     "actuator_gain": "the actuator gives {w.main} of what is commanded",
     "actuator_dead_band": "the actuator loses the first {w.main} of a command",
     "torque_saturation": "the actuator gives no more than {w.main}",

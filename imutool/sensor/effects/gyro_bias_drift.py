@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Remembered, Stage, Theta, each_axis, residual, starts_at
+from imutool.sensor.effect import ONCE_MORE, Effect, Parameter, Remembered, Stage, Theta, each_axis, residual, starts_at
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
 TRAINING_TAU_S = 60.0
-START_TAU_S = (10.0, 30.0, 100.0)
+START_TAU_S = (3.0, 10.0, 30.0, 100.0)
 STEADY_TAU_S = 86400.0
 
 
@@ -55,7 +55,7 @@ def warm_up(sensor: Sensor, unit: str, plausible: float) -> Effect:
 
 
 def within(effects: Sequence[Effect], end_s: float) -> Iterator[Effect]:
-    """Effects in a log that ends then, with a steady drift beside each warm-up.
+    """Effects in a log that ends then, with a second and a steady drift beside each warm-up.
 
     A warm-up is fitted by what the log reaches of it. Of a time constant far beyond the log only the slope shows, A / tau: tau
     is a day there, and as unsure as its prior.
@@ -64,7 +64,9 @@ def within(effects: Sequence[Effect], end_s: float) -> Iterator[Effect]:
         if effect.reached is None:
             yield effect
         else:
-            yield from (replace(effect, reached=partial(_reached, end_s)), _steady(effect, _reached(end_s, STEADY_TAU_S)))
+            reaching = replace(effect, reached=partial(_reached, end_s))
+            second = replace(reaching, variant=ONCE_MORE[0], equation=f"{effect.equation} ({ONCE_MORE[0]})")
+            yield from (reaching, second, _steady(effect, _reached(end_s, STEADY_TAU_S)))
 
 
 def _steady(warming: Effect, share: float) -> Effect:

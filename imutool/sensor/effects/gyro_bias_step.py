@@ -7,10 +7,14 @@ the likeliest walk (`imutool.noise.bias_walk`), for as many times as there are s
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 
 from imutool.array_types import Float64
-from imutool.sensor.effect import Effect, Parameter, Stage, Theta, each_axis, residual
+from imutool.sensor.effect import ONCE_MORE, Effect, Parameter, Stage, Theta, each_axis, residual
 from imutool.sensor.samples import IdealMotion, SensorSamples
 from imutool.units import Sensor
 
@@ -25,13 +29,6 @@ def bias_step(sensor: Sensor, unit: str, plausible: float) -> Effect:
     def forward(samples: SensorSamples, theta: Theta) -> SensorSamples:
         return samples.with_added(sensor, np.outer(theta[:3], samples.stamp_s >= theta[3]).T)
 
-    def starts(motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
-        error = residual(motion, samples)[0 if sensor == "gyro" else 1]
-        ideal, t_s = motion.sample(samples.stamp_s, samples.stamp_s), samples.stamp_s
-        followed = _followed(ideal)
-        trends = (np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1) for degree in TREND_DEGREES)
-        return [_likeliest(t_s, error, np.concatenate([trend, followed], axis=1)) for trend in trends]
-
     return Effect(
         f"{sensor}_bias_step",
         Stage.SENSOR,
@@ -41,10 +38,28 @@ def bias_step(sensor: Sensor, unit: str, plausible: float) -> Effect:
         "the log goes on for some seconds before and after",
         forward,
         linear=False,
-        starts=starts,
+        starts=partial(_starts, 0 if sensor == "gyro" else 1, 0),
         alternatives=lambda samples: len(samples.stamp_s),
         of_time=True,
     )
+
+
+def repeated(effects: Sequence[Effect]) -> Iterator[Effect]:
+    """Effects with a second and third step of a bias that steps several times."""
+    for effect in effects:
+        yield effect
+        if effect.name in ("gyro_bias_step", "accel_bias_step"):
+            for before, variant in enumerate(ONCE_MORE, start=1):
+                starts = partial(_starts, 0 if effect.sensors == ("gyro",) else 1, before)
+                yield replace(effect, variant=variant, equation=f"{effect.equation} ({variant})", starts=starts)
+
+
+def _starts(sensor: int, before: int, motion: IdealMotion, samples: SensorSamples) -> list[Theta]:
+    """The likeliest step with so many likelier ones before it, beside each trend."""
+    error, t_s = residual(motion, samples)[sensor], samples.stamp_s
+    followed = _followed(motion.sample(t_s, t_s))
+    trends = (np.vander((t_s - t_s[0]) / np.ptp(t_s), degree + 1) for degree in TREND_DEGREES)
+    return [_likeliest(t_s, error, np.concatenate([trend, followed], axis=1), before) for trend in trends]
 
 
 def _followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
@@ -55,14 +70,30 @@ def _followed(ideal: SensorSamples) -> Float64[np.ndarray, "n q"]:
     )
 
 
-def _likeliest(t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"], beside: Float64[np.ndarray, "n q"]) -> Theta:
-    """The step, between two samples, that explains most of an error beside some columns, each axis by what is left there.
+def _likeliest(
+    t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"], beside: Float64[np.ndarray, "n q"], before: int
+) -> Theta:
+    """The step, between two samples, that explains most of an error beside some columns and so many likelier steps.
 
-    In least squares a further column gains (left' x)² / x' x, both less their projection on the others (Frisch and Waugh,
-    Econometrica 1933); for all columns that set in at one time these are sums from that time on.
+    Each axis counts by what is left there. In least squares a further column gains (left' x)² / x' x, both less their
+    projection on the others (Frisch and Waugh, Econometrica 1933); for all columns that set in at one time these are sums from
+    that time on.
     """
     left, singular, _ = np.linalg.svd(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300), full_matrices=False)
     basis = left[:, singular > INDEPENDENT * singular[0]]
+    size, row = _largest(t_s, error, basis)
+    for _ in range(before):
+        step = (np.arange(len(t_s)) > row).astype(np.float64)
+        step -= basis @ (basis.T @ step)
+        basis = np.column_stack([basis, step / np.linalg.norm(step)])
+        size, row = _largest(t_s, error, basis)
+    return np.append(size, (t_s[row] + t_s[row + 1]) / 2.0)
+
+
+def _largest(
+    t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"], basis: Float64[np.ndarray, "n q"]
+) -> tuple[Float64[np.ndarray, "3"], int]:
+    """Size of the step that explains most beside orthonormal columns, and the sample before it."""
     rest = error - basis @ (basis.T @ error)
     after = np.cumsum(basis[::-1], axis=0)[::-1][1:]
     own = np.arange(len(t_s) - 1, 0, -1) - (after**2).sum(axis=1)
@@ -70,7 +101,7 @@ def _likeliest(t_s: Float64[np.ndarray, " n"], error: Float64[np.ndarray, "n 3"]
     size = sums / np.maximum(own, 1.0)[:, None]
     gain = (sums * size / np.maximum((rest**2).mean(axis=0), np.finfo(np.float64).tiny)).sum(axis=1)
     row = int(np.argmax(np.where((t_s[1:] > t_s[0] + EDGE_S) & (t_s[:-1] < t_s[-1] - EDGE_S), gain, 0.0)))
-    return np.append(size[row], (t_s[row] + t_s[row + 1]) / 2.0)
+    return size[row], row
 
 
 EFFECT = bias_step("gyro", "rad/s", 0.02)

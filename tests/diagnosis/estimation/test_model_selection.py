@@ -30,7 +30,7 @@ from imutool.diagnosis.estimation.trial.walking_bias import with_bias_walk
 from imutool.diagnosis.settings import SearchSettings
 from imutool.processes.forked import Forked
 from imutool.sensor import catalogue
-from imutool.sensor.effects import clock_wander
+from imutool.sensor.effects import clock_wander, gyro_bias_drift, gyro_bias_step
 from imutool.sensor.samples import IdealMotion
 
 SURE = 4.0
@@ -149,6 +149,47 @@ def test_a_step_of_a_bias_is_found_wherever_it_lies(case: str) -> None:
     found = asked(planted.pair(planted.rich(), STEPS[case], 3), beyond=False)
     assert sorted(names(found)) == sorted(STEPS[case])
     assert all(sure(found, name, theta) for name, theta in STEPS[case].items())
+
+
+def several_times(pair: Pair) -> Selection:
+    """The catalogue, with what may act more than once."""
+    forms = gyro_bias_step.repeated([*gyro_bias_drift.within(planted.catalogue(), float(pair.stamp_s[-1]))])
+    return select_effects([planted.weighed(pair)], tuple(forms))
+
+
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+@pytest.mark.parametrize("times_s", [(17.3, 41.9), (12.1, 24.7, 44.2)])
+def test_a_bias_may_step_several_times(sensor: str, times_s: tuple[float, ...]) -> None:
+    """Two steps had no name: each alone leaves a curve that a walk explains as well."""
+    motion, steps = planted.rich(duration_s=WALK_S), 0.02 * np.array([[1.0, -0.5, 0.2], [-1.0, -0.6, 0.7], [0.5, 0.9, -1.0]])
+    steps = steps * (1.0 if sensor == "gyro" else 5.0)
+    added = np.zeros((len(motion.t_s), 6))
+    for size, t_s in zip(steps, times_s, strict=False):
+        added[:, :3] += np.outer(motion.t_s >= t_s, size)
+    found = several_times(planted.pair(motion, {}, 3, added=added if sensor == "gyro" else np.roll(added, 3, axis=1)))
+    assert {one.effect.name for one in found.selected} == {f"{sensor}_bias_step"}
+    selected = sorted(found.selected, key=lambda one: one.theta[3])
+    assert len({one.effect.equation for one in selected}) == len(times_s)  # by which a finding is told from another
+    for one, size, t_s in zip(selected, steps, times_s, strict=False):
+        assert (np.abs(one.theta - [*size, t_s]) < SURE * one.std).all()
+
+
+def test_a_bias_may_settle_with_two_time_constants() -> None:
+    """A sensor turned on: the second was a step that is none, and a curve."""
+    motion = planted.rich(duration_s=WALK_S)
+    fast, slow = (np.outer(-np.expm1(-motion.t_s / tau_s), [0.03, -0.02, 0.04]) for tau_s in (5.0, 40.0))
+    added = np.concatenate([fast - slow[:, ::-1], np.zeros_like(fast)], axis=1)
+    found = several_times(planted.pair(motion, {}, 3, added=added)).selected
+    assert [one.effect.name for one in found] == ["gyro_bias_drift"] * 2
+    assert sorted(one.theta[3] for one in found) == pytest.approx([5.0, 40.0], rel=0.15)
+
+
+@pytest.mark.parametrize(("corner_hz", "seed"), [(0.05, 2), (0.1, 5), (0.3, 7), (1.2, 3)])
+def test_a_bias_that_walks_steps_and_drifts_no_number_of_times(corner_hz: float, seed: int) -> None:
+    """Of two drifts that nearly cancel each is needed beside the other, and both together are a walk."""
+    steps = 2.0 * np.pi * corner_hz / planted.RATE_HZ * planted.noise(len(planted.clock(WALK_S)), seed + 1000)
+    walk = np.cumsum(steps, axis=0)
+    assert names(several_times(planted.pair(planted.rich(seed + 1, WALK_S), {}, seed, added=walk))) == []
 
 
 def test_an_effect_is_found_with_its_uncertainty_beside_a_bias_that_walks() -> None:

@@ -10,6 +10,7 @@ from support import planted
 
 from imutool.diagnosis.estimation import timestamps
 from imutool.diagnosis.estimation.gauss_newton import fit
+from imutool.diagnosis.estimation.model_selection import select_effects
 from imutool.diagnosis.estimation.observability import beyond_the_band
 from imutool.diagnosis.settings import SearchSettings
 
@@ -205,8 +206,19 @@ def test_a_soft_limit_is_one_that_readings_pass_by_no_more_than_noise() -> None:
     noisy = replace(one, real=one.real + planted.noise(len(one.real), 8))
     in_g = replace(one, real=there / 9.81)
     for pair, gyro_limit, is_answer in ((noisy, limit, True), (in_g, 0.3 * np.abs(in_g.real[:, :3]).max(), False)):
-        gyro, _ = timestamps.soft_limits([pair], [np.zeros(6)])
+        gyro, *_ = timestamps.soft_limits([pair], [np.zeros(6)])
         assert beyond_the_band(gyro, np.array([gyro_limit]), [planted.weighed(pair)], SearchSettings()) is not is_answer
+
+
+def test_a_limit_is_found_though_the_sensor_corrects_its_bias_behind_it() -> None:
+    """Each axis then stops elsewhere, and on both sides of zero by different readings: no limit below them was an answer."""
+    limit, bias = 2.0, np.array([0.15, -0.2, 0.1, 0.0, 0.0, 0.0])
+    one, _ = clipped_pair(limit)
+    pair = replace(one, real=one.real + bias + planted.noise(len(one.real), 8))
+    candidates = timestamps.soft_limits([pair], [np.median(pair.real - planted.ideal(planted.rich()), axis=0)])
+    (found,) = select_effects([planted.weighed(pair)], (*planted.catalogue(), *candidates)).selected
+    assert found.effect.key == "saturation:corrected gyro"
+    assert found.theta == pytest.approx([limit], abs=0.02)
 
 
 # ── nothing of it ──

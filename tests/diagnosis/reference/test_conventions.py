@@ -73,4 +73,4 @@ def test_the_conclusion_does_not_count_a_convention_among_what_the_others_remove
     said = conclusion(replace(diagnoses.ARM, findings=(axes, arm), closer=closer))
     assert "in the units and axes of the simulation the others remove" in said
     alone = conclusion(replace(diagnoses.ARM, findings=(axes,)))
-    assert "its axes are those of the other hand: recorded x, y, z = y, x, z of the simulation (left_handed)" in alone
+    assert "its axes are left-handed: recorded x, y, z = y, x, z of the simulation (left_handed)" in alone
