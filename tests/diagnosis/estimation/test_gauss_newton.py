@@ -232,7 +232,7 @@ def test_of_an_onset_which_moves_later_a_first_step_foretells_less() -> None:
 def test_a_drift_far_longer_than_its_log_is_found_by_what_the_log_reaches_of_it() -> None:
     truth = np.array([100.0, -60.0, 80.0, 1e4])  # a slope of 0.01 rad/s², so clear that the time constant has to be right
     pair = planted.pair(planted.rich(), {"gyro_bias_drift": truth.tolist()})
-    warm_up, steady = gyro_bias_drift.within(catalogue.diagnosed(["gyro_bias_drift"]), float(pair.stamp_s[-1]))
+    warm_up, _, steady = gyro_bias_drift.within(catalogue.diagnosed(["gyro_bias_drift"]), float(pair.stamp_s[-1]))
     slope = truth[:3] / truth[3]
     for effect in (warm_up, steady):
         got = fit([planted.weighed(pair)], ((effect, pair.starts(effect)[-1]),))
@@ -245,7 +245,7 @@ def test_a_drift_far_longer_than_its_log_is_found_by_what_the_log_reaches_of_it(
 
 
 def test_parameters_change_with_the_free_ones_as_their_slopes_say() -> None:
-    warm_up, _ = gyro_bias_drift.within(catalogue.diagnosed(["gyro_bias_drift"]), 40.0)
+    warm_up, *_ = gyro_bias_drift.within(catalogue.diagnosed(["gyro_bias_drift"]), 40.0)
     theta, h = np.array([0.02, -0.01, 0.03, 90.0]), 1e-6
     x = free(warm_up, theta)
     differences = np.stack(
