@@ -95,8 +95,9 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
-    if not poses and path.is_dir() and (file := columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)):
-        said = f"{file} gives no poses: no time with positions and rotations of a certain order was found in it"
+    file = (columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)) if path.is_dir() else None
+    if not poses and (file or "pose_kind" in given):
+        said = f"{file or path.name} gives no poses: no time with positions and rotations of a certain order was found in it"
         remarks.losses.append(f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)")
     if poses and not table.truth_file:
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)

@@ -350,6 +350,15 @@ def test_a_truth_that_gives_no_poses_is_a_loss(tmp_path):
     assert any("poses_gt.txt gives no poses" in loss for loss in log.remarks.losses)
 
 
+def test_a_kind_of_poses_that_are_not_found_is_a_loss(tmp_path):
+    path = tmp_path / "imu.csv"
+    path.write_text(imu_text())
+    log = table.read_sequence(table.sequences(path)[0], mapping={"pose_kind": "truth"})
+    assert log.poses == {}
+    assert any("imu.csv gives no poses" in loss and "quaternion_wxyz" in loss for loss in log.remarks.losses)
+    assert not read(path).remarks.losses
+
+
 def zipped(content: bytes, path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("inside.csv", content)
