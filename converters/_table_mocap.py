@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from imutool.array_types import Float64
+from imutool.errors import DataError
 
 from ._table_rotations import of_matrices
 from ._table_text import Columns
@@ -55,15 +56,22 @@ def read_mocap_mat(content: dict[str, Any], columns: Columns, path: Path) -> boo
     frames) column by column; of a single body without the first dimension.
 
     Raises:
-        DataError: a matrix that does not rotate.
+        DataError: a matrix that does not rotate, or arrays that are no such measurement.
     """
     measured = [value for value in content.values() if isinstance(value, dict) and {"FrameRate", "RigidBodies"} <= value.keys()]
     body = measured[0]["RigidBodies"] if measured else {}
     if not (isinstance(body, dict) and {"Name", "Positions", "Rotations"} <= body.keys()):
         return False
-    rate, frames = float(measured[0]["FrameRate"]), np.shape(body["Positions"])[-1]
     names = [str(name) for name in np.atleast_1d(body["Name"])]
-    positions, rotations = (np.reshape(body[key], (len(names), -1, frames)) for key in ("Positions", "Rotations"))
+    frames = np.atleast_1d(body["Positions"]).shape[-1]
+    try:
+        rate = float(measured[0]["FrameRate"])
+        sizes = {"Positions": 3, "Rotations": 9}
+        positions, rotations = (np.asarray(body[key], float).reshape(len(names), k, frames) for key, k in sizes.items())
+    except (TypeError, ValueError) as error:
+        raise DataError(f"its measurement of Qualisys cannot be read ({error})", where=path) from error
+    if not 0.0 < rate < np.inf:
+        raise DataError("its measurement of Qualisys has no frame rate", where=path, expected="FrameRate above 0 Hz")
     columns.add("time [s]", np.arange(frames) / rate, "s")
     columns.remarks.notes.append(f"a measurement of Qualisys at {rate:g} Hz, frames counted from 0 s, positions in mm")
     columns.is_mocap = True

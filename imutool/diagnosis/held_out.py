@@ -281,4 +281,4 @@ def _refuse_unlike(
     if log.whiten.band is not None:
         off = log.whiten.band(off)
     if (np.sqrt((off[rows] ** 2).mean(axis=0)) > AS_GOOD * noise_floor([log])).any():
-        raise DataError("a simulation along its poses gives other samples than it has", where=sim.name)
+        raise DataError("its samples do not follow from its poses", where=sim.name)

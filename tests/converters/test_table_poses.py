@@ -8,6 +8,7 @@ import lzma
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ EXPORTS = {
 }
 
 
-def write_qualisys_mat(path: Path, bodies: int) -> None:
+def write_qualisys_mat(path: Path, bodies: int, **changed: Any) -> None:
     """A measurement as Qualisys saves it: a text of its own in the header, bodies in mm, matrices column by column."""
     turned = MATRICES.transpose(2, 1, 0).reshape(9, COUNT)
     turned[:, 2], place = np.nan, np.where(np.arange(COUNT) == 2, np.nan, 1000.0 * P_M.T)  # out of sight
@@ -87,7 +88,9 @@ def write_qualisys_mat(path: Path, bodies: int) -> None:
         "Positions": np.stack([place, other[0]][:bodies]),
         "Rotations": np.stack([turned, other[1]][:bodies]),
     }
-    savemat(path, {path.stem: {"File": "walk.qtm", "Frames": float(COUNT), "FrameRate": 100.0, "RigidBodies": rigid}})
+    measured = {"File": "walk.qtm", "Frames": float(COUNT), "FrameRate": 100.0, "RigidBodies": rigid}
+    rigid |= {name: value for name, value in changed.items() if name in rigid}
+    savemat(path, {path.stem: measured | {name: value for name, value in changed.items() if name in measured}})
     saved = path.read_bytes()
     path.write_bytes(b"QTM_ver 2.10, Level 5 MAT-file".ljust(124, b"\0") + saved[124:])
 
@@ -348,6 +351,17 @@ def test_a_truth_that_gives_no_poses_is_a_loss(tmp_path):
     log = read(tmp_path)
     assert log.poses == {}
     assert any("poses_gt.txt gives no poses" in loss for loss in log.remarks.losses)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"FrameRate": 0.0}, {"FrameRate": np.nan}, {"FrameRate": "fast"}, {"Rotations": np.zeros((8, COUNT))}, {"Positions": 0.0}],
+    ids=str,
+)
+def test_a_measurement_of_qualisys_that_contradicts_itself_is_refused(tmp_path, changed):
+    write_qualisys_mat(tmp_path / "walk_7.mat", 1, **changed)
+    with pytest.raises(DataError, match="its measurement of Qualisys"):
+        table.load(tmp_path / "walk_7.mat", "mat")
 
 
 def test_a_kind_of_poses_that_are_not_found_is_a_loss(tmp_path):

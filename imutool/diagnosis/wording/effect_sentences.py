@@ -16,11 +16,12 @@ from imutool.recording import GRAVITY_M_S2
 class Words:
     """Words of a sentence: pronoun of the signal, name of the reference, quantities.
 
-    it: the pronoun; other: the reference; main: the first quantity; rest: the others.
+    it: the pronoun; other: the reference; by_poses: whether that is true poses; main: the first quantity; rest: the others.
     """
 
     it: str
     other: str
+    by_poses: bool
     main: Quantity
     rest: tuple[Quantity, ...]
     finding: Finding
@@ -185,7 +186,7 @@ SENTENCES: Mapping[str, str | Callable[[Words], str]] = {
     "second_order_low_pass": "{w.it} is too slow for fast motion, {w.main.labelled} (second-order low-pass)",
     "saturation": "{w.it} stops at its limit of {w.main}",
     "quantization": "{w.it} comes in steps of {w.main}",
-    "gravity": lambda w: f"gravity differs from {OF_POSES if 'poses' in w.other else f'that of {w.other}'}, {w.main.labelled}",
+    "gravity": lambda w: f"gravity differs from {OF_POSES if w.by_poses else f'that of {w.other}'}, {w.main.labelled}",
     "earth_rotation": "{w.it} feels the Earth turn, {w.main.labelled}",
     "vibration": "{w.it} vibrates at {w.main}",
     "mount_resonance": _mount_resonance,
@@ -245,7 +246,7 @@ def effect_sentence(d: Diagnosis, finding: Finding) -> str:
     parameters, small = distinguished(stated_parameters(finding))
     quantities = grouped(parameters)
     main = quantities[0] if quantities else Quantity("", (), ())
-    words = Words(_pronoun(finding.signal), reference(d), main, tuple(quantities[1:]), finding)
+    words = Words(_pronoun(finding.signal), reference(d), d.sim is None, main, tuple(quantities[1:]), finding)
     template = SENTENCES.get(finding.effect)
     needs_quantity = finding.curve is None if callable(template) else "{w.main" in (template or "")
     if template is None or (needs_quantity and not quantities):
