@@ -17,6 +17,8 @@ from imutool.cli.terminal import epoch_line, say, table
 from imutool.errors import ConfigError
 from imutool.report import UNSET, Report, Section, UnsetType
 
+AFTER = "after 5 s"  # drift of the attitude from the truth
+
 
 @app.command(
     cls=listing("imutool.bias", "--method"),
@@ -86,19 +88,27 @@ def left_out_table(left_out: Mapping[str, Any]) -> None:
     """Print the scores of left-out logs by log and start, and the models that were kept."""
     scores = left_out["scores"]
     models = list(dict.fromkeys(score["model"] for score in scores))
-    aoe = {(score["log"], score["start"], score["model"]): score["aoe_deg"] for score in scores}
-    raw = {score["log"]: score["aoe_deg"] for score in scores if score["model"] == "raw"}
+    logs = list(dict.fromkeys(score["log"] for score in scores))
     starts = sorted({score["start"] for score in scores if score["start"]})
+    errors = {(score["log"], score["start"], score["model"]): score["aoe_deg"] for score in scores}
+    errors |= {
+        (score["log"], start, "raw"): score["aoe_deg"] for score in scores if score["model"] == "raw" for start in starts
+    }
+    drifts = [score for score in scores if score["start"] in ("", "truth") and score["drift_deg"] is not None]
+    errors |= {(score["log"], AFTER, score["model"]): score["drift_deg"] for score in drifts}
     rows = [
-        (log, start, [aoe.get((log, start, model), raw[log] if model == "raw" else None) for model in models])
-        for start in starts
-        for log in raw
+        (log, error, [errors.get((log, error, model)) for model in models])
+        for error in (*starts, *([AFTER] if drifts else []))
+        for log in logs
     ]
-    for start in starts:
-        columns = zip(*(values for _, of, values in rows if of == start), strict=True)
-        rows.append(("mean", start, [None if None in column else sum(column) / len(column) for column in columns]))
-    cells = [(log, start, *("–" if value is None else f"{value:.2f}" for value in values)) for log, start, values in rows]
-    table([("left-out log", "start", *(f"{model}\nAOE °" for model in models)), *cells], keys=2)
+    for error in dict.fromkeys(error for _, error, _ in rows):
+        columns = zip(*(values for _, of, values in rows if of == error), strict=True)
+        rows.append(("mean", error, [None if None in column else sum(column) / len(column) for column in columns]))
+    cells = [
+        (log, error if error == AFTER else f"AOE, {error}", *("–" if value is None else f"{value:.2f}" for value in values))
+        for log, error, values in rows
+    ]
+    table([("left-out log", "error °", *models), *cells], keys=2)
     say(", ".join(f"{sensor}: {kept}" for sensor, kept in left_out["kept"].items()) + " kept, the simplest that is not beaten")
 
 

@@ -20,6 +20,7 @@ from imutool.bias.networks.temperature import temperature_tensors
 from imutool.bias.temperature import Scale
 from imutool.training.bias_spread import speed_of, store_statistics, turn_on_prior
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, effects_beyond_chance, parameter_columns
+from imutool.training.calibration.normal_equations import Solution
 from imutool.training.log_signals import effects_turned_alike
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool, without_motion
@@ -93,6 +94,16 @@ def left_out_model(
     return model
 
 
+def unknown_matrix(fit: Calibration, sensor: Sensor) -> Solution:
+    """Scale and misalignment of a constant bias: zero, and as uncertain as the logs show them.
+
+    The second moment about zero is that about the solution, and the square of the solution that the constant leaves out.
+    """
+    columns = parameter_columns(fit.forms, LINEAR[sensor])
+    theta, covariance = fit.problem.solve_by_scatter(columns)
+    return Solution(torch.zeros_like(theta[columns]), covariance + torch.outer(theta[columns], theta[columns]))
+
+
 def simpler_effects(fits: Mapping[Sensor, Calibration], kept: Mapping[Sensor, str]) -> dict[str, tuple[str, ...]]:
     """Settings of `hybrid` with the effects of the candidates kept, where they differ."""
     effects: dict[str, tuple[str, ...]] = {}
@@ -110,7 +121,7 @@ def _solved(
     network, biases = hybrid.Network(Config(remainder=False), pool.rate_hz).double(), {}
     for sensor, fit in fits.items():
         columns = parameter_columns(fit.forms, effects[sensor])
-        theta, covariance = fit.problem.solve(columns, without=without).theta, fit.problem.covariance(columns, without)
+        theta, covariance = fit.problem.solve_by_scatter(columns, without)
         network.take(sensor, effects[sensor], theta[columns], covariance)
         biases[sensor] = fit.problem.own_at(theta)[:, :3]
         if sensor == "gyro" and "accel" not in fits:

@@ -15,29 +15,28 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from imutool.array_types import Bool, Float64
 from imutool.bias import static
-from imutool.bias.model import COLUMNS, BiasModel
+from imutool.bias.model import BiasModel
 from imutool.bias.networks.network import BiasNetwork
 from imutool.bias.temperature import Scale
 from imutool.bias_start.bias_from_truth import poses_turn_alone
 from imutool.bias_start.correction import apply
 from imutool.bias_start.model_choice import bound_to, estimate_at_rest, find_initial_bias, smooth_in_memory
-from imutool.bias_start.prior_width import turned_axes
 from imutool.errors import DataError, ModelError
 from imutool.geometry import quaternion
 from imutool.inertial import metrics
 from imutool.inertial.strapdown import along_truth, drift
 from imutool.processes.forked import of_each
 from imutool.recording import Imu, Poses, Recording, nanoseconds, seconds
-from imutool.training.bias_spread import TURN_ON_STD
 from imutool.training.calibration.effect_selection import LINEAR, Calibration, parameter_columns
 from imutool.training.candidates import CANDIDATES, known, left_out_effects, left_out_model, with_statistics
+from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.log_signals import without_nuisances
 from imutool.training.settings import TrainSettings
 from imutool.training.training_windows import Pool
@@ -49,41 +48,38 @@ STARTS = ("auto", "smooth", "truth")
 LEAST_GAIN, SURELY = 0.03, 2.0  # share of the error, and standard errors, by which a candidate is better than a simpler one
 CHANCE = 0.3  # least deviation of a sum of gains over logs, in logarithms of errors, that candidates without a true effect have
 LEAST_ERROR = 1e-6  # ° or m/s
-CONTRADICTS = 0.35  # of the error without a matrix, left by a log's own: 30 s without any matrix keep 0.43 at least
-MOST_LEFT = (
-    0.02  # share of chi-square that turned axes leave; of made-up sensors that turn on 10 to 20 mrad/s apart, 1 in 5000 has it
-)
-LONG_ENOUGH_S = 40.0  # for a calibration of a log alone: shorter logs fit their noise
 LONGEST_S = 120.0  # of a log that is scored
 DRIFT_S = 5.0
 
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of a left-out log with one model and start: AOE (°), velocity after 5 s (m/s)."""
+    """Errors of a left-out log with one model and start: AOE (°), velocity (m/s) and attitude (°) after 5 s from the truth."""
 
     log: str
     model: str
     start: str
     aoe_deg: float
     drift_m_s: float | None
+    drift_deg: float | None = None
 
 
-@dataclass(frozen=True)
-class Contradiction:
-    """Log that other logs' scale and misalignment make worse: its errors over that without."""
+class Error(NamedTuple):
+    """Error by which candidates are compared: field of a score, and its start; the mean over all starts without one."""
 
-    log: str
-    sensor: Sensor
-    others: float
-    own: float
+    field: str
+    start: str = ""
 
-    def __str__(self) -> str:
-        """What a user should look at."""
-        return (
-            f"{self.log}: contradicts the other logs: their {self.sensor} scale and misalignment leave {self.others:.0%} of "
-            f"its error, its own {self.own:.0%}. Another unit or mount, or turned poses? Train a model for each unit"
-        )
+
+ERRORS: Mapping[Sensor, tuple[Error, ...]] = {
+    "gyro": (Error("aoe_deg"), *(Error("aoe_deg", start) for start in STARTS), Error("drift_deg", "truth")),
+    "accel": (Error("drift_m_s"), *(Error("drift_m_s", start) for start in STARTS)),
+}
+# Those by which a candidate replaces a simpler one. Errors of opposite signs cancel in the AOE of a log, in short windows less.
+DECISIVE = {
+    sensor: tuple(error for error in errors if not error.start or error.field == "drift_deg")
+    for sensor, errors in ERRORS.items()
+}
 
 
 @dataclass(frozen=True)
@@ -93,6 +89,11 @@ class Comparison:
     scores: tuple[Score, ...]
     kept: Mapping[Sensor, str]
     contradicting: tuple[Contradiction, ...] = ()
+
+    @property
+    def constant(self) -> set[Sensor]:
+        """Sensors for which a constant bias is enough."""
+        return {sensor for sensor, kept in self.kept.items() if kept == CANDIDATES[0]}
 
     def card(self) -> dict[str, Any]:
         """Entry of a model card."""
@@ -143,43 +144,6 @@ def compare(
     return Comparison(tuple(scores), {sensor: keep(scores, sensor) for sensor in fits}, contradictions)
 
 
-def check_axes(pool: Pool, fits: Mapping[Sensor, Calibration]) -> None:
-    """Refuse a log whose axes are turned against those of the others.
-
-    Gravity and poses contradict no such log, and scales are the same in axes turned by half a turn: its bias shows it.
-
-    Raises:
-        DataError: such a log.
-    """
-    if len(pool.names) < 2:
-        return
-    bias, std = np.zeros((len(pool.names), 6)), np.full(6, np.inf)
-    for sensor, fit in fits.items():
-        bias[:, COLUMNS[sensor]] = fit.own[:, :3].cpu().numpy()
-        std[COLUMNS[sensor]] = np.sqrt(2.0) * TURN_ON_STD[sensor]
-    for log, name in enumerate(pool.names):
-        others = np.delete(bias, log, axis=0)
-        mean = np.median(others, axis=0)
-        for what in turned_axes(bias[log] - mean, np.hypot(std, others.std(axis=0)), mean, MOST_LEFT):
-            fix = "Turn its axes, or leave it out" if len(others) > 1 else "Turn the axes of one of the two"
-            raise DataError(what, where=name, expected="the axes of the other logs", fix=fix)
-
-
-def contradicting(pool: Pool, fits: Mapping[Sensor, Calibration]) -> tuple[Contradiction, ...]:
-    """Logs of another unit or mount, or with turned poses; of two logs it could be either."""
-    found = []
-    for sensor, fit in fits.items():
-        if len(fit.problem.own) == len(pool.names) > 2:  # logs, not folds of them
-            other = [name for name in fit.effects if name not in LINEAR[sensor]]
-            every, without = (parameter_columns(fit.forms, names) for names in ((*other, *LINEAR[sensor]), other))
-            losses = [fit.problem.predicted(every, by_itself=alone) for alone in (False, True)]
-            shares = (torch.stack(losses, dim=1) / fit.problem.predicted(without)[:, None]).clamp_min(0.0).sqrt()
-            for name, (begin, end), (others, own) in zip(pool.names, pool.spans_ns, shares.tolist(), strict=True):
-                if end - begin >= nanoseconds(LONG_ENOUGH_S) and others > 1.0 and own < CONTRADICTS:
-                    found.append(Contradiction(name, sensor, others, own))
-    return tuple(found)
-
-
 def keep(scores: Sequence[Score], sensor: Sensor) -> str:
     """Simplest unbeaten candidate, of those that no simpler one beats from any start.
 
@@ -188,33 +152,33 @@ def keep(scores: Sequence[Score], sensor: Sensor) -> str:
     logs = list(dict.fromkeys(score.log for score in scores))
     present = [candidate for candidate in CANDIDATES if any(score.model == candidate for score in scores)]
     table = {
-        (model, start): _log_errors(scores, sensor, logs, model, start)
-        for model in ("static", *present)
-        for start in ("", *STARTS)
+        (model, error): _log_errors(scores, logs, model, error) for model in ("static", *present) for error in ERRORS[sensor]
     }
     sound = []
     for place, candidate in enumerate(present):
         simpler = [*(["static"] if sensor == "gyro" else []), *present[:place]]
-        if not any(beaten(table[candidate, start], table[other, start]) for other in simpler for start in ("", *STARTS)):
+        if not any(beaten(table[candidate, error], table[other, error]) for other in simpler for error in ERRORS[sensor]):
             sound.append(candidate)
     return next(
         (
             candidate
             for place, candidate in enumerate(sound)
-            if not any(beaten(table[candidate, ""], table[other, ""], SURELY) for other in sound[place + 1 :])
+            if not any(
+                beaten(table[candidate, error], table[other, error], SURELY)
+                for other in sound[place + 1 :]
+                for error in DECISIVE[sensor]
+            )
         ),
         present[0],
     )
 
 
-def _log_errors(
-    scores: Sequence[Score], sensor: Sensor, logs: Sequence[str], model: str, start: str
-) -> Float64[np.ndarray, " logs"]:
-    """Logarithm of each log's error from a start, or the mean over all starts; NaN where there is none."""
+def _log_errors(scores: Sequence[Score], logs: Sequence[str], model: str, error: Error) -> Float64[np.ndarray, " logs"]:
+    """Logarithm of an error of each log, or its mean over all starts; NaN where there is none."""
     out = []
     for log in logs:
-        some = [score for score in scores if (score.model, score.log) == (model, log) and start in ("", score.start)]
-        known = [max(value, LEAST_ERROR) for score in some if (value := _error(score, sensor)) is not None]
+        some = [score for score in scores if (score.model, score.log) == (model, log) and error.start in ("", score.start)]
+        known = [max(value, LEAST_ERROR) for score in some if (value := getattr(score, error.field)) is not None]
         out.append(float(np.mean(np.log(known))) if known else np.nan)
     return np.array(out)
 
@@ -236,14 +200,10 @@ def beaten(errors: Float64[np.ndarray, " logs"], others: Float64[np.ndarray, " l
     return len(rest) > 0 and bool(rest.mean() > max(LEAST_GAIN, surely * chance / len(rest)))
 
 
-def _error(score: Score, sensor: Sensor) -> float | None:
-    return score.aoe_deg if sensor == "gyro" else score.drift_m_s
-
-
 def _without_nuisances(log: Recording, fit: Calibration, names: Sequence[str], index: int) -> Recording:
     """Recording whose poses are turned and shifted onto the sensor, as far as a log left out shows that to some effects."""
     columns = parameter_columns(fit.forms, names)
-    return without_nuisances(log, fit.problem.own_at(fit.problem.solve(columns, without=index).theta)[index].cpu().numpy())
+    return without_nuisances(log, fit.problem.own_at(fit.problem.solve_by_scatter(columns, index).theta)[index].cpu().numpy())
 
 
 def _logs(recordings: Sequence[Recording], pool: Pool, fit: Calibration) -> Iterator[Recording]:
@@ -277,9 +237,13 @@ def _corrected(log: Recording, model: BiasModel | None, start: str) -> list[Imu]
 def _score(log: Recording, model: str, start: str, imu: Imu, alone: Bool[np.ndarray, " n"]) -> Score:
     imu = _turned_as_poses(imu, log.truth, alone[np.searchsorted(log.imu.t_ns, imu.t_ns)])
     path, truth, valid = along_truth(imu, log.truth, log.name)
-    speeds = drift(path, truth, valid, DRIFT_S).velocity_m_s
-    drift_m_s = float(np.sqrt(np.mean(speeds**2))) if len(speeds) and truth.has_positions else None
-    return Score(log.name, model, start, float(metrics.absolute(path, truth, valid)["aoe_deg"] or 0.0), drift_m_s)
+    drifted = drift(path, truth, valid, DRIFT_S)
+    drift_m_s, drift_rad = (
+        float(np.sqrt(np.mean(x**2))) if len(x) else None for x in (drifted.velocity_m_s, drifted.orientation_rad)
+    )
+    drift_deg = None if drift_rad is None else float(np.degrees(drift_rad))
+    aoe_deg = float(metrics.absolute(path, truth, valid)["aoe_deg"] or 0.0)
+    return Score(log.name, model, start, aoe_deg, drift_m_s if truth.has_positions else None, drift_deg)
 
 
 def _turned_as_poses(imu: Imu, truth: Poses, rows: Bool[np.ndarray, " n"]) -> Imu:

@@ -30,10 +30,10 @@ from imutool.recording import Recording
 from imutool.training import checkpoint
 from imutool.training.bias_spread import speed_of
 from imutool.training.calibration.effect_selection import DRIFTS, LINEAR, Calibration, PhysicsFirst, config_of
-from imutool.training.candidates import simpler_effects
+from imutool.training.candidates import simpler_effects, unknown_matrix
 from imutool.training.fit import Epoch, Training, check_device, note
 from imutool.training.left_out import LEAST_ERROR, LEAST_GAIN, SURELY, beaten, compare
-from imutool.training.log_signals import with_poses_of_sensor
+from imutool.training.log_signals import of_matrix, with_poses_of_sensor
 from imutool.training.objectives.paper_scheme import PaperTraining
 from imutool.training.settings import TrainSettings, settings_for
 from imutool.training.training_windows import Pool, check_trainable
@@ -160,13 +160,12 @@ def _physics_first(
     alone = msgspec.structs.replace(settings, model={})
     without = descent(physics.recordings, static.Model.method, alone)
     compared: dict[str, Any] = {}
-    constant: set[Sensor] = set()
+    constant, fits = set[Sensor](), physics.fits
     if settings.compare:
         descent.say(note("scoring left-out logs"))
         pool = Pool.of(recordings, floors=settings.pose_floors)
         comparison = compare(recordings, pool, physics.fits, without.model, settings, physics.scale)
-        compared["left_out"] = comparison.card()
-        constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
+        compared, constant = {"left_out": comparison.card()}, comparison.constant
         if simpler := simpler_effects(physics.fits, comparison.kept):
             named = msgspec.structs.replace(settings, model=settings.model | simpler)
             physics = PhysicsFirst.of(recordings, named, descent.device, descent.say)
@@ -183,6 +182,8 @@ def _physics_first(
     if kept.turn_on is None:
         kept.store_statistics(without.pool)
     model = physics.finish(kept.model)
+    for sensor in (sensor for sensor in constant if not fits[sensor].named):
+        model.take(sensor, LINEAR[sensor], *unknown_matrix(fits[sensor], sensor))
     about = {"held_out": _held_out(kept), **_turn_on(kept)}
     return model, about | {"compared": held_out, "physics": _described(physics.fits)} | compared
 
@@ -241,7 +242,7 @@ def _described(fits: Mapping[Sensor, Calibration]) -> dict[str, Any]:
 def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _Descent) -> tuple[BiasNetwork, dict[str, Any]]:
     """A matrix for each sensor whose matrix helps left-out logs; the card's entries."""
     compared: dict[str, Any] = {}
-    constant: set[Sensor] = set()
+    constant = set[Sensor]()
     if settings.compare:
         descent.say(note("scoring left-out logs"))
         names = {f"{sensor}_effects": LINEAR[sensor] for sensor in SENSORS}
@@ -250,9 +251,10 @@ def _linear(recordings: Sequence[Recording], settings: TrainSettings, descent: _
         without = descent(physics.recordings, static.Model.method, msgspec.structs.replace(settings, model={}))
         pool = Pool.of(recordings, floors=settings.pose_floors)
         comparison = compare(recordings, pool, physics.fits, without.model, settings)
-        compared["left_out"] = comparison.card()
-        constant = {sensor for sensor, kept in comparison.kept.items() if kept == "constant"}
+        compared, constant = {"left_out": comparison.card()}, comparison.constant
     training = descent(recordings, linear.Model.method, settings, constant)
+    for sensor in constant:
+        training.model.take_covariance(sensor, of_matrix(unknown_matrix(physics.fits[sensor], sensor).covariance))
     return training.model, {"held_out": _held_out(training), **_turn_on(training)} | compared
 
 

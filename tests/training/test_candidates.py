@@ -53,6 +53,29 @@ def test_a_candidate_is_judged_with_the_statistics_that_it_would_ship_with(tmp_p
         assert judged.max() > 3.0 * others.max()
 
 
+@pytest.mark.parametrize("method", ["linear", "hybrid"])
+def test_a_constant_is_as_uncertain_as_the_scale_that_it_leaves_out(tmp_path: Path, method: str) -> None:
+    """Logs too short to beat a constant; its covariance grows with the motion all the same."""
+    kind = Switchings(
+        sensor_seed=0, scale=5e-4, misalignment_rad=0.0, truth_noise=5e-3, rest_s=6.0, duration_s=30.0, rate_hz=50.0
+    )
+    paths = [tmp_path / f"{seed}.mcap" for seed in range(3)]
+    for seed, path in enumerate(paths):
+        write(log(seed, 0, kind), path)
+    words = ["model.remainder=false"] if method == "hybrid" else []
+    model = train(paths, tmp_path / "model.safetensors", method=method, settings=load(settings_of(method), None, words))
+    assert model.card["left_out"]["kept"]["gyro"] == "constant"
+    rates = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    t, force = np.arange(3) / kind.rate_hz, np.tile([0.0, 0.0, 9.81], (3, 1))
+    np.testing.assert_array_equal(model.stretch(np.zeros(6))(t, rates, force)[:, :3], 0.0)
+    covariance_at = model.calibration_covariance()
+    assert covariance_at is not None
+    std = np.linalg.norm(covariance_at(t, rates, force)["gyro"], axis=2)
+    np.testing.assert_array_equal(std[0], 0.0)
+    assert (std[1:] > 0.5 * kind.scale * np.abs(rates[1:]).max(axis=1, keepdims=True)).all()
+    assert (std < 0.02).all()
+
+
 def test_turns_that_the_gyro_does_not_show_count_for_no_candidate() -> None:
     """A second of a flight that is lost costs ten degrees and more, whatever the model; the rest of the path is exact."""
     perfect = TriadSettings(

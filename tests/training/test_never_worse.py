@@ -17,7 +17,8 @@ from imutool.evaluation import evaluate
 from imutool.mcap_io.write import write
 from imutool.recording import Recording
 from imutool.training.calibration.effect_selection import LINEAR, calibrate
-from imutool.training.left_out import Contradiction, Score, beaten, check_axes, contradicting, keep
+from imutool.training.left_out import Score, beaten, keep
+from imutool.training.log_agreement import Contradiction, check_axes, contradicting
 from imutool.training.run import train
 from imutool.training.settings import settings_of
 from imutool.training.training_windows import Pool
@@ -81,6 +82,18 @@ def test_a_candidate_that_is_worse_from_one_start_is_not_kept() -> None:
     assert keep(from_auto + smooth, "gyro") == "constant"
     static = [replace(score, start="smooth") for score in scores(static=[0.1] * 4, linear=better)]
     assert keep(from_auto + static, "gyro") == "constant", "static is better with smooth"
+
+
+def test_a_drift_counts_where_errors_of_a_whole_log_cancel() -> None:
+    """Three logs: a constant is better on one of them by the AOE, and worse on all of them after 5 s."""
+    aoe = {"constant": [0.8, 2.3, 2.6], "effects": [0.9, 2.3, 0.85]}
+    drift = {"constant": [1.0, 1.3, 1.8], "effects": [0.4, 0.4, 0.5]}
+    drifting = [Score(str(log), model, "truth", aoe[model][log], None, drift[model][log]) for model in aoe for log in range(3)]
+    assert keep([replace(score, drift_deg=None) for score in drifting], "gyro") == "constant"
+    assert keep(drifting, "gyro") == "effects"
+    drift["effects"] = [1.2, 1.6, 2.1]
+    worse = [replace(score, drift_deg=drift[score.model][int(score.log)], aoe_deg=0.5) for score in drifting]
+    assert keep(worse, "gyro") == "constant", "a simpler one drifts less"
 
 
 def test_a_gain_counts_beyond_its_scatter_from_log_to_log() -> None:

@@ -25,8 +25,8 @@ from imutool.inertial.strapdown import GRAVITY_W
 from imutool.inertial.windows import HUBER_MEDIANS, attitudes, huber_weight, rotation_residual, step_means, velocity_residual
 from imutool.training.calibration.log_scatter import (
     ROTATION,
-    covariance_by_scatter,
     integrated,
+    shared_by_scatter,
     shown_by_logs,
     sums_by_log,
     widest,
@@ -143,7 +143,9 @@ def solve(
         rest[:, columns] = own[:, :3]
     P = torch.linalg.inv(H)
     std = P.diagonal()[known:].reshape(own.shape)[:, :3].sqrt()
-    covariance = _matrix_covariance(sensor, map(linearised, sets), W, _apart(own, turns)) if matrix else P[:0, :0]
+    covariance = P[:0, :0]
+    if matrix:
+        W, covariance = _matrix_by_scatter(sensor, map(linearised, sets), W, _apart(own, turns))
     return Solution(W, covariance, rest[:, columns].clone(), std)
 
 
@@ -164,15 +166,16 @@ def _apart(own: Float[Tensor, "logs o"], turns: slice) -> Float[Tensor, "logs o"
     return out
 
 
-def _matrix_covariance(
+def _matrix_by_scatter(
     sensor: Sensor, sets: Iterable[_Linearised], W: Float[Tensor, "3 3"], own: Float[Tensor, "logs o"]
-) -> Float[Tensor, "9 9"]:
-    """Covariance of W, as wide as the logs scatter beside nuisances that are as wide as the logs show."""
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "9 9"]]:
+    """W and its covariance with errors as large as the logs scatter, beside nuisances that are as wide as the logs show."""
     sums = [sums_by_log(torch.cat([s.by_matrix, s.by_own], dim=2), s.e, s.weight, s.log, len(own)) for s in sets]
     H, g = (torch.stack([parts[k] for parts in sums]).sum(0) for k in (0, 1))
     theta, prior = W.flatten(), torch.full((9,), W_PRIOR**-2.0).to(W)
     own_prior = shown_by_logs(sensor, H, g, theta, own, prior)
-    return covariance_by_scatter(integrated(H, g, own, own_prior, 9), theta, prior)
+    theta, covariance = shared_by_scatter(integrated(H, g, own, own_prior, 9), theta, prior)
+    return theta.reshape(3, 3), covariance
 
 
 def nuisance_jacobian(

@@ -109,7 +109,7 @@ def calibrate(
     if names is None and len(gains) < len(effects):
         effects = tuple(effect for effect in effects if effect.name in gains)
         problem = linearise(seen, effects, part, every.own_prior)
-    theta, covariance = problem.solve(range(len(problem.theta))).theta, problem.covariance(range(len(problem.theta)))
+    theta, covariance = problem.solve_by_scatter(range(len(problem.theta)))
     own = problem.own_at(theta)
     return Calibration(
         tuple(effect.name for effect in effects),

@@ -85,26 +85,28 @@ def minus_log_likelihood(logs: Integrated, theta: Float[Tensor, " p"], prior: Fl
     return torch.where(failed == 0, found, math.inf)  # rounding alone makes S indefinite
 
 
-def covariance_by_scatter(logs: Integrated, theta: Float[Tensor, " p"], prior: Float[Tensor, " p"]) -> Float[Tensor, "p p"]:
-    """Covariance of parameters that logs share, as wide as the logs scatter (Birge's ratio).
+def shared_by_scatter(
+    logs: Integrated, theta: Float[Tensor, " p"], prior: Float[Tensor, " p"]
+) -> tuple[Float[Tensor, " p"], Float[Tensor, "p p"]]:
+    """Parameters that logs share and their covariance, with errors as large as the logs scatter (Birge's ratio).
 
     `logs` are losses about theta. Each log alone is compared with the others: posterior means of one prior differ by
     C + D - CD - DC, in units of the prior. The ratio of their squares to this is the size of a log's errors, beside
-    `USUAL_SQUARES` squares of the stated size. A log on its own has the stated size.
+    `USUAL_SQUARES` squares of the stated size. A log on its own has the stated size. Errors of parameters that are missing
+    count, too: what only a part of them shows stays near its prior.
     """
-    P, S = torch.diag(prior), logs.S.sum(0)
-    if len(logs.S) < 2 or not len(theta):
-        return torch.linalg.inv(P + S) if len(theta) else S
-    C, D = torch.linalg.inv(P + logs.S), torch.linalg.inv(P + S - logs.S)
-    step = C @ (prior * theta + logs.v)[..., None] - D @ (prior * theta + logs.v.sum(0) - logs.v)[..., None]
-    root = prior.sqrt()
-    C, D = (root[:, None] * each * root for each in (C, D))
-    variance, V = torch.linalg.eigh(C + D - C @ D - D @ C)
-    square = (V.mT @ (root[:, None] * step))[..., 0].square() / variance
-    shown, share = variance > LEAST_VARIANCE, 1.0 - 1.0 / len(logs.S)
-    size = (USUAL_SQUARES + share * float(square[shown].sum())) / (USUAL_SQUARES - 2.0 + share * int(shown.sum()))
-    covariance: Tensor = torch.linalg.inv(P + S / size)
-    return covariance
+    P, S, v, size = torch.diag(prior), logs.S.sum(0), logs.v.sum(0), 1.0
+    if len(logs.S) > 1 and len(theta):
+        C, D = torch.linalg.inv(P + logs.S), torch.linalg.inv(P + S - logs.S)
+        step = C @ (prior * theta + logs.v)[..., None] - D @ (prior * theta + v - logs.v)[..., None]
+        root = prior.sqrt()
+        C, D = (root[:, None] * each * root for each in (C, D))
+        variance, V = torch.linalg.eigh(C + D - C @ D - D @ C)
+        square = (V.mT @ (root[:, None] * step))[..., 0].square() / variance
+        shown, share = variance > LEAST_VARIANCE, 1.0 - 1.0 / len(logs.S)
+        size = (USUAL_SQUARES + share * float(square[shown].sum())) / (USUAL_SQUARES - 2.0 + share * int(shown.sum()))
+    covariance = torch.linalg.inv(P + S / size) if len(theta) else S
+    return theta - covariance @ (prior * theta + v / size), covariance
 
 
 def sums_by_log(

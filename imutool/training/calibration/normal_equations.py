@@ -26,7 +26,7 @@ from imutool.inertial.windows import HUBER_MEDIANS, Pieces, Prefix, derivative_b
 from imutool.sensor.linear_form import LinearForm, patterns, terms_of
 from imutool.sensor.signals import Signals
 from imutool.training.calibration.closed_form import end_samples, median_per_log, nuisance_jacobian, window_sets
-from imutool.training.calibration.log_scatter import covariance_by_scatter, integrated, shown_by_logs, sums_by_log, widest
+from imutool.training.calibration.log_scatter import integrated, shared_by_scatter, shown_by_logs, sums_by_log, widest
 from imutool.training.settings import SensorPrior
 from imutool.training.training_windows import Part, Pool
 from imutool.units import Sensor
@@ -100,15 +100,16 @@ class Problem:
         at[columns] -= covariance @ v
         return Solution(at, covariance)
 
-    def covariance(self, columns: Sequence[int], without: int | None = None) -> Float[Tensor, "c c"]:
-        """Covariance of a solution, as wide as the logs scatter, in place of the design effect."""
+    def solve_by_scatter(self, columns: Sequence[int], without: int | None = None) -> Solution:
+        """The same with errors as large as the logs scatter, in place of the design effect."""
         columns, logs = list(columns), [i for i in range(len(self.own)) if i != without]
         at = torch.zeros_like(self.theta)
         at[columns] = self.theta[columns]
         fit = self._of(logs, self.design_effect).fit.moved(at - self.theta)
         kept = [*columns, *range(len(self.prior), fit.g.shape[1])]
         of_logs = integrated(fit.H[:, kept][:, :, kept], fit.g[:, kept], self.own[logs], self.own_prior, len(columns))
-        return covariance_by_scatter(of_logs, at[columns], self.prior[columns])
+        at[columns], covariance = shared_by_scatter(of_logs, at[columns], self.prior[columns])
+        return Solution(at, covariance)
 
     def without(self, index: int) -> Problem:
         """The problem of all logs but one."""

@@ -134,16 +134,33 @@ def test_the_covariance_follows_the_scatter_of_the_logs(noise: float) -> None:
         found = made.solve(range(SHARED))
         error = found.theta - theta
         squares.append(float(error @ torch.linalg.solve(found.covariance, error)))
-        sizes.append(float(torch.linalg.solve(found.covariance, made.covariance(range(SHARED))).trace()))
+        sizes.append(float(torch.linalg.solve(found.covariance, made.solve_by_scatter(range(SHARED)).covariance).trace()))
     freedom = SHARED * (LOGS - 1)
     size = (freedom * noise**2 + USUAL_SQUARES) / (freedom + USUAL_SQUARES - 2.0)
     assert sum(squares) / sum(sizes) == pytest.approx(noise**2 / size, rel=0.25)
     assert sum(squares) / (DRAWS * SHARED) == pytest.approx(noise**2 / made.design_effect, rel=0.25)  # without the scatter
 
 
+def test_a_parameter_that_only_missing_effects_show_stays_near_its_prior() -> None:
+    """The losses take errors for ten times smaller than the logs scatter, and the motion hardly shows the first parameter."""
+    generator = torch.Generator().manual_seed(4)
+    weak, ratios = torch.tensor([0.1, *[1.0] * (SHARED + OWN - 1)], dtype=torch.float64), []
+    for _ in range(DRAWS):
+        normal = [torch.randn(40, SHARED + OWN + 1, generator=generator, dtype=torch.float64) for _ in range(LOGS)]
+        zero = problem(
+            [(x[:, :-1] * weak, 10.0 * x[:, -1]) for x in normal], torch.zeros(SHARED).double(), torch.zeros(LOGS, OWN).double()
+        )
+        solved = [zero.solve(range(SHARED)), zero.solve_by_scatter(range(SHARED))]
+        ratios.append([float(found.theta[0].square() / found.covariance[0, 0]) for found in solved])
+        assert solved[1].theta[0].abs() < PRIOR[0].rsqrt()
+    stated, scattered = torch.tensor(ratios).mean(0).tolist()
+    assert stated > 10.0
+    assert scattered < 1.0
+
+
 def test_a_log_on_its_own_counts_in_full(data: Data) -> None:
     made = problem(data, torch.zeros(SHARED).double(), torch.zeros(LOGS, OWN).double())
     alone = replace(made.alone(1), design_effect=2.0)
     expected = replace(alone._of([0], 2.0), design_effect=1.0).solve(range(SHARED))
-    torch.testing.assert_close(alone.covariance(range(SHARED)), expected.covariance, rtol=0, atol=ROUNDING)
-    assert made.covariance([]).shape == (0, 0)
+    torch.testing.assert_close(alone.solve_by_scatter(range(SHARED)).covariance, expected.covariance, rtol=0, atol=ROUNDING)
+    assert made.solve_by_scatter([]).covariance.shape == (0, 0)
