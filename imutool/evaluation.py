@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from imutool.bias_start.stretches import measured_imu, read_stretches
 from imutool.errors import ConfigError, DataError, ImutoolError, ModelError
 from imutool.inertial import metrics
 from imutool.inertial.aids import Aids, parse_aids
+from imutool.inertial.kinematics import trapezoidal
 from imutool.inertial.strapdown import (
     StartPose,
     along_truth,
@@ -39,7 +39,6 @@ from imutool.inertial.strapdown import (
 from imutool.log_info.aid_search import find_aids
 from imutool.log_info.convention_report import contradictions, warn_of_recordings
 from imutool.mcap_io.log import Log
-from imutool.mcap_io.storage.target import writing
 from imutool.recording import Imu, Poses, Recording, nanoseconds
 
 logger = logging.getLogger(__name__)
@@ -70,7 +69,7 @@ def evaluate(
     overwrite: bool = False,
     refused: Refused | None = None,
 ) -> list[dict[str, Any]]:
-    """One result for the raw samples and one for each model.
+    """One result for the raw samples and one for each model; without models, one for the samples that the log has debiased.
 
     A log whose clock jumps has these for each of its stretches, which are named NAME_1, NAME_2 and so on.
     Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
@@ -87,19 +86,33 @@ def evaluate(
         _refuse_twins(models)
     asked = None if aid is None else parse_aids(aid)
     results = list[dict[str, Any]]()
-    for stretch in read_stretches(log, imu=imu, truth=truth):
+    stretches = read_stretches(log, imu=imu, truth=truth)
+    in_log = [None] * len(stretches) if models else _debiased(log, stretches, truth)
+    for stretch, debiased in zip(stretches, in_log, strict=True):
         recording = replace(stretch, imu=measured_imu(stretch.imu, f"{log} {stretch.imu_topic}"))
         aids = None
         if asked is not None:
             with Log(log) as opened:
                 aids = find_aids(opened, recording, asked)
         chosen = recording.with_truth(next(iter(recording.truths))) if truth is None and recording.truths else recording
-        results += _evaluated(chosen, log, models, init, smooth, aids, trajectories, overwrite, refused)
+        results += _evaluated(chosen, debiased, log, models, init, smooth, aids, trajectories, overwrite, refused)
     return results
+
+
+def _debiased(log: Path, stretches: Sequence[Recording], truth: str | None) -> Sequence[Recording | None]:
+    """The same stretches with the samples that the log has debiased."""
+    from imutool.debiasing import SUFFIX
+
+    topic = f"{stretches[0].imu_topic}{SUFFIX}"
+    with Log(log) as opened:
+        known = topic in opened.topics
+    found = read_stretches(log, imu=topic, truth=truth) if known else []
+    return found if len(found) == len(stretches) else [None] * len(stretches)
 
 
 def _evaluated(
     recording: Recording,
+    debiased: Recording | None,
     log: Path,
     models: Sequence[str | Path],
     init: str,
@@ -117,13 +130,17 @@ def _evaluated(
         logger.warning("%s: until then its positions and velocities are not scored", recording.name)
         truth = replace(truth, p_wb=np.zeros_like(truth.p_wb), v_w=None)
     recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
-    rows, true, valid = stretch_with_truth(recording.imu.t_ns, recording.truth, recording.name)
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
-    for name, model, start in [(RAW, None, None), *started(recording, models, init, log, smooth=smooth, refused=refused)]:
+    recorded = [(RAW, recording.imu, None, None)]
+    if debiased is not None:
+        recorded += [(str(about.get("model", "debiased")), debiased.imu, None, None)]
+    found = started(recording, models, init, log, smooth=smooth, refused=refused)
+    for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
+        rows, true, valid = stretch_with_truth(imu.t_ns, recording.truth, recording.name)
         fit = judge(model, start, [model_samples(model, recording.imu)], about).beside(wrong) if model and start else None
-        found, std = _corrected(recording.imu, model, start, with_std=aids is not None)
-        corrected = found.imu
-        del found  # no array as long as the log stays when it is no longer needed
+        debiasing, std = _corrected(imu, model, start, with_std=aids is not None)
+        corrected = debiasing.imu
+        del debiasing  # no array as long as the log stays when it is no longer needed
         drifted = _drifts(corrected, (rows, true, valid), recording, model, start)
         estimates = {PURE: dead_reckon(corrected.rows(rows), StartPose.of(true))}
         if name == RAW and (gaps := gaps_crossed(estimates[PURE], GAP_S, int(recording.imu.t_ns[0]))):
@@ -148,8 +165,10 @@ def _evaluated(
                 }
             )
             if trajectories is not None:
+                if (name, kind) == (RAW, PURE):
+                    metrics.write_trajectory(true.rows(valid), trajectories, recording.name, "truth", overwrite)
                 label = name if kind == PURE else f"{name}_{kind}"
-                _write(trajectories, recording.name, label, estimate, true, valid, overwrite=overwrite)
+                metrics.write_trajectory(estimate.rows(valid), trajectories, recording.name, label, overwrite)
         del corrected, estimates, estimate
     return results
 
@@ -162,22 +181,13 @@ def _drifts(
     start: InitialBias | None,
 ) -> Figures:
     """Drift of windows that start from the truth, what the bias covariance expects, and a delay of the poses."""
-    means = _trapezoidal(corrected)
+    means = trapezoidal(corrected)
     rows, true, valid = truth
     path = dead_reckon(means.rows(rows), StartPose.of(true))
     drifted = _drift(path, true, valid, model, start, recording.imu)
     delay = metrics.pose_delay(path, true, drift_windows(path, valid, DELAY_WINDOW_S)) if model else None
     del path
     return drifted | _without_delay(delay, means, recording, drifted[DRIFTS[0]])
-
-
-def _trapezoidal(imu: Imu) -> Imu:
-    """Samples whose Euler steps are those of the trapezoidal rule of the given ones.
-
-    The Euler rule, by which the paths are integrated, lags by half a sample, as if the poses were early.
-    """
-    gyro, accel = (np.concatenate([0.5 * (u[1:] + u[:-1]), u[-1:]]) for u in (imu.gyro, imu.accel))
-    return Imu(imu.t_ns, gyro, accel)
 
 
 def _drift(path: Poses, true: Poses, valid: Mask, model: BiasModel | None, start: InitialBias | None, imu: Imu) -> Figures:
@@ -285,13 +295,3 @@ def _refuse_twins(models: Sequence[str | Path]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"two models are called {name!r}", where="trajectories", fix="Rename one of the files")
-
-
-def _write(folder: Path, log: str, model: str, estimate: Poses, true: Poses, valid: Any, *, overwrite: bool) -> None:
-    """TUM-format files: LOG_truth.tum and LOG_MODEL.tum on the same stamps, those that are scored."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    log = re.sub(r"[^\w.+-]", "_", log).lstrip(".") or "_"  # a log's name is its writer's, and must not lead elsewhere
-    if model == RAW:
-        metrics.write_tum(true.rows(valid), folder / f"{log}_truth.tum", overwrite)
-    metrics.write_tum(estimate.rows(valid), folder / f"{log}_{model}.tum", overwrite)

@@ -24,6 +24,7 @@ from imutool.bias_start.initial_bias import LEAST_STD
 from imutool.bias_start.model_choice import find_initial_bias
 from imutool.bias_start.prior_width import BiasPrior
 from imutool.conversion.run import convert
+from imutool.debiasing import debias
 from imutool.errors import ConfigError, DataError, LogError, ModelError
 from imutool.evaluation import evaluate, runs
 from imutool.geometry import quaternion
@@ -68,6 +69,19 @@ FIELDS = {  # contracts.md, JSON of evaluate
     "gyro_bias": list,
     "accel_bias": list,
 }
+
+
+def test_samples_that_a_log_has_debiased_are_scored_as_their_model(log: Path, model: Path, tmp_path: Path) -> None:
+    debias(log, tmp_path / "debiased.mcap", model=str(model))
+    raw, written = evaluate(tmp_path / "debiased.mcap", trajectories=tmp_path / "paths")
+    _, expected = evaluate(log, models=[model])
+    assert (raw["model"], written["model"]) == ("raw", expected["model"])
+    assert written["aoe_deg"] == pytest.approx(expected["aoe_deg"], rel=1e-3)
+    assert written["aoe_deg"] < raw["aoe_deg"]
+    named = {path.name.removeprefix(raw["log"]) for path in (tmp_path / "paths").iterdir()}
+    assert named == {"_truth.tum", "_raw.tum", f"_{written['model']}.tum"}
+    asked = evaluate(tmp_path / "debiased.mcap", models=["static"])
+    assert [result["model"] for result in asked] == ["raw", "static"]
 
 
 def test_a_truth_of_orientations_alone_scores_the_orientation_alone(recording: Recording, tmp_path: Path) -> None:

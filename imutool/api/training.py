@@ -108,8 +108,9 @@ def evaluate(
         overwrite: Replace existing trajectories.
 
     Returns:
-        One result for `raw` and one per model: `aoe_deg`, `ape_m`, `roe_deg`, `rpe_m`, velocity error, and others. `fit` says
-        whether the model fits the log. `drift_orientation_deg` is the error after five seconds from the truth, and
+        One result for `raw` and one per model; without models, one for the samples that the log has debiased: `aoe_deg`, `ape_m`,
+        `roe_deg`, `rpe_m`, velocity error, and others. `fit` says whether the model fits the log. `drift_orientation_deg` is the
+        error after five seconds from the truth, and
         `drift_orientation_std_deg` what the covariance of the bias expects; likewise for the velocity.
 
     Raises:

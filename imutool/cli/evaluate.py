@@ -95,7 +95,8 @@ def evaluate(
 ) -> None:
     """Integrate the IMU from the true start, raw and debiased, and compare it with the truth.
 
-    A model that does not apply to a log is named at the end, after the scores of the others.
+    Without --model the debiased samples of the log are scored, if it has them. A model that does not apply to a log is named at
+    the end, after the scores of the others.
     """
     from imutool.evaluation import evaluate as run
 

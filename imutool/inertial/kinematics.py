@@ -165,3 +165,12 @@ def continuous(q_wxyz: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]
     flips = np.where(np.sum(q_wxyz[1:] * q_wxyz[:-1], axis=1) < 0.0, -1.0, 1.0)
     signed: Float64[np.ndarray, "n 4"] = q_wxyz * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
     return signed
+
+
+def trapezoidal(imu: Imu) -> Imu:
+    """Samples whose Euler steps are those of the trapezoidal rule of the given ones.
+
+    The Euler rule, by which the paths are integrated, lags by half a sample, as if the poses were early.
+    """
+    gyro, accel = (np.concatenate([0.5 * (u[1:] + u[:-1]), u[-1:]]) for u in (imu.gyro, imu.accel))
+    return Imu(imu.t_ns, gyro, accel)

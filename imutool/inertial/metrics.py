@@ -19,6 +19,7 @@ roe_deg, rpe_m      mean rotation angle and mean length of the difference of mot
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ import numpy as np
 from imutool.array_types import Bool, Float64, Int64
 from imutool.errors import DataError, NumericsError
 from imutool.geometry import quaternion
-from imutool.mcap_io.storage.target import Target
+from imutool.mcap_io.storage.target import Target, writing
 from imutool.recording import Poses, seconds
 from imutool.recording.columns import median
 
@@ -219,6 +220,14 @@ def write_tum(poses: Poses, path: Path, overwrite: bool = False) -> None:
     text = "".join(f"{stamp} {' '.join(map(repr, row))}\n" for stamp, row in zip(stamps, columns, strict=True))
     with Target(path, overwrite=overwrite) as target:
         target.write(text.encode("ascii"))
+
+
+def write_trajectory(poses: Poses, folder: Path, log: str, name: str, overwrite: bool = False) -> None:
+    """Write FOLDER/LOG_NAME.tum, as `write_tum`, and the folder."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    safe = re.sub(r"[^\w.+-]", "_", f"{log}_{name}").lstrip(".")  # names in a log are its writer's, and must not lead elsewhere
+    write_tum(poses, folder / f"{safe}.tum", overwrite)
 
 
 def _scored(estimate: Poses, truth: Poses, valid: Mask) -> tuple[Poses, Poses]:
