@@ -108,10 +108,10 @@ def evaluate(
         overwrite: Replace existing trajectories.
 
     Returns:
-        One result for `raw` and one per model; without models, one for the samples that the log has debiased: `aoe_deg`, `ape_m`,
-        `roe_deg`, `rpe_m`, velocity error, and others. `fit` says whether the model fits the log. `drift_orientation_deg` is the
-        error after five seconds from the truth, and
-        `drift_orientation_std_deg` what the covariance of the bias expects; likewise for the velocity.
+        One result for `raw` and one per model; without models, one for the samples that the log has debiased. Each has
+        `aoe_deg`, `ape_m`, `roe_deg`, `rpe_m`, velocity error, and others. `fit` says whether the model fits the log.
+        `drift_orientation_deg` is the error after five seconds from the truth, and `drift_orientation_std_deg` what the
+        covariance of the bias expects; likewise for the velocity.
 
     Raises:
         ConfigError: Contradictory options, two models of one name, or files that exist.
