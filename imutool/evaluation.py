@@ -69,13 +69,13 @@ def evaluate(
     overwrite: bool = False,
     refused: Refused | None = None,
 ) -> list[dict[str, Any]]:
-    """One result for the raw samples and one for each model; without models, one for the samples that the log has debiased.
+    """Results of the raw samples and of each model.
 
-    A log whose clock jumps has these for each of its stretches, which are named NAME_1, NAME_2 and so on.
-    Every trajectory starts at the true pose and velocity at the first sample the truth covers, and is integrated by
-    `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. A warning counts gaps of the
-    IMU. With `smooth` each bias comes from the whole log. With `aid` a second result each is the smoothed path of the same
-    samples with those aids (`aids.parse_aids`).
+    Without models also those of the debiased samples in the log. A log whose clock jumps has these for each of its stretches,
+    which are named NAME_1, NAME_2 and so on. Every trajectory starts at the true pose and velocity at the first sample the
+    truth covers, and is integrated by `strapdown.dead_reckon`; only samples outside gaps of the truth are scored. A warning
+    counts gaps of the IMU. With `smooth` each bias comes from the whole log. With `aid` a second result each is the smoothed
+    path of the same samples with those aids (`aids.parse_aids`).
 
     Raises:
         ConfigError: `smooth` with another `init`, an unknown aid, two models of one name, files that exist, no sample measured.
@@ -132,8 +132,7 @@ def _evaluated(
     recording = replace(recording, truths={next(iter(recording.truths)): with_velocity(truth)})
     results, about = list[dict[str, Any]](), recording.metadata.get("imutool", {})
     recorded = [(RAW, recording.imu, None, None)]
-    if debiased is not None:
-        recorded += [(str(about.get("model", "debiased")), debiased.imu, None, None)]
+    recorded += [] if debiased is None else [(str(about.get("model", "debiased")), debiased.imu, None, None)]
     found = started(recording, models, init, log, smooth=smooth, refused=refused)
     for name, imu, model, start in [*recorded, *((name, recording.imu, model, start) for name, model, start in found)]:
         rows, true, valid = stretch_with_truth(imu.t_ns, recording.truth, recording.name)

@@ -54,7 +54,10 @@ DRIFT_S = 5.0
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of a left-out log with one model and start: AOE (°), velocity (m/s) and attitude (°) after 5 s from the truth."""
+    """Errors of a left-out log with one model and start.
+
+    AOE (°), and after 5 s from the truth those of the velocity (m/s) and the attitude (°).
+    """
 
     log: str
     model: str
@@ -65,7 +68,7 @@ class Score:
 
 
 class Error(NamedTuple):
-    """Error by which candidates are compared: field of a score, and its start; the mean over all starts without one."""
+    """Field and start of the scores that are compared; without a start their mean over all."""
 
     field: str
     start: str = ""

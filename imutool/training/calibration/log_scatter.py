@@ -88,7 +88,7 @@ def minus_log_likelihood(logs: Integrated, theta: Float[Tensor, " p"], prior: Fl
 def shared_by_scatter(
     logs: Integrated, theta: Float[Tensor, " p"], prior: Float[Tensor, " p"]
 ) -> tuple[Float[Tensor, " p"], Float[Tensor, "p p"]]:
-    """Parameters that logs share and their covariance, with errors as large as the logs scatter (Birge's ratio).
+    """Parameters that logs share, with their covariance, as the logs scatter (Birge's ratio).
 
     `logs` are losses about theta. Each log alone is compared with the others: posterior means of one prior differ by
     C + D - CD - DC, in units of the prior. The ratio of their squares to this is the size of a log's errors, beside
