@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
+from imutool.conversion import Failure
 from imutool.conversion.common_setup import most_alike, shared
 from imutool.conversion.correction_rounds import write_corrected
 from imutool.conversion.corrections import Corrections
@@ -55,6 +56,28 @@ class Outcome:
     losses: tuple[str, ...] = ()
     corrections: Corrections = field(default_factory=Corrections)  # in one, without stamps
     mapping: Mapping[str, str] = field(default_factory=dict)  # of a table: what its columns were taken for
+
+
+@dataclass(frozen=True)
+class ConvertReport:
+    """Written logs, in the order of the source, and failures."""
+
+    written: list[Path] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what is worth knowing about a log
+    losses: list[str] = field(default_factory=list)  # what of a source is not in its log
+
+    def add(self, target: Path, outcome: Outcome) -> None:
+        """Enter a written log and the remarks on it."""
+        self.written.append(target)
+        self.notes.extend(f"{target.name}: {note}" for note in outcome.notes)
+        self.losses.extend(f"{target.name}: {loss}" for loss in outcome.losses)
+
+    def renamed(self, temporary: str, source: str) -> ConvertReport:
+        """Report that names the source in place of the temporary folder."""
+        failures = [Failure(failure.name, failure.message.replace(temporary, source)) for failure in self.failures]
+        notes, losses = ([text.replace(temporary, source) for text in texts] for texts in (self.notes, self.losses))
+        return ConvertReport(self.written, failures, notes, losses)
 
 
 def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
