@@ -14,12 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.recording import nanoseconds
 
 WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds
 GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
 GAP_BATCHES = 1.7  # batches: samples are missing in a longer step, which ends a stretch, as one back does
+SHORT, MANY_SHORT = 0.7, 0.05  # of the median step, and the share of such steps that only late stamps leave
+SPAN = 16  # samples: over so many, stamps that jitter by a period show the period, and one of them is hardly late
+STAYS = 0.5  # of a period: by which the stamps behind a step are later at least, where a sample is lost and not late
 WRAPS = {
     f"{bits} bit of {unit}": 2**bits * ns for bits in (16, 32) for unit, ns in (("ns", 1), ("us", 1000), ("ms", 1_000_000))
 }
@@ -106,6 +109,33 @@ def batch_words(size: float) -> str:
     return f"stamps come in batches of about {size:.1f} samples: the driver's, not the sensor's"
 
 
+def usual_period(stamp_ns: Int64[np.ndarray, " n"]) -> float:
+    """Usual period of a sensor (ns); 0 for fewer than two stamps.
+
+    It is the median step. Where many steps are short, stamps are late by a good part of a period: then the median over 16
+    samples counts. Lost samples make that too long, but leave no short steps.
+    """
+    steps = np.diff(stamp_ns)
+    median = float(np.median(steps)) if len(steps) else 0.0
+    if len(steps) <= SPAN or (steps < SHORT * median).mean() < MANY_SHORT:
+        return median
+    return float(np.median(stamp_ns[SPAN:] - stamp_ns[:-SPAN])) / SPAN
+
+
+def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarray, " m"]:
+    """Whether the stamps behind each step stay late, as behind a sample that is lost and not late.
+
+    The earliest of the stamps on both sides, against a line of the period, are compared.
+    """
+    line = (stamp_ns - stamp_ns[:1]).astype(np.float64) - period_ns * np.arange(len(stamp_ns))
+    before, behind = line.copy(), line.copy()
+    for back in range(1, min(SPAN, len(line))):
+        np.minimum(before[back:], line[:-back], out=before[back:])
+        np.minimum(behind[:-back], line[back:], out=behind[:-back])
+    late: Bool[np.ndarray, " m"] = behind[1:] - before[:-1] > STAYS * period_ns
+    return late
+
+
 def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:
     """Unit of the stamps' fractions of a second in ns: not 1 where a driver wrote them in another unit.
 
@@ -134,9 +164,10 @@ def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     near = steps[(steps >= 0) & (steps < GAP_NS)]
     if not len(near):
         return whole
-    batch_ns = found.batch * float(near.mean()) if found.batch > 1.0 else float(np.median(near))
+    is_batched = found.batch > 1.0
+    batch_ns = found.batch * float(near.mean()) if is_batched else usual_period(whole)
     back = np.flatnonzero(steps < -GAP_NS) + 1
-    ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns) + 1
+    ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns if is_batched else _lost(whole, batch_ns)) + 1
     out = whole.copy()
     for first, end in pairwise([0, *np.union1d(back, ends).tolist(), len(whole)]):
         if end - first > 2:
@@ -145,6 +176,15 @@ def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         number = np.arange(end - first)
         out[first:end] = np.maximum.accumulate(out[first:end] - number) + number
     return out
+
+
+def _lost(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarray, " m"]:
+    """Steps in which samples are lost: long ones, and others from which on the stamps stay late, but at the ends."""
+    late, is_long = stay_late(stamp_ns, period_ns), np.diff(stamp_ns) > GAP_BATCHES * period_ns
+    begins = late & ~np.concatenate([late[:1], late[:-1]])
+    begins[:SPAN] = begins[-SPAN:] = False  # where few stamps show it
+    lost: Bool[np.ndarray, " m"] = begins | (late & is_long)
+    return lost
 
 
 def _line(delayed_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

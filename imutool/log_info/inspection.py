@@ -17,7 +17,7 @@ from imutool.cleaning import raw_batches
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
 from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped
+from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import rest_stretches
@@ -218,9 +218,8 @@ def _sound(t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], acce
 
 
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
-    """Number of samples that would fill the steps of at least 1.5 median periods."""
-    steps = np.diff(ordered_ns)
-    return int(missing(steps, float(np.median(steps))).sum()) if len(steps) else 0
+    """Number of samples that would fill the steps of at least 1.5 periods behind which the stamps stay late."""
+    return int(missing(ordered_ns, usual_period(ordered_ns)).sum()) if len(ordered_ns) > 1 else 0
 
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
