@@ -9,6 +9,7 @@ of windows, so that a crystal may drift. Stamps take 8 bytes a sample.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -31,6 +32,8 @@ FRACTIONS = {10: "10 ns", 100: "100 ns", 1000: "us", 10_000: "10 us", 100_000: "
 FILLED = 0.9  # of a second: how far fractions reach in their own unit
 LEAST_SECONDS, LEAST_HZ = 3, 4.0  # of a log whose fractions are judged
 EVEN = 5.0  # times: most by which the step into the next second differs from the others
+OTHER_RATE = 1.25  # of a window's rate, that of the next: no crystal drifts so far
+SIDE = 4  # blocks, of a quarter of a window
 BUNCHED = 0.3  # of the mean period: a shorter step is within a batch
 BATCHED = 0.3  # share of such steps from which on stamps come in batches
 
@@ -170,8 +173,9 @@ def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns if is_batched else _lost(whole, batch_ns)) + 1
     out = whole.copy()
     for first, end in pairwise([0, *np.union1d(back, ends).tolist(), len(whole)]):
-        if end - first > 2:
-            out[first:end] = whole[first] + np.rint(_line(whole[first:end] - whole[first])).astype(np.int64)
+        for a, b in _at_one_rate(whole[first:end], found.batch):
+            start, part = whole[first + a], slice(first + a, first + b)
+            out[part] = start + np.rint(_line(whole[part] - start)).astype(np.int64)
     for first, end in pairwise([0, *back.tolist(), len(whole)]):
         number = np.arange(end - first)
         out[first:end] = np.maximum.accumulate(out[first:end] - number) + number
@@ -185,6 +189,27 @@ def _lost(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarra
     begins[:SPAN] = begins[-SPAN:] = False  # where few stamps show it
     lost: Bool[np.ndarray, " m"] = begins | (late & is_long)
     return lost
+
+
+def _at_one_rate(stamp_ns: Int64[np.ndarray, " n"], batch: float) -> Iterator[tuple[int, int]]:
+    """Parts of a stretch in which the rate is the same; the stamps near a change of the rate are in none.
+
+    The usual rates of a window on both sides are compared: a stamp that is late for long only moves time between two blocks.
+    """
+    block, start = max(WINDOW // 4, round(8 * batch)), 0
+    bounds = stamp_ns[::block].astype(np.float64)
+    lasting = np.concatenate([np.full(SIDE, np.nan), np.diff(bounds), np.full(SIDE, np.nan)])
+    usual = (
+        np.nanmedian(np.lib.stride_tricks.sliding_window_view(lasting, SIDE)[1:-1], axis=1) if len(bounds) > 2 else bounds[:0]
+    )
+    ratio = np.abs(np.log(np.maximum(usual[SIDE:], 1.0) / np.maximum(usual[:-SIDE], 1.0)))
+    for row in np.flatnonzero(ratio > np.log(OTHER_RATE)).tolist():
+        if ratio[row] == ratio[max(row - SIDE, 0) : row + SIDE + 1].max():
+            if row * block - start > 2:
+                yield start, row * block
+            start = (row + 2) * block
+    if len(stamp_ns) - start > 2:
+        yield start, len(stamp_ns)
 
 
 def _line(delayed_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

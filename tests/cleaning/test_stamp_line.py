@@ -87,6 +87,23 @@ def test_a_logger_that_slows_down_does_not_write_in_batches() -> None:
     assert np.abs(restamped(true) - true).max() < 1000
 
 
+@pytest.mark.parametrize("late_ns", [0, 4_000_000])
+@pytest.mark.parametrize("burst", [140, 1030])
+def test_the_line_does_not_bend_where_the_rate_changes(burst: int, late_ns: int) -> None:
+    """A board sends a burst at 400 Hz before it goes on at 100 Hz, and the reader is late by a good part of a period."""
+    true = START_NS + np.cumsum(np.where(np.arange(4000) < burst, 2_500_000, 10_000_000))
+    stamps = np.maximum.accumulate(true + np.random.default_rng(8).integers(0, late_ns + 1, len(true)))
+    assert np.abs(restamped(stamps) - true).max() <= late_ns + 1000
+    assert np.quantile(np.abs(restamped(stamps) - true)[1200:], 0.99) < 0.3e6
+
+
+def test_a_stamp_that_is_late_for_long_is_no_change_of_the_rate() -> None:
+    true = sampled()
+    stamps = true.copy()
+    stamps[5000:5012] = stamps[5012]  # the reader slept
+    assert np.abs(restamped(stamps) - true).max() < 20_000
+
+
 def test_a_clock_set_back_is_no_wrap_and_a_pause_ends_the_line() -> None:
     true = sampled()
     assert not read_stamps(np.where(np.arange(12_000) < 6000, true, true - 3_000_000_000)).wraps
