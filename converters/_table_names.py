@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
-ROS_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_"  # of ROS' and PX4's messages, in SI units
+SI_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_|gyro_?rotation"  # of ROS, PX4 and CoreMotion
 TIME_WORDS = (
     rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|cts|stamp|seconds|seconds_?elapsed|sec|epoch?|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"

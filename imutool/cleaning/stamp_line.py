@@ -126,9 +126,9 @@ def usual_period(stamp_ns: Int64[np.ndarray, " n"]) -> float:
 
 
 def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarray, " m"]:
-    """Whether the stamps behind each step stay late, as behind a sample that is lost and not late.
+    """Steps behind which the stamps stay late, as behind a sample that is lost.
 
-    The earliest of the stamps on both sides, against a line of the period, are compared.
+    Behind one that is late they do not. The earliest of the stamps on both sides, against a line of the period, are compared.
     """
     line = (stamp_ns - stamp_ns[:1]).astype(np.float64) - period_ns * np.arange(len(stamp_ns))
     before, behind = line.copy(), line.copy()

@@ -419,3 +419,11 @@ def _rates(turned: Rotation, step_s: float) -> np.ndarray:
     """Angular rates of rotations in the axes of their body."""
     between = (turned[:-1].inv() * turned[1:]).as_rotvec() / step_s
     return np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
+
+
+def test_an_acquisition_of_st_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/lsm6dsv16x_gyro.dat").write_bytes(bytes(range(256)) * 20)
+    (tmp_path / "run/device_config.json").write_text('{"devices": []}')
+    with pytest.raises(DataError, match=r"an acquisition of ST's High Speed Datalog.*Export it as CSV"):
+        convert(tmp_path, tmp_path / "out")

@@ -13,6 +13,7 @@ from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
 from imutool.cleaning.stamp_line import batch_size, batch_words, bunched, stay_late, usual_period
 from imutool.recording import nanoseconds
+from imutool.recording.columns import MOST_GAP_S
 
 MISSING = "samples missing"
 MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
@@ -123,3 +124,11 @@ def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.n
     periods = steps_ns / period_ns
     is_lost = (periods >= MISSING_STEP) & (steps_ns <= PAUSE_NS) & stay_late(stamp_ns, period_ns)
     return np.where(is_lost, np.round(periods - 1.0), 0.0)
+
+
+def pause_words(stamp_ns: Int64[np.ndarray, " n"]) -> list[str]:
+    """Pauses of the recorder, in words; a longer step is a jump of the clock."""
+    steps = np.diff(stamp_ns)
+    pauses = steps[(steps > PAUSE_NS) & (steps <= nanoseconds(MOST_GAP_S))]
+    longest = f", the longest of {pauses.max() * 1e-9:.0f} s" if len(pauses) else ""
+    return [f"pauses of more than {PAUSE_NS * 1e-9:g} s: {len(pauses)}{longest}"] if longest else []
