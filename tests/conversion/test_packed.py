@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from imutool.conversion.run import ConvertReport, convert
+from imutool.conversion.run import convert
+from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write

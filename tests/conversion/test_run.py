@@ -18,7 +18,8 @@ from support.processes import below
 
 import imutool as imutool_api
 from imutool import registry
-from imutool.conversion.run import ConvertReport, convert
+from imutool.conversion.run import convert
+from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
