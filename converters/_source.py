@@ -47,7 +47,7 @@ def find(source: Path) -> list[Sequence]:
         return [Sequence(folder.parent.name, folder.parent)] if folder.name == ROOT else list(_in_folder(folder))
     if not source.exists():
         raise DataError("does not exist", where=source, expected="a folder, an archive or a bag")
-    return _in_file(source, nested=SUFFIXES)  # bags in it are found when it is unpacked
+    return _in_file(source)
 
 
 def is_bag(path: Path) -> bool:
@@ -63,7 +63,7 @@ def _in_folder(folder: Path) -> Iterator[Sequence]:
             yield Sequence(stem(path), path)
 
 
-def _in_file(path: Path, nested: tuple[str, ...] = (*SUFFIXES, BAG)) -> list[Sequence]:
+def _in_file(path: Path) -> list[Sequence]:
     name = path.name.lower()
     if name.endswith(BAG):
         return [Sequence(stem(path), path)]
@@ -72,12 +72,6 @@ def _in_file(path: Path, nested: tuple[str, ...] = (*SUFFIXES, BAG)) -> list[Seq
     members = list_members(path).sizes
     folders = (member.split("/")[:-1] for member in members)
     roots = {"/".join(parts[: parts.index(ROOT)]) for parts in folders if ROOT in parts and "__MACOSX" not in parts}
-    if not roots and (inner := sorted(m for m in members if m.lower().endswith(nested))):
-        raise DataError(
-            f"holds archives or bags, not the files of a sequence ({', '.join(inner[:3])}{', ...' if len(inner) > 3 else ''})",
-            where=path,
-            fix="Unpack it and convert the folder",
-        )
     return [Sequence(PurePosixPath(root).name or stem(path), path, root) for root in sorted(roots)]
 
 
@@ -94,7 +88,7 @@ class Tree:
             self._listing = list_members(self.path)
             cut = len(self._prefix)
             self.sizes = {m[cut:]: size for m, size in self._listing.sizes.items() if m.startswith(self._prefix)}
-            if not self.sizes and not _in_file(self.path):  # which says more where it holds other archives
+            if not self.sizes:
                 raise DataError(f"holds no {ROOT} folder", where=self.path)
 
     def __contains__(self, name: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 XSENS_TIME = r"sample_?time_?fine"  # counts 100 us
-ROS_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_"  # of ROS' and PX4's messages, in SI units
+SI_WORDS = r"angular_?velocity|linear_?acceleration|gyro_rad_|accelerometer_m_s2_|gyro_?rotation"  # of ROS, PX4 and CoreMotion
 TIME_WORDS = (
     rf"({XSENS_TIME}|times?|time_?interval|timestamps?|time_?stamps?|t|ts|cts|stamp|seconds|seconds_?elapsed|sec|epoch?|rosbagtimestamp|time_?(s|ms|us|ns|sec)"
     r"|zeit|zeitstempel|uhrzeit|date_?time|utc|[a-z]*(nanos|micros|millis)|elapsed|(gps_?)?(tow|time_?of_?week))"
@@ -15,10 +15,10 @@ UNITS = {
     "rad/s": r"rad ?/ ?s|rads|rad[ .·]?s\^?-1|rps|rad_s|radps|rad(ian)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?|rad_?sec(ond)?",
     "deg/s": r"deg ?/ ?s|dps|degs|°/s|(deg|°)[ .·]?s\^?-1|deg_s|degps|deg(ree)?s?[ _]?(per|/)[ _]?s(ec(ond)?)?|deg_?sec(ond)?",
     "mdeg/s": r"mdeg ?/ ?s|mdps|mdegs|m°/s|mdeg/sec",
-    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
+    "m/s^2": r"m/s(\^|\*\*)?2|m/\(s(ec)?\^?2\)|m/s²|mps2|ms2|mss|m[ .·]?s\^?-2|m_s_?2|m_?per_?s_?2",
     "cm/s^2": r"cm/s(\^|\*\*)?2|cm/s²",
     "ft/s^2": r"(ft|feet|foot)/s(ec)?((\^|\*\*)?2|²|/s(ec)?)|(ft|feet|foot)[ .·]?s\^?-2|fps\^?2|ft_?(per_?)?s_?2",
-    "mg": r"mg|milli[ -]?gs?",
+    "mg": r"mg|milli[ _-]?gs?",
     "g": r"g'?s?",
     "ns": r"ns|(n|nano)sec(ond)?s?",
     "us": r"us|µs|(u|micro)sec(ond)?s?",
@@ -31,7 +31,10 @@ UNITS = {
     "cm": r"cm|centimet(er|re)s?",
     "mm": r"mm|millimet(er|re)s?",
 }
-RATE_OR_FORCE_UNITS = r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|(?:m|ft)_(?:per_)?s_?2|mg"  # in a name
+RATE_OR_FORCE_UNITS = (
+    r"m?dps|(?:deg|rad)(?:_?(?:per_?)?s(?:ec(?:ond)?)?|ps)|mps2|ms2|mss|(?:m|ft)_(?:per_)?s_?2|mg|milli_?gs?"  # in a name
+)
+G_INSIDE = r"(?<=acc_)g|(?<=accel_)g|(?<=acceleration_)g"  # else `g` is a gyro
 WITHOUT_GRAVITY = r"(user|free|lin|linear)_?acc"  # where an acceleration with gravity is beside it
 ESTIMATED = r"(^|_)(est|estimated|filt|filtered|smoothed|fused|rotated|world|earth|ref|reference)(_|$)"  # no sensor
 CORE_MOTION = r"accelerometer_acceleration"  # `CMAccelerometerData.acceleration` of Apple's CoreMotion
@@ -96,7 +99,7 @@ def _triples(sensor: str, names: dict[str, str], form: str) -> dict[str, dict[st
 def name_and_unit(column: str, beside: str) -> tuple[str, str]:
     """Name and unit of a column; a unit `beside` the column counts where its name has none."""
     name, unit = split_name(column)
-    return name, unit or unit_named(beside)
+    return name, unit or unit_named(beside) or split_name(_spaced(column))[1]
 
 
 def unit_named(text: str) -> str:
@@ -113,10 +116,13 @@ def unit_with_factor(column: str, beside: str) -> tuple[float, str]:
 
 
 def spaced_name(column: str) -> str:
-    """Name of a column with underscores between its words: UncompGyro_0, xAccel, SENSgyro."""
-    return split_name(
-        re.sub(rf"((?<=[a-z]{{2}})|(?<=^[xyz]))(?=[A-Z][a-z])|(?<=[A-Z]{{2}})(?={WHOLE_WORDS})", "_", column.strip())
-    )[0]
+    """Name of a column with underscores between its words: UncompGyro_0, SENSgyro, gyroXDps."""
+    return split_name(_spaced(column))[0]
+
+
+def _spaced(column: str) -> str:
+    begins = r"((?<=[a-z]{2})|(?<=^[xyz])|(?<=[a-z][XYZ]))(?=[A-Z][a-z])"
+    return re.sub(rf"{begins}|(?<=[A-Z]{{2}})(?={WHOLE_WORDS})", "_", column.strip())
 
 
 def split_name(column: str) -> tuple[str, str]:
@@ -137,7 +143,7 @@ def split_name(column: str) -> tuple[str, str]:
     ):
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, end[1]))
         name = name[: end.start()]
-    elif not unit and (inside := re.search(rf"_({RATE_OR_FORCE_UNITS})(?=_[xyz012]$)", name)):  # gyro_rad_s[0], acc_mg_x
+    elif not unit and (inside := re.search(rf"_({RATE_OR_FORCE_UNITS}|{G_INSIDE})(?=_[xyz012]$)", name)):  # acc_mg_x
         unit = next(u for u, p in UNITS.items() if re.fullmatch(p, inside[1]))
         name = name[: inside.start()] + name[inside.end() :]
     return name, unit

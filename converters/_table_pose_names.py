@@ -41,13 +41,21 @@ NUMBERS = "012345678", "123456789"
 def has_poses(columns: Columns) -> bool:
     """Whether a table has positions and quaternions, matrices or angles, in whatever order."""
     leaves = {split_name(column)[0]: column for column in columns.values}
-    turns = (
-        axes_of(QUATERNION, leaves, "wxyz")
-        or axes_of(QUATERNION_ARRAY, leaves, "0123")
-        or matrix_of(leaves)
-        or angles_of(leaves)
-    )
-    return bool(turns and position_of(leaves))
+    return _has_turns(leaves) and bool(position_of(leaves))
+
+
+def why_no_poses(columns: Columns, group: str) -> str:
+    """Reason why a table that is named as poses gives none, and what to do."""
+    leaves = {split_name(name.removeprefix(f"{group}/"))[0]: name for name in columns.values if name.startswith(f"{group}/")}
+    if position_of(leaves) and not _has_turns(leaves):
+        return "it has positions without orientations, and imutool uses no positions alone; its columns are topics of the log"
+    said = "no time with positions and rotations of a certain order was found in it"
+    return f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)"
+
+
+def _has_turns(leaves: dict[str, str]) -> bool:
+    quaternion = axes_of(QUATERNION, leaves, "wxyz") or axes_of(QUATERNION_ARRAY, leaves, "0123")
+    return bool(quaternion or matrix_of(leaves) or angles_of(leaves))
 
 
 def bodies_of(leaves: dict[str, str]) -> list[dict[str, str]]:

@@ -17,7 +17,7 @@ from ._table_motion import doubt_gravity, unit_by_motion
 from ._table_names import (
     CORE_MOTION,
     ESTIMATED,
-    ROS_WORDS,
+    SI_WORDS,
     WITHOUT_GRAVITY,
     name_and_unit,
     spaced_name,
@@ -118,7 +118,7 @@ def _propose_stated(
         proposal.open += [sensor, f"{sensor}_unit"]
         listed = ", ".join(chosen)
         proposal.reasons.append(f"{listed} state different units: {sensor}_scale = [x, y, z] in a map brings them to one")
-    elif re.search(ROS_WORDS, names[chosen[0]][0]):
+    elif re.search(SI_WORDS, names[chosen[0]][0]):
         proposal.entries[f"{sensor}_unit"] = next(iter(units))
     else:
         _propose_unit(proposal, sensor, columns)

@@ -7,7 +7,6 @@ parts of a ROS 2 bag (`NAME_0.mcap`, `NAME_1.mcap`, ...) and no metadata.yaml is
 from __future__ import annotations
 
 import re
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -20,11 +19,11 @@ from imutool.errors import DataError
 from imutool.recording.message_log import Message, MessageLog, MessageTopic, Remarks
 
 from . import Sequence
+from ._mcap_chunks import RECORD_HEAD, in_order
 from ._source import find_files, find_folders, head, name, with_suffix
 
 GENERAL = True
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
 CRC_AT = 33  # in a Chunk record: behind opcode, length, two times and the size
 IMUS = r"sensor_msgs/msg/Imu|px4_msgs/msg/(Sensor|Vehicle).*"  # PX4 has parts of an IMU in messages of their own
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which its recorder writes last
@@ -255,40 +254,12 @@ def _messages(path: Path, images: bool) -> Iterator[Message]:
     """Messages in log-time order."""
     topics: dict[int, MessageTopic] = {}
     with _refusing(path), path.open("rb") as file:
-        for schema, channel, message in _in_order(_reader(file), file):
+        for schema, channel, message in in_order(_reader(file), file):
             topic = topics.get(channel.id)
             if topic is None:
                 topic = topics[channel.id] = _topic(schema, channel)
             if images or not re.fullmatch(IMAGES, topic.schema_name):
-                yield Message(topic, message.log_time, message.publish_time, message.data)
-
-
-def _in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Any]]:
-    """What `reader.iter_messages()` yields: chunks are sorted as they come, in place of a heap of single messages."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Chunk
-    from mcap.records import Message as Record
-    from mcap.stream_reader import breakup_chunk
-
-    summary = reader.get_summary()
-    if summary is None or not summary.chunk_indexes:
-        yield from reader.iter_messages()
-        return
-    waiting: list[tuple[int, int, int, Record]] = []
-    for start_ns, at in sorted((index.message_start_time, index.chunk_start_offset) for index in summary.chunk_indexes):
-        due = bisect_left(waiting, (start_ns, at))
-        yield from (_defined(summary, record) for *_, record in waiting[:due])
-        del waiting[:due]
-        file.seek(at + RECORD_HEAD)
-        records = breakup_chunk(Chunk.read(ReadDataStream(file)), validate_crc=True)
-        waiting += [(each.log_time, at, number, each) for number, each in enumerate(records) if isinstance(each, Record)]
-        waiting.sort()
-    yield from (_defined(summary, record) for *_, record in waiting)
-
-
-def _defined(summary: Any, record: Any) -> tuple[Any, Any, Any]:
-    channel = summary.channels[record.channel_id]
-    return summary.schemas[channel.schema_id] if channel.schema_id else None, channel, record
+                yield message._replace(topic=topic)
 
 
 def _topic(schema: Any, channel: Any) -> MessageTopic:

@@ -44,6 +44,7 @@ from ._table_map import (
 )
 from ._table_motion import settle_accel_unit
 from ._table_packed import table_name
+from ._table_pose_names import why_no_poses
 from ._table_propose import propose
 from ._table_rotations import TURNS, known_rotations, of_angles, of_matrices, unit_by_poses
 from ._table_sheets import recordings
@@ -95,10 +96,10 @@ def read_sequence(sequence: Sequence, *, images: bool = True, mapping: Path | Ma
     imus = {each.topic: _imu(columns, each, place) for each in tables}
     used = {c for each in tables for c in (each.time, each.counter, each.accel_time, *each.gyro, *each.accel)}
     poses = _truth(columns, table, path, place, remarks)
-    file = (columns.sources.get(POSES_GROUP) or columns.sources.get(TRUTH_GROUP)) if path.is_dir() else None
-    if not poses and (file or "pose_kind" in given):
-        said = f"{file or path.name} gives no poses: no time with positions and rotations of a certain order was found in it"
-        remarks.losses.append(f"{said}; a map names its columns (truth_time, position, quaternion_wxyz or another rotation)")
+    group = next((g for g in (POSES_GROUP, TRUTH_GROUP) if g in columns.sources), "") if path.is_dir() else ""
+    if not poses and (group or "pose_kind" in given):
+        file = columns.sources.get(group, path.name)
+        remarks.losses.append(f"{file} gives no poses: {why_no_poses(columns, group)}")
     if poses and not table.truth_file:
         turns = *table.quaternion_wxyz, *table.roll_pitch_yaw, *matrix_columns(table.rotation_matrix)
         used |= {table.truth_time, *table.position, *turns}

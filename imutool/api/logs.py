@@ -8,7 +8,7 @@ from typing import Any
 
 from imutool.api import NamedProgress, checked
 from imutool.conversion import run as conversion
-from imutool.conversion.run import ConvertReport
+from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError, LogError, did_you_mean
 from imutool.exporting import ExportReport, euroc, rosbag2, simulators
 from imutool.file_location import LogPath, local, location, several

@@ -9,17 +9,21 @@ of windows, so that a crystal may drift. Stamps take 8 bytes a sample.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from imutool.array_types import Float64, Int64
+from imutool.array_types import Bool, Float64, Int64
 from imutool.recording import nanoseconds
 
 WINDOW = 256  # samples, several batches of any driver; a cheap sensor's rate wanders within seconds
 GAP_NS = nanoseconds(0.5)  # no longer step says anything of the period
 GAP_BATCHES = 1.7  # batches: samples are missing in a longer step, which ends a stretch, as one back does
+SHORT, MANY_SHORT = 0.7, 0.05  # of the median step, and the share of such steps that only late stamps leave
+SPAN = 16  # samples: over so many, stamps that jitter by a period show the period, and one of them is hardly late
+STAYS = 0.5  # of a period: by which the stamps behind a step are later at least, where a sample is lost and not late
 WRAPS = {
     f"{bits} bit of {unit}": 2**bits * ns for bits in (16, 32) for unit, ns in (("ns", 1), ("us", 1000), ("ms", 1_000_000))
 }
@@ -28,6 +32,8 @@ FRACTIONS = {10: "10 ns", 100: "100 ns", 1000: "us", 10_000: "10 us", 100_000: "
 FILLED = 0.9  # of a second: how far fractions reach in their own unit
 LEAST_SECONDS, LEAST_HZ = 3, 4.0  # of a log whose fractions are judged
 EVEN = 5.0  # times: most by which the step into the next second differs from the others
+OTHER_RATE = 1.25  # of a window's rate, that of the next: no crystal drifts so far
+SIDE = 4  # blocks, of a quarter of a window
 BUNCHED = 0.3  # of the mean period: a shorter step is within a batch
 BATCHED = 0.3  # share of such steps from which on stamps come in batches
 
@@ -106,6 +112,33 @@ def batch_words(size: float) -> str:
     return f"stamps come in batches of about {size:.1f} samples: the driver's, not the sensor's"
 
 
+def usual_period(stamp_ns: Int64[np.ndarray, " n"]) -> float:
+    """Usual period of a sensor (ns); 0 for fewer than two stamps.
+
+    It is the median step. Where many steps are short, stamps are late by a good part of a period: then the median over 16
+    samples counts. Lost samples make that too long, but leave no short steps.
+    """
+    steps = np.diff(stamp_ns)
+    median = float(np.median(steps)) if len(steps) else 0.0
+    if len(steps) <= SPAN or (steps < SHORT * median).mean() < MANY_SHORT:
+        return median
+    return float(np.median(stamp_ns[SPAN:] - stamp_ns[:-SPAN])) / SPAN
+
+
+def stay_late(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarray, " m"]:
+    """Steps behind which the stamps stay late, as behind a sample that is lost.
+
+    Behind one that is late they do not. The earliest of the stamps on both sides, against a line of the period, are compared.
+    """
+    line = (stamp_ns - stamp_ns[:1]).astype(np.float64) - period_ns * np.arange(len(stamp_ns))
+    before, behind = line.copy(), line.copy()
+    for back in range(1, min(SPAN, len(line))):
+        np.minimum(before[back:], line[:-back], out=before[back:])
+        np.minimum(behind[:-back], line[back:], out=behind[:-back])
+    late: Bool[np.ndarray, " m"] = behind[1:] - before[:-1] > STAYS * period_ns
+    return late
+
+
 def _fraction_unit(stamp_ns: Int64[np.ndarray, " n"]) -> int:
     """Unit of the stamps' fractions of a second in ns: not 1 where a driver wrote them in another unit.
 
@@ -134,17 +167,49 @@ def restamped(stamp_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     near = steps[(steps >= 0) & (steps < GAP_NS)]
     if not len(near):
         return whole
-    batch_ns = found.batch * float(near.mean()) if found.batch > 1.0 else float(np.median(near))
+    is_batched = found.batch > 1.0
+    batch_ns = found.batch * float(near.mean()) if is_batched else usual_period(whole)
     back = np.flatnonzero(steps < -GAP_NS) + 1
-    ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns) + 1
+    ends = np.flatnonzero(steps > GAP_BATCHES * batch_ns if is_batched else _lost(whole, batch_ns)) + 1
     out = whole.copy()
     for first, end in pairwise([0, *np.union1d(back, ends).tolist(), len(whole)]):
-        if end - first > 2:
-            out[first:end] = whole[first] + np.rint(_line(whole[first:end] - whole[first])).astype(np.int64)
+        for a, b in _at_one_rate(whole[first:end], found.batch):
+            start, part = whole[first + a], slice(first + a, first + b)
+            out[part] = start + np.rint(_line(whole[part] - start)).astype(np.int64)
     for first, end in pairwise([0, *back.tolist(), len(whole)]):
         number = np.arange(end - first)
         out[first:end] = np.maximum.accumulate(out[first:end] - number) + number
     return out
+
+
+def _lost(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Bool[np.ndarray, " m"]:
+    """Steps in which samples are lost: long ones, and others from which on the stamps stay late, but at the ends."""
+    late, is_long = stay_late(stamp_ns, period_ns), np.diff(stamp_ns) > GAP_BATCHES * period_ns
+    begins = late & ~np.concatenate([late[:1], late[:-1]])
+    begins[:SPAN] = begins[-SPAN:] = False  # where few stamps show it
+    lost: Bool[np.ndarray, " m"] = begins | (late & is_long)
+    return lost
+
+
+def _at_one_rate(stamp_ns: Int64[np.ndarray, " n"], batch: float) -> Iterator[tuple[int, int]]:
+    """Parts of a stretch in which the rate is the same; the stamps near a change of the rate are in none.
+
+    The usual rates of a window on both sides are compared: a stamp that is late for long only moves time between two blocks.
+    """
+    block, start = max(WINDOW // 4, round(8 * batch)), 0
+    bounds = stamp_ns[::block].astype(np.float64)
+    lasting = np.concatenate([np.full(SIDE, np.nan), np.diff(bounds), np.full(SIDE, np.nan)])
+    usual = (
+        np.nanmedian(np.lib.stride_tricks.sliding_window_view(lasting, SIDE)[1:-1], axis=1) if len(bounds) > 2 else bounds[:0]
+    )
+    ratio = np.abs(np.log(np.maximum(usual[SIDE:], 1.0) / np.maximum(usual[:-SIDE], 1.0)))
+    for row in np.flatnonzero(ratio > np.log(OTHER_RATE)).tolist():
+        if ratio[row] == ratio[max(row - SIDE, 0) : row + SIDE + 1].max():
+            if row * block - start > 2:
+                yield start, row * block
+            start = (row + 2) * block
+    if len(stamp_ns) - start > 2:
+        yield start, len(stamp_ns)
 
 
 def _line(delayed_ns: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

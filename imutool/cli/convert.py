@@ -17,7 +17,7 @@ from imutool.errors import LOST, DataError
 from imutool.report import Report
 
 if TYPE_CHECKING:
-    from imutool.conversion.run import ConvertReport
+    from imutool.conversion.workers import ConvertReport
 
 LOGS = Written(files=("*.mcap",), keeps=True)  # a file, or a folder of files
 FOLDER = Written(files=("*",), keeps=True)

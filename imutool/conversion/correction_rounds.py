@@ -6,7 +6,7 @@ One error may hide another: after each round a log without images shows what the
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,11 +23,12 @@ from imutool.conversion.message_writer import write_log
 from imutool.conversion.restamping import find_stamps
 from imutool.log_info.inspection import sound_samples
 from imutool.log_info.pose_imu_rotation import Body, body_of, frames_of_copies, is_straight, turned_body
+from imutool.mcap_io.codec import schemas
 from imutool.mcap_io.codec.reflection import Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.storage.output_conflicts import refuse_existing
 from imutool.mcap_io.topics import ENCODINGS, MESSAGE_POSES
-from imutool.recording.message_log import MessageLog
+from imutool.recording.message_log import Message, MessageLog
 
 MOST_ROUNDS = 4  # quaternions first, then the clock of poses, which hides a turned body, which hides a wrong world
 AS_RECORDED = np.stack([np.eye(3)] * 2)  # axes of gyro and accel
@@ -154,7 +155,7 @@ def _with_stamps(first: Corrections, log: Path, wanted: Sequence[str]) -> Correc
 def _rounds(log: Path, wanted: Sequence[str], first: Corrections | None = None) -> tuple[list[Corrections], list[str]]:
     """Corrections of one round after the other, and what stays wrong.
 
-    After each round a log without images, in a new folder next to `log`, shows what the next has to correct.
+    After each round a log without images and numbers, in a new folder next to `log`, shows what the next has to correct.
     """
     judged, rounds, kept = log, list[Corrections](), list[str]()
     most = MOST_ROUNDS if CONVENTIONS in wanted else 1
@@ -169,7 +170,7 @@ def _rounds(log: Path, wanted: Sequence[str], first: Corrections | None = None) 
             if number + 1 == most:
                 break
             small = Path(folder) / f"{number}_{log.name}"
-            write_log(found.put_on(_content(judged, images=False)), small, compression="none")
+            write_log(found.put_on(_judged(judged)), small, compression="none")
             judged = small
     return rounds, kept
 
@@ -180,3 +181,16 @@ def _content(log: Path, *, images: bool = True) -> MessageLog:
     content: MessageLog = module.read_sequence(next(iter(module.sequences(log))), images=images)
     with Log(log) as opened:
         return replace(content, metadata=opened.metadata())
+
+
+def _judged(log: Path) -> MessageLog:
+    """Content of a log without images and single numbers, which show nothing to correct."""
+    content = _content(log, images=False)
+    with Log(log) as opened:
+        left_out = {topic.name for topic in opened.topics.values() if topic.schema_name == schemas.FLOAT}
+
+    def messages() -> Iterator[Message]:
+        return (message for message in content.messages() if message.topic.name not in left_out)
+
+    counts = {name: count for name, count in content.counts.items() if name not in left_out}
+    return replace(content, messages=messages, counts=counts)

@@ -19,7 +19,7 @@ from imutool.conversion import Failure
 from imutool.conversion.corrections import parse_corrections
 from imutool.conversion.unread_formats import nothing_found
 from imutool.conversion.user_labels import Labels, parse_kinds, parse_pair
-from imutool.conversion.workers import GROUP, Job, Outcome, Progress, run_jobs, write_content
+from imutool.conversion.workers import GROUP, ConvertReport, Job, Progress, run_jobs, write_content
 from imutool.errors import ConfigError, DataError, ImutoolError, did_you_mean
 from imutool.file_location import local
 from imutool.mcap_io.storage.local import removed_if_empty
@@ -31,34 +31,21 @@ AUTO = "auto"
 SUFFIX = ".mcap"
 
 
-@dataclass(frozen=True)
-class ConvertReport:
-    """Written logs, in the order of the source, and failures."""
-
-    written: list[Path] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)  # what is worth knowing about a log
-    losses: list[str] = field(default_factory=list)  # what of a source is not in its log
-
-    def add(self, target: Path, outcome: Outcome) -> None:
-        """Enter a written log and the remarks on it."""
-        self.written.append(target)
-        self.notes.extend(f"{target.name}: {note}" for note in outcome.notes)
-        self.losses.extend(f"{target.name}: {loss}" for loss in outcome.losses)
-
-    def renamed(self, temporary: str, source: str, note: str) -> ConvertReport:
-        """Report that names the source in place of the temporary folder, with a note."""
-        failures = [Failure(failure.name, failure.message.replace(temporary, source)) for failure in self.failures]
-        notes, losses = ([text.replace(temporary, source) for text in texts] for texts in (self.notes, self.losses))
-        return ConvertReport(self.written, failures, [note, *notes], losses)
-
-
 @dataclass
 class _Sequences:
     """Recognised sequences of a source, and the others with their errors."""
 
     jobs: list[Job] = field(default_factory=list)
     errors: list[tuple[str, ImutoolError]] = field(default_factory=list)
+    places: list[str] = field(default_factory=list)  # of both
+    empty: list[str] = field(default_factory=list)  # packed files without a sequence
+
+    def add(self, unpacked: _Sequences, packed: Any) -> None:
+        """Take in the sequences and errors of packed files."""
+        self.jobs += unpacked.jobs
+        self.errors += [*unpacked.errors, *packed.errors]
+        inside = [Path(place) for place in unpacked.places]
+        self.empty = [n for n, place in packed.places.items() if not any(path.is_relative_to(place) for path in inside)]
 
     def names(self) -> list[str]:
         return [job.sequence.name for job in self.jobs] + [name for name, _ in self.errors]
@@ -98,15 +85,22 @@ def convert(
     ways = Job("", None, Path(), compression, images, overwrite, labels, mapping, corrected)
     if format != AUTO and not hasattr(module := registry.load(GROUP, format), "sequences"):
         return _from_stream(module, source, out, sequences, ways, progress)
-    if (found := _find(source, format, Path(out))).names():
+    found = _find(source, format, Path(out))
+    if found.names() and not source.is_dir():
         return _convert_found(found, source, out, sequences, ways, workers, progress)
-    unpacked = next(module.unpacked for _, module in _converters(AUTO) if hasattr(module, "unpacked"))
-    with unpacked(source, Path(out)) as (content, root):
-        if not (root and (found := _find(content, format, Path(out))).names()):
-            raise nothing_found(content, packed=bool(root))
+    unpack = next(module.unpacked for _, module in _converters(AUTO) if hasattr(module, "unpacked"))
+    with unpack(source, Path(out), found.places) as packed:
+        if packed.root is not None:
+            found.add(_find(packed.content, format, Path(out)), packed)
+        if not found.names():
+            raise nothing_found(packed.content, packed=packed.root is not None)
         report = _convert_found(found, source, out, sequences, ways, workers, progress)
-    note = f"{source.name}: it is packed, and was unpacked into a temporary folder"
-    return report.renamed(str(root), str(source), note)
+    if packed.root is None:
+        return report
+    names = [name for name in packed.places if name not in found.empty] if source.is_dir() else [source.name]
+    report.notes[:0] = [f"{name}: it is packed, and was unpacked into a temporary folder" for name in names]
+    report.notes.extend(f"{name}: it is packed, and nothing in it shows that it is a recording" for name in found.empty)
+    return report.renamed(str(packed.root), str(source))
 
 
 def _convert_found(
@@ -174,6 +168,7 @@ def _find(source: Path, format: str, out: Path) -> _Sequences:
     return _Sequences(
         _told_apart([job for jobs in claims.values() for job in jobs], source),
         [error for place, error in errors.items() if not claims[place]],
+        [*claims, *errors],
     )
 
 

@@ -64,6 +64,7 @@ FORMATS = {  # what a file that begins like this is, and what to do
         "Export it as CSV with SensorConnect, and convert that",
     ),
 }
+ST_DATALOG = {"device_config.json", "deviceconfig.json"}
 WITHOUT_NUMBERS = (
     "it is text without a row of four numbers, which are the least of a table: a time and a vector",
     "See whether the recorder wrote any rows, and how it separates their fields: by comma, semicolon, tab or blanks",
@@ -95,7 +96,10 @@ def describe_unread(start: bytes) -> tuple[str, str]:
 
 def describe_folder(folder: Path) -> tuple[str, str]:
     """What a folder is in which no recording was found, and what to do."""
-    if any(files for _, _, files in os.walk(folder)):
+    names = {name.lower() for _, _, files in os.walk(folder) for name in files}
+    if names & ST_DATALOG and any(name.endswith(".dat") for name in names):
+        return "it is an acquisition of ST's High Speed Datalog", "Export it as CSV with ST's stdatalog, and convert that"
+    if names:
         return (
             "",
             "Name the file, or a folder nearer to it: four levels are searched, and tables that show no IMU are left out",

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from imutool import registry
+from imutool.conversion import Failure
 from imutool.conversion.common_setup import most_alike, shared
 from imutool.conversion.correction_rounds import write_corrected
 from imutool.conversion.corrections import Corrections
@@ -26,6 +27,8 @@ from imutool.recording.message_log import MessageLog
 GROUP = "imutool.converters"
 MAP = "imutool/map"  # record of what a table's columns were taken for
 SAME_COLUMNS = "its columns and units are taken for those of the other tables, which show them"
+ORDER = "quaternion_wxyz"  # entry of that record
+SAME_ORDER = "the order of its quaternions is that which most of the other tables show, as one program wrote them"
 Progress = Callable[[int, int, str], None]  # sequences done, sequences in all, the name of the one that just ended
 
 
@@ -57,6 +60,28 @@ class Outcome:
     mapping: Mapping[str, str] = field(default_factory=dict)  # of a table: what its columns were taken for
 
 
+@dataclass(frozen=True)
+class ConvertReport:
+    """Written logs, in the order of the source, and failures."""
+
+    written: list[Path] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # what is worth knowing about a log
+    losses: list[str] = field(default_factory=list)  # what of a source is not in its log
+
+    def add(self, target: Path, outcome: Outcome) -> None:
+        """Enter a written log and the remarks on it."""
+        self.written.append(target)
+        self.notes.extend(f"{target.name}: {note}" for note in outcome.notes)
+        self.losses.extend(f"{target.name}: {loss}" for loss in outcome.losses)
+
+    def renamed(self, temporary: str, source: str) -> ConvertReport:
+        """Report that names the source in place of the temporary folder."""
+        failures = [Failure(failure.name, failure.message.replace(temporary, source)) for failure in self.failures]
+        notes, losses = ([text.replace(temporary, source) for text in texts] for texts in (self.notes, self.losses))
+        return ConvertReport(self.written, failures, notes, losses)
+
+
 def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | None) -> dict[int, Outcome]:
     """Outcomes of jobs by their numbers.
 
@@ -64,7 +89,7 @@ def run_jobs(jobs: Sequence[Job], of: int, workers: int, progress: Progress | No
     setup is converted once more, with that.
     """
     jobs, outcomes = [*jobs], dict(_run(jobs, of, workers, progress))
-    for with_common in (_with_common_map, _with_common_corrections):
+    for with_common in (_with_common_map, _with_common_order, _with_common_corrections):
         again = with_common(jobs, outcomes)
         numbers = [*again]
         for place, outcome in _run([*again.values()], len(again), workers, progress):
@@ -80,6 +105,23 @@ def _with_common_map(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> di
         return {}
     asking = [n for n, outcome in outcomes.items() if isinstance(outcome.error, ConfigError) and jobs[n].mapping is None]
     return {n: replace(jobs[n], mapping=common, said=SAME_COLUMNS) for n in asking}
+
+
+def _with_common_order(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> dict[int, Job]:
+    """Jobs whose tables give quaternions in another order than most of the other tables with such columns."""
+    alike: dict[frozenset[str], dict[int, str]] = {}
+    for number, outcome in outcomes.items():
+        if order := outcome.mapping.get(ORDER, ""):
+            alike.setdefault(frozenset(column.lstrip("-") for column in order.split(", ")), {})[number] = order
+    others = {
+        number: common
+        for orders in alike.values()
+        if (common := most_alike([*orders.values()])) is not None
+        for number, order in orders.items()
+        if order != common
+    }
+    maps = {number: {**outcomes[number].mapping, ORDER: order} for number, order in others.items()}
+    return {n: replace(jobs[n], mapping=mapping, said=SAME_ORDER, overwrite=True) for n, mapping in maps.items()}
 
 
 def _with_common_corrections(jobs: Sequence[Job], outcomes: Mapping[int, Outcome]) -> dict[int, Job]:

@@ -16,8 +16,8 @@ from imutool.array_types import Bool, Float64, Int64
 from imutool.cleaning import raw_batches
 from imutool.cleaning.rule import TopicSummary
 from imutool.cleaning.rules import not_finite, saturation
-from imutool.cleaning.rules.gaps import missing
-from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped
+from imutool.cleaning.rules.gaps import PAUSE_NS, missing, pause_words
+from imutool.cleaning.stamp_line import Stamps, distinct, read_stamps, restamped, usual_period
 from imutool.cleaning.truth import Truth, read_truth
 from imutool.file_location import Location, log_name
 from imutool.inertial.stationary import rest_stretches
@@ -39,8 +39,8 @@ from imutool.mcap_io.codec.reflection import LOG_TIME, Reflected
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
-from imutool.recording import LEAST_PERIOD_S, Imu, nanoseconds
-from imutool.recording.columns import MOST_GAP_S, clock_jumps, jump_warnings
+from imutool.recording import LEAST_PERIOD_S, Imu
+from imutool.recording.columns import clock_jumps, jump_warnings
 from imutool.report import UNSET
 
 UNUSUAL = 0.5  # share by which a period may differ from the median, to count for the rate
@@ -126,7 +126,7 @@ def _topic(topic: Topic, log_times: Int64[np.ndarray, " n"]) -> TopicInfo:
 def _clock(t_ns: Int64[np.ndarray, " n"]) -> Clock:
     """Rate, jitter, largest gap and ends of the sorted times."""
     periods = np.diff(ordered := np.sort(t_ns))
-    steady = periods[periods < nanoseconds(MOST_GAP_S)]  # that a clock is set is no jitter
+    steady = periods[periods <= PAUSE_NS]  # that nobody recorded is no jitter
     known = len(periods) > 0
     median = float(np.median(periods)) if known else 0.0
     usual = periods[np.abs(periods - median) <= UNUSUAL * median]  # the median itself is coarse where times are whole ms
@@ -218,9 +218,8 @@ def _sound(t_ns: Int64[np.ndarray, " n"], gyro: Float64[np.ndarray, "n 3"], acce
 
 
 def _missing(ordered_ns: Int64[np.ndarray, " n"]) -> int:
-    """Number of samples that would fill the steps of at least 1.5 median periods."""
-    steps = np.diff(ordered_ns)
-    return int(missing(steps, float(np.median(steps))).sum()) if len(steps) else 0
+    """Number of samples that would fill the steps of at least 1.5 periods behind which the stamps stay late."""
+    return int(missing(ordered_ns, usual_period(ordered_ns)).sum()) if len(ordered_ns) > 1 else 0
 
 
 def _saturated(values: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -282,7 +281,7 @@ def _imu_warnings(
     }
     warnings = [f"{n} sample{'s' * (n != 1)} {text}" for key, text in words.items() if (n := counts[key])]
     warnings += [f"{text}; imutool convert LOG OUT --restamp corrects it" for text in stamps.faults]
-    warnings += jump_warnings(jumps)
+    warnings += [*pause_words(imu.t_ns), *jump_warnings(jumps)]
     if len(imu) > 1 and imu.period_s < LEAST_PERIOD_S and not stamps.faults:
         warnings.append(f"{1.0 / imu.period_s:.3g} samples a second: the stamps are not in nanoseconds, or were never set")
     return [*warnings, *constant_sensors(imu), *convention_warnings(whole)] if len(imu) else [*warnings, "no samples"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imutool.cleaning.stamp_line import GAP_NS, read_stamps, restamped
+from imutool.cleaning.rules.gaps import missing
+from imutool.cleaning.stamp_line import GAP_NS, read_stamps, restamped, usual_period
 
 PERIOD_NS = 5_000_321
 START_NS = 1_700_000_000_000_000_000
@@ -54,11 +55,53 @@ def test_stamps_one_by_one_are_no_batches(jitter_ns: int) -> None:
     assert read_stamps(stamps).faults == []
 
 
+LOST = 1000, 2500, 2501, 7000  # samples that a driver lost, two of them in a row
+
+
+@pytest.mark.parametrize("late_ns", [0, 1_000_000, 4_500_000])
+@pytest.mark.parametrize("lost", [(), LOST])
+def test_stamps_that_are_late_by_up_to_a_period_are_led_back_and_lost_samples_stay_lost(late_ns: int, lost: tuple) -> None:
+    true = np.delete(sampled(), lost)
+    late = true + np.random.default_rng(5).integers(0, late_ns + 1, len(true))
+    stamps = np.maximum.accumulate(late)  # read in turn
+    assert usual_period(stamps) == pytest.approx(PERIOD_NS, rel=0.01)
+    off = np.abs(restamped(stamps) - true)
+    assert np.quantile(off, 0.999) < (0.6e6 if late_ns else 1000)
+    assert off.max() <= late_ns + 6000  # beside a lost sample that late stamps hide
+    count = missing(stamps, usual_period(stamps)).sum()
+    assert len(lost) <= count <= (2 * len(lost) if late_ns > 1_000_000 else len(lost))  # late ones beside a lost one count
+
+
+def test_many_lost_samples_are_counted_though_they_make_long_steps() -> None:
+    kept = np.random.default_rng(6).random(12_000) > 0.1
+    kept[[0, -1]] = True
+    stamps = sampled()[kept]
+    assert usual_period(stamps) == pytest.approx(PERIOD_NS, rel=1e-3)
+    assert missing(stamps, usual_period(stamps)).sum() == 12_000 - kept.sum()
+
+
 def test_a_logger_that_slows_down_does_not_write_in_batches() -> None:
     """A rocket's computer logs at 100 Hz until the apogee and at 10 Hz on its parachute."""
     true = START_NS + np.cumsum(np.where(np.arange(1700) < 1200, 10_000_000, 100_000_000))
     assert read_stamps(true).faults == []
     assert np.abs(restamped(true) - true).max() < 1000
+
+
+@pytest.mark.parametrize("late_ns", [0, 4_000_000])
+@pytest.mark.parametrize("burst", [140, 1030])
+def test_the_line_does_not_bend_where_the_rate_changes(burst: int, late_ns: int) -> None:
+    """A board sends a burst at 400 Hz before it goes on at 100 Hz, and the reader is late by a good part of a period."""
+    true = START_NS + np.cumsum(np.where(np.arange(4000) < burst, 2_500_000, 10_000_000))
+    stamps = np.maximum.accumulate(true + np.random.default_rng(8).integers(0, late_ns + 1, len(true)))
+    assert np.abs(restamped(stamps) - true).max() <= late_ns + 1000
+    assert np.quantile(np.abs(restamped(stamps) - true)[1200:], 0.99) < 0.3e6
+
+
+def test_a_stamp_that_is_late_for_long_is_no_change_of_the_rate() -> None:
+    true = sampled()
+    stamps = true.copy()
+    stamps[5000:5012] = stamps[5012]  # the reader slept
+    assert np.abs(restamped(stamps) - true).max() < 20_000
 
 
 def test_a_clock_set_back_is_no_wrap_and_a_pause_ends_the_line() -> None:

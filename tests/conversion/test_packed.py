@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from imutool.conversion.run import ConvertReport, convert
+from imutool.conversion.run import convert
+from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.read import read
 from imutool.mcap_io.write import write
@@ -114,6 +115,41 @@ def test_an_archive_of_several_recordings_becomes_a_log_for_each(log: Path) -> N
         convert(source, log.parents[1] / "out/b.mcap")
     report = converted(source, log.parents[1] / "out/logs")
     assert sorted(path.name for path in report.written) == ["a.mcap", "b.mcap"]
+
+
+def test_packed_files_in_a_folder_and_in_each_other_become_logs_beside_the_others(log: Path) -> None:
+    """The table is read where it is; the archive of an archive, the packed log and the damaged one are unpacked."""
+    raw, folder, out = log.read_bytes(), log.parent, log.parents[1] / "out"
+    log.unlink()
+    rows = "\n".join(f"{n / 100},0.1,{n % 7 / 10},0.3,0.1,0.2,9.8" for n in range(200))
+    table = f"time [s],gyr_x [rad/s],gyr_y [rad/s],gyr_z [rad/s],acc_x [m/s^2],acc_y [m/s^2],acc_z [m/s^2]\n{rows}".encode()
+    (folder / "a").mkdir()
+    (folder / "a/run.csv.gz").write_bytes(gzip.compress(table))
+    inner = zipped(folder / "inner.zip", {"ride/imu.csv": table}).read_bytes()
+    (folder / "inner.zip").unlink()
+    tarred(folder / "day.tar.gz", {"more/inner.zip": inner})
+    zipped(folder / "notes.zip", {"readme.md": b"no recording"})
+    (folder / "flight.mcap.zst").write_bytes(zstandard.compress(raw))
+    (folder / "cut.mcap.zst").write_bytes(zstandard.compress(raw)[:-100])
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    report = convert(folder, out, workers=1)
+    assert sorted(path.name for path in report.written) == ["a.mcap", "ride.mcap"]  # `flight` is a log of imutool itself
+    assert [(failure.name, "cut off" in failure.message) for failure in report.failures] == [("cut.mcap.zst", True)]
+    assert "day.tar.gz: it is packed, and was unpacked into a temporary folder" in report.notes
+    assert "notes.zip: it is packed, and nothing in it shows that it is a recording" in report.notes
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert left(out) == ["a.mcap", "ride.mcap"]
+
+
+def test_a_folder_of_packed_logs_alone_becomes_a_log_for_each(log: Path) -> None:
+    raw, folder = log.read_bytes(), log.parent
+    log.unlink()
+    for number in (1, 2):
+        (folder / f"day{number}").mkdir()
+        (folder / f"day{number}/walk.mcap.gz").write_bytes(gzip.compress(raw))
+    report = convert(folder, log.parents[1] / "out", workers=1)
+    assert sorted(path.name for path in report.written) == ["day1_walk.mcap", "day2_walk.mcap"]
+    assert read(report.written[0]).imu.gyro.shape == (500, 3)
 
 
 def test_a_log_is_not_written_over_its_packed_source(log: Path) -> None:

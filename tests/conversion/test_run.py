@@ -11,13 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support import pool_functions
 from support.loaded import loaded
 from support.processes import below
 
 import imutool as imutool_api
 from imutool import registry
-from imutool.conversion.run import ConvertReport, convert
+from imutool.conversion.run import convert
+from imutool.conversion.workers import ConvertReport
 from imutool.errors import ConfigError, DataError
 from imutool.mcap_io.log import Log
 from imutool.mcap_io.read import read
@@ -387,3 +389,42 @@ def test_what_holds_for_several_logs_is_said_once(tmp_path, imutool):
     assert told.returncode == 0, told.stderr
     assert told.stderr.count("gravity in m/s^2") == 1
     assert "walk_1.mcap and 2 others: the median acceleration is 9.8: gravity in m/s^2" in " ".join(told.stderr.split())
+
+
+def test_tables_of_one_program_hold_quaternions_in_one_order(tmp_path: Path) -> None:
+    """Motion about one axis fits both orders, and what the other tables show counts for it, too."""
+    t = np.arange(1500) * 0.01
+    swings = {
+        "a": np.stack([np.sin(t), 0.7 * np.cos(1.3 * t), np.sin(0.6 * t)], axis=1),
+        "b": np.stack([0.5 * np.cos(t), np.sin(0.8 * t), 0.9 * np.sin(1.1 * t)], axis=1),
+        "flat": np.outer(np.sin(t), [0.0, 0.0, 1.0]),
+    }
+    header = ["time [s]", *(f"gyr_{a} [rad/s]" for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz"), *(f"p{a}" for a in "xyz")]
+    for name, angles in swings.items():
+        turned = Rotation.from_euler("zyx", angles[:, ::-1])
+        gyro = np.gradient(turned.as_rotvec(), t, axis=0) if name == "flat" else _rates(turned, 0.01)
+        accel = turned.inv().apply([0.0, 0.0, 9.81])
+        rows = np.hstack([t[:, None], gyro, accel, np.zeros((len(t), 3)), turned.as_quat()])
+        (tmp_path / "in").mkdir(exist_ok=True)
+        names = ",".join([*header, *(f"robot_quat_{n}" for n in range(4))])
+        np.savetxt(tmp_path / f"in/{name}.csv", rows, "%.9f", ",", header=names, comments="")
+    report = convert(tmp_path / "in", tmp_path / "out", workers=1)
+    assert [note.partition(":")[0] for note in report.notes if "as one program wrote them" in note] == ["flat.mcap"]
+    for log in report.written:
+        with Log(log) as opened:
+            mapped = opened.metadata()["imutool/map"]
+        assert mapped["quaternion_wxyz"] == "robot_quat_3, robot_quat_0, robot_quat_1, robot_quat_2"
+
+
+def _rates(turned: Rotation, step_s: float) -> np.ndarray:
+    """Angular rates of rotations in the axes of their body."""
+    between = (turned[:-1].inv() * turned[1:]).as_rotvec() / step_s
+    return np.concatenate([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
+
+
+def test_an_acquisition_of_st_is_named(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/lsm6dsv16x_gyro.dat").write_bytes(bytes(range(256)) * 20)
+    (tmp_path / "run/device_config.json").write_text('{"devices": []}')
+    with pytest.raises(DataError, match=r"an acquisition of ST's High Speed Datalog.*Export it as CSV"):
+        convert(tmp_path, tmp_path / "out")

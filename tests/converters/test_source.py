@@ -242,10 +242,6 @@ def test_a_text_file_named_zip_is_refused(make):
     refused(source, "not a zip file")
 
 
-def test_an_archive_of_archives_says_to_unpack_it(make):
-    refused(make.zip("machine_hall.zip", {"machine_hall/MH_01_easy/MH_01_easy.zip": b"PK"}), "holds archives or bags.*Unpack")
-
-
 def test_what_a_mac_leaves_in_an_archive_is_no_sequence(make):
     extra = {"__MACOSX/mav0/._body.yaml": b"x", "__MACOSX/mav0/imu0/._data.csv": b"x"}
     assert [s.inside for s in find(make.zip("one.zip", {**make.files("euroc"), **extra}))] == [""]
@@ -274,11 +270,9 @@ def test_a_source_that_does_not_exist_is_named(tmp_path):
         euroc.sequences(tmp_path / "nowhere")
 
 
-def test_an_archive_of_archives_in_a_folder_fails_with_the_same_advice(make):
-    make.zip("machine_hall.zip", {"machine_hall/MH_01_easy/MH_01_easy.zip": b"PK"})
-    (sequence,) = euroc.sequences(make.tmp)
-    with pytest.raises(DataError, match=r"holds archives or bags.*Unpack"):
-        euroc.recognises(sequence)
+def test_an_archive_of_archives_is_no_sequence_itself(make):
+    source = make.zip("machine_hall.zip", {"machine_hall/MH_01_easy/MH_01_easy.zip": b"PK"})
+    assert euroc.sequences(source) == euroc.sequences(make.tmp) == []
 
 
 @pytest.mark.parametrize("spelling", ["one", "one/mav0", ".", "mav0", "mav0/.."])

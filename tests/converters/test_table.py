@@ -46,6 +46,14 @@ HEADERS = {
         G,
     ),
     "units at the end": (["t_ns", *(f"w{a}_dps" for a in "xyz"), *(f"acc_{a}_mg" for a in "xyz")], np.pi / 180, G / 1000),
+    "units at the end of capitals": (
+        ["time_ns", *(f"gyro{a}Dps" for a in "XYZ"), *(f"accel{a}Mg" for a in "XYZ")],
+        np.pi / 180,
+        G / 1000,
+    ),
+    "units before the axis": (["t_ns", *(f"gyro_dps_{a}" for a in "xyz"), *(f"accel_g_{a}" for a in "xyz")], np.pi / 180, G),
+    "milli g": (["t_ns", *(f"g{a}_dps" for a in "xyz"), *(f"a{a}_milli_g" for a in "xyz")], np.pi / 180, G / 1000),
+    "mss": (["t_ns", *(f"gyro_{a}_radps" for a in "xyz"), *(f"accel_{a}_mss" for a in "xyz")], 1.0, 1.0),
     "units of two words": (["t_ns", *(f"gyro_{a}_rad_s" for a in "xyz"), *(f"accel_{a}_m_s2" for a in "xyz")], 1.0, 1.0),
     "fields of ROS": (
         [

@@ -394,11 +394,12 @@ def test_an_acceleration_without_gravity_does_not_stand_for_one_with_it(tmp_path
     assert any("acc_x [m/s^2]/y/z is the one with gravity" in note for note in log.remarks.notes)
 
 
-def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_rest(tmp_path):
+@pytest.mark.parametrize("unit", ["(rad/s)", ""])
+def test_a_table_of_core_motion_has_a_stamp_for_each_sensor_and_reads_down_at_rest(tmp_path, unit):
     s, late_s = (T_NS - START_NS) / 1e9 + 98_765.0, 0.001
     names = [
         "loggingTime(txt)", "accelerometerTimestamp_sinceReboot(s)", *(f"accelerometerAcceleration{a}(G)" for a in "XYZ"),
-        "gyroTimestamp_sinceReboot(s)", *(f"gyroRotation{a}(rad/s)" for a in "XYZ"),
+        "gyroTimestamp_sinceReboot(s)", *(f"gyroRotation{a}{unit}" for a in "XYZ"),
         *(f"motionRotationRate{a}(rad/s)" for a in "XYZ"), *(f"motionUserAcceleration{a}(G)" for a in "XYZ"),
     ]  # fmt: skip
     user = ACCEL - [0.0, 0.0, 9.81]

@@ -353,6 +353,17 @@ def test_a_truth_that_gives_no_poses_is_a_loss(tmp_path):
     assert any("poses_gt.txt gives no poses" in loss for loss in log.remarks.losses)
 
 
+def test_true_positions_without_orientations_are_named_as_such(tmp_path):
+    """As an UWB or GNSS track gives them."""
+    (tmp_path / "imu.csv").write_text(imu_text())
+    track = "\n".join(f"{0.1 * n:.1f},{0.01 * n:.2f},0.5,1.0" for n in range(200))
+    (tmp_path / "ground_truth.csv").write_text(f"time [s],x,y,z\n{track}\n")
+    log = read(tmp_path)
+    assert log.poses == {}
+    assert any("it has positions without orientations" in loss for loss in log.remarks.losses)
+    assert "/ground_truth_x" in log.scalars
+
+
 @pytest.mark.parametrize(
     "changed",
     [{"FrameRate": 0.0}, {"FrameRate": np.nan}, {"FrameRate": "fast"}, {"Rotations": np.zeros((8, COUNT))}, {"Positions": 0.0}],

@@ -129,6 +129,13 @@ def test_missing_samples_are_counted_from_the_gaps(tmp_path):
     assert found["largest_gap_s"] == pytest.approx(0.055)
 
 
+def test_a_pause_of_the_recorder_is_no_jitter_and_is_said(tmp_path):
+    imu = resting(1000)
+    (found,) = logged(tmp_path, Imu(imu.t_ns + np.where(np.arange(1000) < 400, 0, 90 * 10**9), imu.gyro, imu.accel))["imu"]
+    assert (found["missing"], found["jitter_s"]) == (0, pytest.approx(0.0, abs=1e-6))
+    assert "pauses of more than 60 s: 1, the longest of 90 s" in found["warnings"]
+
+
 def test_disorder_repeats_and_values_that_are_no_numbers_are_counted_not_refused(tmp_path, monkeypatch):
     """A log as a poor recorder leaves it; our own writer would refuse, so its checks are stepped around."""
     imu = resting(1000)

@@ -11,9 +11,9 @@ from imutool.array_types import Float64, Int64
 from imutool.cleaning.finding import MAX_INTERVALS, Finding
 from imutool.cleaning.rule import Rule, TopicSummary
 from imutool.cleaning.samples import Samples
-from imutool.cleaning.stamp_line import batch_size, batch_words, bunched
+from imutool.cleaning.stamp_line import batch_size, batch_words, bunched, stay_late, usual_period
 from imutool.recording import nanoseconds
-from imutool.recording.columns import median
+from imutool.recording.columns import MOST_GAP_S
 
 MISSING = "samples missing"
 MISSING_STEP = 1.5  # a step of this many median periods or more has lost samples
@@ -63,10 +63,10 @@ class Gaps(Rule):
         within, near = bunched(steps)
         self._within, self._steps = self._within + within, self._steps + near
         if len(steps) >= FEWEST_STEPS or (len(steps) and not self._period_ns):
-            self._period_ns = float(median(steps))
+            self._period_ns = usual_period(stamp)
         if not self._period_ns:
             return
-        lost = missing(steps, self._period_ns)
+        lost = missing(stamp, self._period_ns)
         lost = np.where(lost > 0, np.maximum(lost - (np.diff(number) - 1), 0), 0)
         for row in np.flatnonzero(steps > PAUSE_NS)[: MOST - len(self._pauses)]:
             self._pauses.append(Gap(int(number[row + 1]), int(stamp[row]), int(stamp[row + 1]), 0))
@@ -115,7 +115,20 @@ class Gaps(Rule):
         return gap._replace(missing=max(gap.missing - late, 0))
 
 
-def missing(steps_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.ndarray, " n"]:
-    """Number of samples that would fill each step; 0 for steps below 1.5 periods and for pauses."""
+def missing(stamp_ns: Int64[np.ndarray, " n"], period_ns: float) -> Float64[np.ndarray, " m"]:
+    """Number of samples that would fill each step.
+
+    0 for steps below 1.5 periods, for pauses, and where a stamp is late that those behind it make up for.
+    """
+    steps_ns = np.diff(stamp_ns)
     periods = steps_ns / period_ns
-    return np.where((periods >= MISSING_STEP) & (steps_ns <= PAUSE_NS), np.round(periods - 1.0), 0.0)
+    is_lost = (periods >= MISSING_STEP) & (steps_ns <= PAUSE_NS) & stay_late(stamp_ns, period_ns)
+    return np.where(is_lost, np.round(periods - 1.0), 0.0)
+
+
+def pause_words(stamp_ns: Int64[np.ndarray, " n"]) -> list[str]:
+    """Pauses of the recorder, in words; a longer step is a jump of the clock."""
+    steps = np.diff(stamp_ns)
+    pauses = steps[(steps > PAUSE_NS) & (steps <= nanoseconds(MOST_GAP_S))]
+    longest = f", the longest of {pauses.max() * 1e-9:.0f} s" if len(pauses) else ""
+    return [f"pauses of more than {PAUSE_NS * 1e-9:g} s: {len(pauses)}{longest}"] if longest else []

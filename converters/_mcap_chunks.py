@@ -1,0 +1,61 @@
+"""Messages of an MCAP log's chunks in log-time order."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from struct import Struct
+from typing import Any, BinaryIO
+
+from imutool.recording.message_log import Message
+
+RECORD_HEAD = 9  # bytes of a record ahead of its content: opcode and length
+RECORD, MESSAGE, MESSAGE_OPCODE = Struct("<BQ"), Struct("<HIQQ"), 5  # a message: channel, sequence, log and publish times
+_Waiting = tuple[int, int, int, int, int, bytes]  # log time, place of its chunk, number in it, channel, publish time, content
+
+
+def in_order(reader: Any, file: BinaryIO) -> Iterator[tuple[Any, Any, Message]]:
+    """What `reader.iter_messages()` yields.
+
+    Chunks are sorted as they come, in place of a heap of single messages.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Chunk
+
+    summary = reader.get_summary()
+    if summary is None or not summary.chunk_indexes:
+        for schema, channel, record in reader.iter_messages():
+            yield schema, channel, Message(channel, record.log_time, record.publish_time, record.data)
+        return
+    waiting: list[_Waiting] = []
+    for start_ns, at in sorted((index.message_start_time, index.chunk_start_offset) for index in summary.chunk_indexes):
+        due = bisect_left(waiting, (start_ns, at))
+        yield from (_defined(summary, record) for record in waiting[:due])
+        del waiting[:due]
+        file.seek(at + RECORD_HEAD)
+        waiting += _messages_in(Chunk.read(ReadDataStream(file)), at)
+        waiting.sort()
+    yield from (_defined(summary, record) for record in waiting)
+
+
+def _messages_in(chunk: Any, at: int) -> Iterator[_Waiting]:
+    """Messages of a chunk; the library's own records take three times as long."""
+    from mcap.stream_reader import get_chunk_data_stream
+
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    data, place, number = stream.read(size), 0, 0
+    while place < size:
+        opcode, length = RECORD.unpack_from(data, place)
+        place += RECORD_HEAD
+        if opcode == MESSAGE_OPCODE:
+            channel, _, log_time, publish_time = MESSAGE.unpack_from(data, place)
+            yield log_time, at, number, channel, publish_time, data[place + MESSAGE.size : place + length]
+            number += 1
+        place += length
+
+
+def _defined(summary: Any, waiting: _Waiting) -> tuple[Any, Any, Message]:
+    log_time, _, _, number, publish_time, payload = waiting
+    channel = summary.channels[number]
+    schema = summary.schemas[channel.schema_id] if channel.schema_id else None
+    return schema, channel, Message(channel, log_time, publish_time, payload)
