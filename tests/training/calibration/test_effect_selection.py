@@ -27,6 +27,7 @@ FLIGHT = {"rate_hz": RATE_HZ, "duration_s": 60.0, "still_s": 0.0}
 NOISE = {"gyro": 2e-3, "accel": 0.05}  # of a sample
 REST = {"gyro": 0.01, "accel": 0.1}
 SURE = 3.0  # standard deviations
+NEAR_PRIOR = 0.3  # deviations of the prior, of what the motion does not show
 # A clock or an arm may be each log's own: only that all logs have the same one speaks for an effect. A drift shows in long
 # windows, of which such a flight has few.
 LEAST_GAIN = {"clock_offset": 0.05, "lever_arm": 0.05, "gyro_bias_drift": 0.2}
