@@ -89,9 +89,9 @@ class Outputs:
         _check_extras(asked)
         if not asked.needs_rerun:
             return
-        from imutool.viewing.rerun import connect, sdk, web
+        from imutool.viewing.rerun import connect, require_rerun, web
 
-        sdk.require_rerun()
+        require_rerun()
         if asked.export_web is not None:
             web.check_folder(asked.export_web, overwrite=asked.overwrite)
         if asked.connect is not None:

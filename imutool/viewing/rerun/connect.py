@@ -14,8 +14,8 @@ from urllib.parse import SplitResult, urlsplit
 from imutool.errors import ConfigError
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import scene, sdk
-from imutool.viewing.rerun.sdk import FLUSH_S, require_rerun, rerun_version, stream_of_logs
+from imutool.viewing.rerun import require_rerun, scene, sdk
+from imutool.viewing.rerun.sdk import FLUSH_S, rerun_version, stream_of_logs
 
 ANSWER_TIMEOUT_S = 0.6  # for a connection to open, for the first bytes of the listener, and for a viewer's version
 CURSOR_TIMEOUT_S = 1.5  # for a recording to arrive before its cursor can be set

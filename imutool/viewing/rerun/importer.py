@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 from imutool.file_location import Location, first_bytes
+from imutool.viewing.rerun import rr
 
 if TYPE_CHECKING:
-    import rerun as rr
-
     from imutool.mcap_io.log import Log
     from imutool.viewing.model.run_data import RunData
 

@@ -17,11 +17,10 @@ from imutool.mcap_io.recovery.recovered_log import RecoveredLog
 from imutool.mcap_io.topics import DERIVED_KEY, Topic
 from imutool.recording import Times
 from imutool.viewing.model.run_data import TRUE_BIAS, RunData
-from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.sdk import Scope, entity_path
 
 if TYPE_CHECKING:
-    import rerun as rr
     from rerun.chunk import Chunk
 
 logger = logging.getLogger(__name__)

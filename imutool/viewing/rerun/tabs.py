@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from imutool.units import AXES, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
-from imutool.viewing.rerun import other_topics, sdk
+from imutool.viewing.rerun import other_topics, rr, rrb, sdk
 from imutool.viewing.rerun.entities import errors, signals
 from imutool.viewing.rerun.entities.styles import BACKGROUND, color_name, color_of
 from imutool.viewing.rerun.plots import error_axis_limit, plot, signed_range, unsigned_range, whole_time_axis
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 TITLES = {"gyro": "Angular rate (rad/s)", "accel": "Specific force (m/s²)"}
 BIAS_TITLES = {"gyro": "Gyro bias (rad/s)", "accel": "Accel bias (m/s²)"}
@@ -69,16 +66,12 @@ def error_limit(data: RunData, kind: str) -> float | None:
 
 
 def _signals(data: RunData, scope: Scope) -> View:
-    import rerun.blueprint as rrb
-
     shown = [_three(data, _of_all(data, scope, "imu", kind), title) for kind, title in TITLES.items()]
     return rrb.Vertical(*shown, name="Signals")
 
 
 def _bias(data: RunData, scope: Scope) -> View | None:
     """Bias tabs per sensor, a plot per axis: one plot would hide differences of a thousandth."""
-    import rerun.blueprint as rrb
-
     sensors = [kind for kind in signals.KINDS if data.models() or kind in data.true_bias]
     if not sensors:
         return None
@@ -90,8 +83,6 @@ def _bias(data: RunData, scope: Scope) -> View | None:
 
 def _bias_of(data: RunData, scope: Scope, kind: str, axis: int) -> rrb.TimeSeriesView:
     """Plot of one axis of one sensor; each of several models has its colour of the error plots."""
-    import rerun as rr
-
     overrides: dict[str, Any] = {}
     several = len(data.models()) > 1
     key_parts = []
@@ -140,8 +131,6 @@ def _bias_range(data: RunData, kind: str, axis: int) -> tuple[float, float] | No
 
 
 def _spectrum(data: RunData, scope: Scope) -> View | None:
-    import rerun.blueprint as rrb
-
     bounds = rrb.VisualBounds2D(x_range=signals.VISIBLE_X, y_range=signals.VISIBLE_Y)
     shown = []
     for kind in signals.sensors_with_spectrum(data):
@@ -154,8 +143,6 @@ def _spectrum(data: RunData, scope: Scope) -> View | None:
 
 def _errors(data: RunData, scope: Scope) -> View | None:
     """Errors by axis, by angle or direction, and since the last reset; one tab per kind."""
-    import rerun.blueprint as rrb
-
     if all(trace.errors is None for trace in data.traces):
         return None
     return rrb.Tabs(
@@ -209,8 +196,6 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
 
 
 def _events(data: RunData, scope: Scope) -> View | None:
-    import rerun.blueprint as rrb
-
     kinds = errors.event_kinds(data)
     if not kinds:
         return None
@@ -223,21 +208,15 @@ def _events(data: RunData, scope: Scope) -> View | None:
 
 def _event_list(contents: list[str], origin: str) -> rrb.TextLogView:
     """List of events; a click on a time moves the cursor there."""
-    import rerun.blueprint as rrb
-
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     return rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)
 
 
 def _report(scope: Scope) -> View:
-    import rerun.blueprint as rrb
-
     return rrb.TextDocumentView(origin=sdk.entity_path(scope, "report"), name="Report")
 
 
 def _cameras(data: RunData, scope: Scope) -> View | None:
-    import rerun.blueprint as rrb
-
     cameras = other_topics.plan_import(data, scope).cameras
     shown = [rrb.Spatial2DView(origin=camera, name=camera.removeprefix("/")) for camera in cameras]
     return rrb.Grid(*shown, name="Cameras") if shown else None

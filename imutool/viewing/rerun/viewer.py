@@ -18,9 +18,9 @@ from msgspec.structs import replace
 from imutool.errors import ConfigError
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import connect, scene
+from imutool.viewing.rerun import connect, require_rerun, scene
 from imutool.viewing.rerun.connect import Listener
-from imutool.viewing.rerun.sdk import recording_name, require_rerun, rerun_version
+from imutool.viewing.rerun.sdk import recording_name, rerun_version
 
 MEMORY_LIMIT = "50%"  # of the machine's memory; the viewer's default is three quarters
 START_TIMEOUT_S = 10.0  # for a viewer that runs but does not listen yet, as from a slow disk; a dead one is seen at once

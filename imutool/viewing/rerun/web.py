@@ -17,9 +17,9 @@ from imutool.mcap_io.storage.local import remove_abandoned, temporary_path
 from imutool.recording import nanoseconds
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import RunData
-from imutool.viewing.rerun import viewer
+from imutool.viewing.rerun import require_rerun, viewer
 from imutool.viewing.rerun.scene import rrd
-from imutool.viewing.rerun.sdk import recording_name, require_rerun
+from imutool.viewing.rerun.sdk import recording_name
 
 PAGE, START, RECORDING = "index.html", "start.js", "recording.rrd"
 RERUN_FILES = ("re_viewer.js", "re_viewer_bg.wasm")  # built for the installed version
@@ -209,7 +209,6 @@ def export(
         ConfigError: as `check_folder`, Rerun is not installed or does not run, or the system refuses to write.
     """
     check_folder(folder, overwrite=overwrite)
-    require_rerun()
     files = site(logs, source=source, at_s=at_s)
     place = folder.absolute()  # "." has no name
     remove_abandoned(place)

@@ -4,33 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from imutool.viewing.model.run_data import RunData
 from imutool.viewing.model.trajectory_error import WINDOWS_NOTE
-from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities.paths import error_scale_top
 from imutool.viewing.rerun.entities.styles import color_name
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 MAX_EVENTS = 40  # in the list; the Events tab shows all
 
 
 def log_report(data: RunData, to: rr.RecordingStream, scope: Scope, more: Sequence[str] = ()) -> None:
     """Log the text of `markdown` as `report`."""
-    import rerun as rr
-
     text = rr.TextDocument(markdown(data, more), media_type="text/markdown")
     to.log(sdk.entity_path(scope, "report"), text, static=True, strict=True)
 
 
 def log_comparison(logs: Sequence[RunData], to: rr.RecordingStream) -> None:
     """Log a table of the figures of several logs as `compare`."""
-    import rerun as rr
-
     to.log("compare", rr.TextDocument(comparison(logs), media_type="text/markdown"), static=True, strict=True)
 
 

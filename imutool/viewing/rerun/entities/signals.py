@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,13 +11,10 @@ from imutool.array_types import Float64
 from imutool.recording import Times
 from imutool.units import AXES
 from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows
-from imutool.viewing.rerun import sdk
+from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
 from imutool.viewing.rerun.sdk import Scope
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 KINDS = ("gyro", "accel")
 SIGMAS = 3.0
@@ -92,8 +88,6 @@ def log_curves(
     max_rows: int | None = None,
 ) -> None:
     """Log one curve per column after its style, decimated to `max_rows` (MAX_DERIVED_ROWS)."""
-    import rerun as rr
-
     to.log(entity, style, static=True, strict=True)
     rows = curve_rows(values, MAX_DERIVED_ROWS if max_rows is None else max_rows)
     # strict: Rerun only warns of a length that does not match, and then the rows are missing
@@ -163,8 +157,6 @@ def decimate_points(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "
 
 
 def _log_spectrum(data: RunData, to: rr.RecordingStream, entity: str, trace: Trace, kind: str, frame: DecadeFrame) -> None:
-    import rerun as rr
-
     spectrum = trace.spectra[kind]
     strips = [decimate_points(frame.at(spectrum.frequency_hz, np.sqrt(column))) for column in spectrum.density.T]
     pale = trace.is_raw and bool(data.models())
@@ -176,8 +168,6 @@ def _log_spectrum(data: RunData, to: rr.RecordingStream, entity: str, trace: Tra
 
 def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
     """Lines at whole decades, with tick labels left and below."""
-    import rerun as rr
-
     across = np.arange(frame.low_hz, frame.high_hz + 1)
     up = np.arange(frame.low, frame.high + 1)
     x = (across - frame.low_hz) / (frame.high_hz - frame.low_hz) * WIDTH
@@ -189,8 +179,6 @@ def _log_frame(to: rr.RecordingStream, entity: str, frame: DecadeFrame) -> None:
 
 
 def _log_labels(to: rr.RecordingStream, entity: str, positions: Sequence[Sequence[float]], labels: Sequence[str]) -> None:
-    import rerun as rr
-
     dots = rr.Radius.ui_points(0.0)
     text = rr.Points2D(positions, labels=list(labels), colors=[INK] * len(labels), radii=dots, show_labels=True)
     to.log(entity, text, static=True, strict=True)
