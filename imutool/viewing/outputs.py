@@ -54,9 +54,7 @@ class RequestedOutputs:
     @property
     def opens_viewer(self) -> bool:
         """Whether a viewer opens: no output was requested."""
-        return (
-            self.connect is None and not self.web and all(p is None for p in (self.save, self.export_web, self.png, self.html))
-        )
+        return not self.needs_rerun and self.png is None and self.html is None
 
     @property
     def needs_rerun(self) -> bool:
@@ -95,18 +93,14 @@ class Outputs:
         if asked.export_web is not None:
             web.check_folder(asked.export_web, overwrite=asked.overwrite)
         if asked.connect is not None:
-            self._connect(connect.full_url(asked.connect))
+            url = connect.full_url(asked.connect)
+            try:
+                self._peer = connect.probe(url)
+            except ConfigError as error:
+                self.refused = error
+                logger.warning("%s", error)
         if asked.web:
             self._server = self._stack.enter_context(web.Server(asked.port))
-
-    def _connect(self, url: str) -> None:
-        from imutool.viewing.rerun import connect
-
-        try:
-            self._peer = connect.probe(url)
-        except ConfigError as error:
-            self.refused = error
-            logger.warning("%s", error)
 
     def show(self, logs: Sequence[RunData]) -> list[Output]:
         """Run every requested output, the slowest last.

@@ -89,6 +89,11 @@ class Window:
     position_m: float
 
 
+def row_of_largest(values: Float64[np.ndarray, " n"]) -> int | None:
+    """Row of the largest value; None where no value is finite."""
+    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
+
+
 def errors(estimate: Poses, truth: Poses, valid: Bool[np.ndarray, " n"]) -> Errors:
     """Error of an estimate against the truth at the same stamps; NaN where `valid` is false."""
     q_true, q = truth.q_wb_wxyz, estimate.q_wb_wxyz

@@ -14,12 +14,11 @@ from imutool.diagnosis.result import Diagnosis, Located, Traces
 from imutool.diagnosis.wording.conclusion import lines, location_text
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Times
-from imutool.units import AXES, UNITS
+from imutool.units import AXES, SENSORS, UNITS
 from imutool.viewing.html.diagnosis_figures import intervals_in_log
 from imutool.viewing.model.decimation import true_intervals
 from imutool.viewing.rerun import rr, rrb
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.signals import KINDS
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, EVENT_COLOR, GREY, MODEL_COLORS, RAW_COLOR, RAW_WIDTH, Color
 from imutool.viewing.rerun.plots import frame, whole_time_axis
 from imutool.viewing.rerun.sdk import elapsed_column, entity_path, new_stream, rrd_bytes, unique_names
@@ -63,7 +62,7 @@ def log(d: Diagnosis, to: rr.RecordingStream) -> None:
     for name, trace in zip(names(d.traces), d.traces, strict=True):
         t_ns = _nanoseconds(trace.t_s)
         for column in range(6):
-            axis = (name, KINDS[column // 3], AXES[column % 3])
+            axis = (name, SENSORS[column // 3], AXES[column % 3])
             real, before, after = (values[:, column] for values in (trace.real, trace.before, trace.after))
             _log_curves(to, entity_path(axis, "samples"), t_ns, np.stack([real, before, after], axis=1), slice(0, 3))
             _log_curves(to, entity_path(axis, "left"), t_ns, np.stack([real - before, real - after], axis=1), slice(1, 3))
@@ -99,7 +98,7 @@ def _log_tab(name: str, trace: Traces) -> rrb.Vertical:
         )
 
     curves = [
-        rrb.Horizontal(*(rrb.Vertical(*(view(kind, sensor, axis) for axis in AXES)) for sensor in KINDS), name=title)
+        rrb.Horizontal(*(rrb.Vertical(*(view(kind, sensor, axis) for axis in AXES)) for sensor in SENSORS), name=title)
         for kind, title in (("left", "Residuals"), ("samples", "Samples"))
     ]
     lanes = rrb.StateTimelineView(

@@ -141,7 +141,8 @@ def _legend(scope: Scope) -> rrb.Spatial2DView:
 def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertical:
     """Errors of all logs over elapsed time, above a table of their figures."""
     rows: list[Any] = []
-    scored = _runs_with_errors(logs, scopes)
+    with_scope = zip(logs, scopes, strict=True)
+    scored = [(data, trace, scope) for data, scope in with_scope for trace in data.traces if trace.errors is not None]
     for kind in errors.KINDS:
         overrides = {}
         for (data, trace, scope), color in zip(scored, _comparison_colors(scored), strict=True):
@@ -153,15 +154,6 @@ def _comparison(logs: Sequence[RunData], scopes: Sequence[Scope]) -> rrb.Vertica
             rows.append(plot(list(overrides), title, height=(0.0, limit) if limit else None, overrides=overrides))
     figures = rrb.TextDocumentView(origin="/compare", name="Figures")
     return rrb.Vertical(*([rrb.Horizontal(*rows)] if rows else []), figures, name="Compare")
-
-
-def _runs_with_errors(logs: Sequence[RunData], scopes: Sequence[Scope]) -> list[tuple[RunData, Trace, Scope]]:
-    return [
-        (data, trace, scope)
-        for data, scope in zip(logs, scopes, strict=True)
-        for trace in data.traces
-        if trace.errors is not None
-    ]
 
 
 def _comparison_colors(scored: Sequence[tuple[RunData, Trace, Scope]]) -> list[Color]:

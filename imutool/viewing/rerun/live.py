@@ -19,12 +19,13 @@ from imutool.errors import ConfigError, ImutoolError
 from imutool.inertial.strapdown import StartPose, dead_reckon
 from imutool.mcap_io.storage.target import Target
 from imutool.recording import Imu, Poses
+from imutool.units import SENSORS
 from imutool.viewing import Output
 from imutool.viewing.model.run_data import level_start
 from imutool.viewing.rerun import connect, layout, rr, sdk, viewer
 from imutool.viewing.rerun.connect import Listener
 from imutool.viewing.rerun.entities import paths, styles
-from imutool.viewing.rerun.entities.signals import KINDS, SIGMAS
+from imutool.viewing.rerun.entities.signals import SIGMAS
 from imutool.viewing.rerun.entities.styles import MODEL_COLORS, RAW_COLOR
 from imutool.viewing.rerun.plots import Box
 from imutool.viewing.rerun.sdk import FLUSH_S, Role, Scope, new_stream
@@ -59,7 +60,7 @@ def live_view(
         live.send(peer, Output("connect", peer.url, f"Shown live: {peer.url}{connect.version_mismatch(peer)}."))
     elif save is None:
         try:
-            peer = viewer.open_empty()
+            peer = viewer.start().peer
             live.send(peer, Output("viewer", peer.url, "The viewer is open and showed the debiasing live."))
         except ConfigError as error:
             save, live.trouble = instead, viewer.as_sentence(error)
@@ -197,7 +198,7 @@ class _Imu:
             to.log(
                 self._path("world", role, "body"), *styles.body_style(role, role, color, SCENE_SIZE_M), static=True, strict=True
             )
-        for kind in KINDS:
+        for kind in SENSORS:
             for role in self._paths:
                 to.log(
                     self._path("imu", kind, role), styles.axis_curves(role, styles.axis_names(role)), static=True, strict=True
@@ -220,7 +221,7 @@ class _Imu:
         raw = np.hstack([block.batch.gyro, block.batch.accel])[new]
         bias, margin = block.bias[new], SIGMAS * block.std[new]
         curves: dict[str, np.ndarray] = {}
-        for kind, columns in zip(KINDS, COLUMNS, strict=True):
+        for kind, columns in zip(SENSORS, COLUMNS, strict=True):
             curves[self._path("imu", kind, "raw")] = raw[:, columns]
             curves[self._path("imu", kind, "debiased")] = (raw - bias)[:, columns]
             curves[self._path("bias", kind, "estimated")] = bias[:, columns]

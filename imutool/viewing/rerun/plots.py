@@ -101,11 +101,6 @@ def error_axis_limit(data: RunData, values: Mapping[str, np.ndarray]) -> float |
     return limit if limit > 0.0 else None
 
 
-def unsigned_range(limit: float | None) -> tuple[float, float] | None:
-    """Axis range of unsigned errors."""
-    return None if limit is None else (0.0, limit)
-
-
-def signed_range(limit: float | None) -> tuple[float, float] | None:
-    """Axis range of signed errors."""
-    return None if limit is None else (-limit, limit)
+def error_range(limit: float | None, *, signed: bool = False) -> tuple[float, float] | None:
+    """Axis range of errors up to a limit."""
+    return None if limit is None else (-limit if signed else 0.0, limit)

@@ -12,7 +12,7 @@ from imutool.viewing.model.run_data import RunData
 from imutool.viewing.rerun import layout, other_topics, require_rerun, rr
 from imutool.viewing.rerun.entities import errors, paths, report, signals
 from imutool.viewing.rerun.plots import diagonal_m
-from imutool.viewing.rerun.sdk import Scope, recording_name, rrd_bytes, scopes, stream_of_logs
+from imutool.viewing.rerun.sdk import Scope, new_stream, recording_name, rrd_bytes, scopes
 
 
 def log(logs: Sequence[RunData], to: rr.RecordingStream, *, source: bool = True, root: Scope = ()) -> None:
@@ -59,7 +59,7 @@ def rrd(logs: Sequence[RunData], *, source: bool = True) -> bytes:
     Raises:
         ConfigError: no log, or Rerun is not installed.
     """
-    return rrd_bytes(stream_of_logs(logs), lambda recording: send(logs, recording, source=source))
+    return rrd_bytes(new_stream(recording_name(logs)), lambda recording: send(logs, recording, source=source))
 
 
 def _log_one(data: RunData, to: rr.RecordingStream, scope: Scope, with_source: bool) -> None:

@@ -21,15 +21,6 @@ FLUSH_S = 30.0
 ELAPSED, STAMP, LOG_TIME = TIMELINES = ("elapsed", "ros2_timestamp", "message_log_time")
 
 
-def stream_of_logs(logs: Sequence[RunData]) -> rr.RecordingStream:
-    """Create a recording stream named after some logs.
-
-    Raises:
-        ConfigError: no log, or Rerun is not installed.
-    """
-    return new_stream(recording_name(logs))
-
-
 def new_stream(name: str, *, application: str | None = None, recording: str | None = None) -> rr.RecordingStream:
     """Create a recording stream in an application of its own: Rerun keeps a layout for each.
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from imutool.units import AXES, UNITS
+from imutool.units import AXES, SENSORS, UNITS
 from imutool.viewing.model.run_data import RunData, Trace
 from imutool.viewing.model.trajectory_error import Drift, Errors
 from imutool.viewing.rerun import other_topics, rr, rrb, sdk
 from imutool.viewing.rerun.entities import errors, signals
 from imutool.viewing.rerun.entities.styles import BACKGROUND, color_name, color_of
-from imutool.viewing.rerun.plots import error_axis_limit, plot, signed_range, unsigned_range, whole_time_axis
+from imutool.viewing.rerun.plots import error_axis_limit, error_range, plot, whole_time_axis
 from imutool.viewing.rerun.sdk import Scope
 
 TITLES = {"gyro": "Angular rate (rad/s)", "accel": "Specific force (m/s²)"}
@@ -32,7 +32,8 @@ def tabs(data: RunData, scope: Scope, with_source: bool) -> list[View]:
     samples = data.integrated()
     views = [_signals(samples, scope), _bias(samples, scope), _spectrum(samples, scope), _errors(data, scope)]
     views.append(_events(data, scope))
-    return [view for view in (*views, _report(scope), _cameras(data, scope) if with_source else None) if view is not None]
+    report = rrb.TextDocumentView(origin=sdk.entity_path(scope, "report"), name="Report")
+    return [view for view in (*views, report, _cameras(data, scope) if with_source else None) if view is not None]
 
 
 def total_errors(data: RunData, scope: Scope) -> list[View]:
@@ -47,7 +48,7 @@ def total_errors(data: RunData, scope: Scope) -> list[View]:
             top = "" if limit is None else f", top {limit:.3g}"  # a low plot may have no room for tick labels
             title, key = f"{kind.capitalize()} error ({errors.UNITS[kind]}){top}", _colors(data, _models_first(data))
             key += ", worst pink" if any(not trace.is_raw for trace in scored) else ""
-            views.append(plot(contents, title, key, height=unsigned_range(limit)))
+            views.append(plot(contents, title, key, height=error_range(limit)))
     return views
 
 
@@ -72,7 +73,7 @@ def _signals(data: RunData, scope: Scope) -> View:
 
 def _bias(data: RunData, scope: Scope) -> View | None:
     """Bias tabs per sensor, a plot per axis: one plot would hide differences of a thousandth."""
-    sensors = [kind for kind in signals.KINDS if data.models() or kind in data.true_bias]
+    sensors = [kind for kind in SENSORS if data.models() or kind in data.true_bias]
     if not sensors:
         return None
     views = [
@@ -154,23 +155,21 @@ def _errors(data: RunData, scope: Scope) -> View | None:
 
 
 def _orientation(data: RunData, scope: Scope) -> list[View]:
-    by_axis = error_axis_limit(data, _by_run(data, lambda found: found.orientation_deg))
-    by_angle = error_axis_limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg))
+    by_axis = error_range(error_axis_limit(data, _by_run(data, lambda found: found.orientation_deg)), signed=True)
+    by_angle = error_range(error_axis_limit(data, _by_run(data, lambda found: found.roll_pitch_yaw_deg)), signed=True)
     return [
-        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the body's axes (deg)", signed_range(by_axis)),
-        _three(
-            data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", signed_range(by_angle), errors.ANGLES
-        ),
+        _three(data, _of_scored(data, scope, "orientation", "axes"), "About the body's axes (deg)", by_axis),
+        _three(data, _of_scored(data, scope, "orientation", "rpy"), "Roll, pitch, yaw (deg)", by_angle, errors.ANGLES),
         *_drift(data, scope, "orientation", lambda drift: drift.orientation_deg),
     ]
 
 
 def _position(data: RunData, scope: Scope) -> list[View]:
-    by_axis = error_axis_limit(data, _by_run(data, lambda found: found.position_m))
+    by_axis = error_range(error_axis_limit(data, _by_run(data, lambda found: found.position_m)), signed=True)
     contents = [*_of_scored(data, scope, "position", "horizontal"), *_of_scored(data, scope, "position", "vertical")]
-    limits = signed_range(error_limit(data, "position"))
+    limits = error_range(error_limit(data, "position"), signed=True)
     return [
-        _three(data, _of_scored(data, scope, "position", "axes"), "Along the world's axes (m)", signed_range(by_axis)),
+        _three(data, _of_scored(data, scope, "position", "axes"), "Along the world's axes (m)", by_axis),
         plot(contents, "Horizontal (length) and vertical (m)", height=limits),
         *_drift(data, scope, "position", lambda drift: drift.position_m),
     ]
@@ -190,7 +189,7 @@ def _drift(data: RunData, scope: Scope, kind: str, of: Callable[[Drift], np.ndar
             contents,
             title,
             key,
-            height=unsigned_range(error_axis_limit(data, {name: of(drift) for name, drift in drifts.items()})),
+            height=error_range(error_axis_limit(data, {name: of(drift) for name, drift in drifts.items()})),
         )
     ]
 
@@ -199,21 +198,11 @@ def _events(data: RunData, scope: Scope) -> View | None:
     kinds = errors.event_kinds(data)
     if not kinds:
         return None
-    contents = [sdk.entity_path(scope, "events", kind) for kind in kinds]
-    lanes = rrb.StateTimelineView(
-        origin=sdk.entity_path(scope, "events"), contents=contents, name="When", time_view=whole_time_axis()
-    )
-    return rrb.Vertical(lanes, _event_list(contents, sdk.entity_path(scope, "events")), name="Events", row_shares=[1, 1])
-
-
-def _event_list(contents: list[str], origin: str) -> rrb.TextLogView:
-    """List of events; a click on a time moves the cursor there."""
+    origin, contents = sdk.entity_path(scope, "events"), [sdk.entity_path(scope, "events", kind) for kind in kinds]
+    lanes = rrb.StateTimelineView(origin=origin, contents=contents, name="When", time_view=whole_time_axis())
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
-    return rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)
-
-
-def _report(scope: Scope) -> View:
-    return rrb.TextDocumentView(origin=sdk.entity_path(scope, "report"), name="Report")
+    texts = rrb.TextLogView(origin=origin, contents=contents, name="What", columns=columns)  # a click moves the cursor there
+    return rrb.Vertical(lanes, texts, name="Events", row_shares=[1, 1])
 
 
 def _cameras(data: RunData, scope: Scope) -> View | None:

@@ -9,10 +9,9 @@ import numpy as np
 
 from imutool.viewing.model import events
 from imutool.viewing.model.run_data import RunData, Trace
-from imutool.viewing.model.trajectory_error import Drift, Errors
+from imutool.viewing.model.trajectory_error import Drift, Errors, row_of_largest
 from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
-from imutool.viewing.rerun.entities.paths import row_of_largest
 from imutool.viewing.rerun.entities.signals import log_axes, log_curves
 from imutool.viewing.rerun.entities.styles import EVENT_COLOR, GREY, MODEL_COLORS, RAW_FADE, WORST_COLOR, Color, color_of
 from imutool.viewing.rerun.sdk import Scope
@@ -66,7 +65,7 @@ def _log_drift(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace
 
 def _log_worst(data: RunData, to: rr.RecordingStream, entity: str, errors: Errors, total: np.ndarray) -> None:
     """One point at the largest total error."""
-    row = row_of_largest(errors.t_ns, total)
+    row = row_of_largest(total)
     if row is not None:
         style = rr.SeriesPoints(names=["worst"], colors=[WORST_COLOR], markers=["diamond"], marker_sizes=[MARKER_SIZE])
         log_curves(to, data, f"{entity}/worst", errors.t_ns[row : row + 1], total[row : row + 1, None], style)

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 
 from imutool.array_types import Float64, Int64
-from imutool.recording import Poses, Times, nanoseconds
+from imutool.recording import Poses, nanoseconds
 from imutool.viewing.model.run_data import TRUTH, Rows, RunData, Trace, path_rows, round_up_125, split_at_gaps
-from imutool.viewing.model.trajectory_error import Errors
+from imutool.viewing.model.trajectory_error import Errors, row_of_largest
 from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import INK, TRUTH_COLOR, WORST_COLOR, Color, color_of, heat_colors
@@ -151,17 +151,12 @@ def _log_error_vectors(to: rr.RecordingStream, data: RunData, trace: Trace, erro
     to.send_columns(entity, sdk.data_times(data, trace.path.t_ns[rows]), columns, strict=True)
 
 
-def row_of_largest(t_ns: Times, values: Float64[np.ndarray, " n"]) -> int | None:
-    """Row of the largest value; None where no value is finite."""
-    return int(np.nanargmax(values)) if len(t_ns) and np.isfinite(values).any() else None
-
-
 def _log_worst(to: rr.RecordingStream, data: RunData, trace: Trace, entity: str, size: float) -> None:
     """Pole on the true path (the model's may be far off) at a model's largest orientation error."""
     if trace.is_raw or trace.errors is None or data.truth is None:
         return
     errors = trace.errors
-    row = row_of_largest(errors.t_ns, errors.orientation_total_deg)
+    row = row_of_largest(errors.orientation_total_deg)
     if row is None:
         return
     at_s = data.elapsed_s(errors.t_ns[row : row + 1])[0]

@@ -67,7 +67,7 @@ def _colors(data: RunData) -> list[str]:
 
 def _figures(data: RunData) -> list[str]:
     rows = [[label, *map(_cell, values)] for label, values in data.table()]
-    return ["## Figures", "", *table(["figure", *_names(data)], rows), ""] if rows else []
+    return ["## Figures", "", *table(["figure", *(escape(trace.name) for trace in data.traces)], rows), ""] if rows else []
 
 
 def _windows(data: RunData) -> list[str]:
@@ -97,10 +97,6 @@ def _events(data: RunData) -> list[str]:
     hidden = len(data.events) - len(rows)
     more = [f"The tab Events shows {hidden} more.", ""] if hidden > 0 else []
     return ["## Events", "", *table(["at (s)", "for (s)", "kind", "what"], rows), "", *more]
-
-
-def _names(data: RunData) -> list[str]:
-    return [escape(trace.name) for trace in data.traces]
 
 
 def _cell(value: float | None) -> str:

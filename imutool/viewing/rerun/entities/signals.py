@@ -9,14 +9,13 @@ import numpy as np
 
 from imutool.array_types import Float64
 from imutool.recording import Times
-from imutool.units import AXES
+from imutool.units import AXES, SENSORS
 from imutool.viewing.model.run_data import MAX_CURVE_ROWS, RunData, Trace, curve_rows
 from imutool.viewing.rerun import rr, sdk
 from imutool.viewing.rerun.entities import styles
 from imutool.viewing.rerun.entities.styles import BOLD_WIDTH, GRID, INK, RAW_FADE, XYZ, axis_colors, blend_to_grey
 from imutool.viewing.rerun.sdk import Scope
 
-KINDS = ("gyro", "accel")
 SIGMAS = 3.0
 MAX_DERIVED_ROWS = 50_000  # of a computed curve (four minutes at 200 Hz); samples keep up to MAX_CURVE_ROWS
 
@@ -38,7 +37,7 @@ def log_signals(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
 
 def _log_samples(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace) -> None:
     imu, role = trace.run.imu, sdk.role(trace)
-    for kind, values in zip(KINDS, (imu.gyro, imu.accel), strict=True):
+    for kind, values in zip(SENSORS, (imu.gyro, imu.accel), strict=True):
         entity = sdk.trace_path(data, trace, scope, "imu", kind, role)
         log_axes(to, data, trace, entity, imu.t_ns, values, max_rows=MAX_CURVE_ROWS)
 
@@ -46,7 +45,7 @@ def _log_samples(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Tra
 def _log_bias(data: RunData, to: rr.RecordingStream, scope: Scope, trace: Trace) -> None:
     run, name, rank = trace.run, sdk.label(data, trace), model_index(data, trace)
     names = styles.axis_names("estimated" if name == "debiased" else name)
-    for kind, bias, columns in zip(KINDS, (run.gyro_bias, run.accel_bias), (slice(0, 3), slice(3, 6)), strict=True):
+    for kind, bias, columns in zip(SENSORS, (run.gyro_bias, run.accel_bias), (slice(0, 3), slice(3, 6)), strict=True):
         entity = sdk.trace_path(data, trace, scope, "bias", kind)
         log_curves(to, data, f"{entity}/estimated", run.imu.t_ns, bias, styles.axis_curves("debiased", names, rank=rank))
         if run.bias_std is not None:
@@ -130,7 +129,7 @@ def log_spectra(data: RunData, to: rr.RecordingStream, scope: Scope) -> None:
 
 def sensors_with_spectrum(data: RunData) -> list[str]:
     """Sensors that have a spectrum."""
-    return [kind for kind in KINDS if any(kind in trace.spectra for trace in data.traces)]
+    return [kind for kind in SENSORS if any(kind in trace.spectra for trace in data.traces)]
 
 
 def decade_frame(data: RunData, kind: str) -> DecadeFrame:
