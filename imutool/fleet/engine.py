@@ -22,7 +22,7 @@ import msgspec
 
 from imutool.errors import ConfigError, LogError, redact, required
 from imutool.fleet.one_log import work
-from imutool.fleet.task import Result, Task
+from imutool.fleet.task import Result, Task, failed
 from imutool.processes import system
 from imutool.processes.worker_pool import ONE_THREAD, WorkerBugError, WorkerPool
 
@@ -98,26 +98,14 @@ def _refuse_too_much(wanted: int, most: int) -> None:
         )
 
 
-def _failed(task: Task, error: str, code: int) -> Result:
-    return Result(
-        key=task.key,
-        source=task.source.place,
-        target=task.target,
-        status="failed",
-        source_bytes=task.source.size,
-        error=redact(error),
-        exit_code=code,
-    )
-
-
 def _bug(task: Task, error: BaseException, trace: str) -> Result:
     logging.getLogger("imutool").info("%s: %s", task.source.place, trace)
-    return _failed(task, f"a bug, please report it: {error}", BUG)
+    return failed(task.key, task.source, f"a bug, please report it: {error}", BUG, task.target)
 
 
 def _died(task: Task, how: str) -> Result:
     why = f"its worker died, also where it ran alone ({how}). Look at this log by itself."
-    return _failed(task, why, LogError.exit_code)
+    return failed(task.key, task.source, why, LogError.exit_code, task.target)
 
 
 def _work_as_json(raw: bytes, model: bytes | None) -> bytes:
