@@ -116,7 +116,7 @@ def evaluate(
             read: dict[str, Any] = {"init": init, "smooth": smooth, "truth": truth, "imu": imu}
             more: dict[str, Any] = {"trajectories": trajectories, "overwrite": common.overwrite, "refused": refused.__setitem__}
             results += run(log, models=model or (), aid=asked, **read, **more)
-            errors += [_of_model(name, error) for name, error in refused.items()]
+            errors += [error.replaced(what=f"the model {name} is not scored: {error.what}") for name, error in refused.items()]
             if report is not None:
                 scored = [name for name in model or () if name not in refused]
                 run_data = load(log, models=scored, aid=asked, **read)
@@ -130,21 +130,10 @@ def evaluate(
         figures(rows, aligned=aligned)
         for sentence in [*_used(results), *_late(results), *_fits(results), *([] if report is None else [f"Report: {report}"])]:
             say(sentence)
-    _raise_first(errors)
-
-
-def _raise_first(errors: Sequence[ImutoolError]) -> None:
     for error in errors[1:]:
         logger.warning("%s", error)
     if errors:
         raise errors[0]
-
-
-def _of_model(name: str, error: ImutoolError) -> ImutoolError:
-    """The error of a model that does not apply, with the model's name."""
-    return type(error)(
-        f"the model {name} is not scored: {error.what}", where=error.where, expected=error.expected, fix=error.fix
-    )
 
 
 def _fits(results: Sequence[dict[str, Any]]) -> list[str]:

@@ -112,7 +112,7 @@ def error_with_flags(error: ImutoolError, flag_of: Mapping[str, str], typed: Col
         if None not in shown:
             where = ", ".join(map(str, shown))
     what, expected, fix = (with_flags(text, flag_of) for text in (error.what, error.expected, error.fix))
-    return type(error)(what, where=where, expected=expected, fix=fix)
+    return error.replaced(what=what, where=where, expected=expected, fix=fix)
 
 
 def _of_url(text: str) -> Path:
