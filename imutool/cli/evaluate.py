@@ -174,12 +174,12 @@ def vio(
     bias_states: Annotated[
         bool | None, typer.Option("--bias-states/--no-bias-states", help="Estimate biases, or trust the IMU; by default both.")
     ] = None,
-    lag: Annotated[float, typer.Option(metavar="S", help="Lag of the fixed-lag smoother.")] = 3.0,
+    lag: Annotated[float, typer.Option(metavar="SECONDS", help="Lag of the fixed-lag smoother.")] = 3.0,
     keyframes: Annotated[float, typer.Option(metavar="HZ", help="Camera keyframes per second.")] = 4.0,
     features: Annotated[int, typer.Option(help="Feature tracks in a frame.")] = 30,
     pixel_noise: Annotated[float, typer.Option(metavar="PX", help="White noise of a pixel coordinate.")] = 1.0,
-    blackout: Annotated[float, typer.Option(metavar="S", help="Length of a camera blackout in every 15 s.")] = 0.0,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="Use only this much of each log.")] = None,
+    blackout: Annotated[float, typer.Option(metavar="SECONDS", help="Length of a camera blackout in every 15 s.")] = 0.0,
+    duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="Use only this much of each log.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of landmarks, tracks and pixel noise.")] = 0,
     set_: Annotated[
         list[str] | None,
