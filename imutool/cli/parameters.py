@@ -67,7 +67,7 @@ def flags(command: Any) -> dict[str, str]:
 
 
 def instead_of(option: str, command: Any) -> list[str]:
-    """What a click command has for the purpose of an option that it lacks."""
+    """Options of a click command that serve the purpose of one that it lacks."""
     from difflib import get_close_matches  # every command would pay for it at its start
 
     own = [_flag(parameter) for parameter in command.params]

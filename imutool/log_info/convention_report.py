@@ -197,7 +197,7 @@ def check_units(whole: TopicSummary, where: str) -> None:
 
 
 def conventions(whole: TopicSummary) -> list[Convention]:
-    """What the motion shows of each convention."""
+    """Lists what the motion shows of each convention."""
     return [Convention(*entry) for entry in _entries(whole, whole.conventions)]
 
 

@@ -33,7 +33,7 @@ SAME_TURN = 1e-9  # of two quaternions, how far the product may be from 1
 
 
 class Agreement(NamedTuple):
-    """What poses explain of the gyro, and how their body is turned."""
+    """Part of the gyro that poses explain, and the rotation of their body."""
 
     rms_rad_s: float
     explained: float

@@ -137,7 +137,7 @@ def read(name: str | Path) -> Noise:
 
 
 def _axes(value: Any) -> Any:
-    """What TOML says of a quantity as a list of three; what is neither goes on as it is, to be refused with its place."""
+    """Turns a quantity of TOML into a list of three; any other value stays, to be refused with its place."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return [float(value)] * 3
     if value == UNKNOWN:

@@ -36,7 +36,7 @@ MAX_SEARCHED = 1 << 20  # bytes of a damaged stretch in which definitions are so
 
 
 class RecoveredIndex(LogIndex):
-    """As `LogIndex`, for a file that may be damaged; `losses` grows while chunks are read.
+    """Index of a file that may be damaged; `losses` grows while chunks are read.
 
     With `by_records` the index is not believed from the start, and all damage is known at once.
 

@@ -105,7 +105,7 @@ class Live:
         self.shown.append(shown)
 
     def record(self, path: Path, temporary: Path) -> None:
-        """Also write everything to `temporary`, which will become `path`."""
+        """Write everything to `temporary` too, which will become `path`."""
         self._file = new_stream(self._name)
         self._file.save(temporary)
         self.shown.append(Output("rrd", str(path), f"{self.trouble}Saved {path}. Open with: rerun {path}"))
