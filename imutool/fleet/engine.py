@@ -92,7 +92,7 @@ def _work_quietly(task: Task, model: bytes | None) -> Result:
 def _refuse_too_much(wanted: int, most: int) -> None:
     if wanted > most:
         raise ConfigError(
-            f"{wanted / 2**30:.2f} GiB for each task",
+            f"{wanted / 2**30:.2f} GiB are asked for each task",
             where="memory_bytes",
             expected=f"at most {most / 2**30:.2f} GiB, which the largest machine has",
         )
@@ -270,7 +270,7 @@ def _refuse_silence(address: str) -> None:
                 if connection.recv(4)[3:] != SETTINGS[3:4]:
                     raise OSError("what listens there does not speak gRPC")
     except (OSError, OverflowError) as error:
-        raise ConfigError(f"no answer ({error})", where=f"address={redact(address)}", expected="a Ray cluster") from error
+        raise ConfigError(f"nothing answers ({error})", where=f"address={redact(address)}", expected="a Ray cluster") from error
 
 
 def _ray() -> Any:

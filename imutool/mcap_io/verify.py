@@ -41,7 +41,7 @@ def check_mode(mode: str) -> None:
         ConfigError: not one of `MODES`.
     """
     if mode not in MODES:
-        raise ConfigError(f"{mode!r}", where="check", expected=", ".join(MODES))
+        raise ConfigError(f"unknown mode {mode!r}", where="check", expected=", ".join(MODES))
 
 
 def verify(

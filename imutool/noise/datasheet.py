@@ -127,7 +127,7 @@ def read(name: str | Path) -> Noise:
     path = Path(name)
     if not path.exists():
         raise ConfigError(
-            "no such noise",
+            "there is no such noise",
             where=path,
             expected=f"{', '.join(SHEETS)} or a TOML file",
             fix=did_you_mean(str(name), SHEETS),

@@ -178,7 +178,7 @@ def cursor_s(logs: Sequence[RunData], at: str) -> float:
     try:
         seconds = float(at)
     except ValueError as error:
-        raise ConfigError(f"{at!r}", where="at", expected="seconds since the first IMU sample, or worst") from error
+        raise ConfigError(f"{at!r} is no time", where="at", expected="seconds since the first IMU sample, or worst") from error
     if not 0.0 <= seconds <= longest:
         raise DataError(f"{at} s is outside the log", where="at", expected=f"0 to {longest:.3f} s")
     return seconds

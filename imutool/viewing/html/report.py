@@ -77,7 +77,7 @@ def page(logs: Sequence[RunData], drawn: Mapping[str, str] = NOTHING) -> str:
         ConfigError: no logs, or matplotlib is not installed.
     """
     if not logs:
-        raise ConfigError("no logs", where="report", expected="at least one")
+        raise ConfigError("no log is given", where="report", expected="at least one")
     require_matplotlib()
     if len(logs) == 1:
         body = [f"<h1>{text(logs[0].name)}</h1>", *_log(logs[0], "log1", drawn, alone=True), *_made()]

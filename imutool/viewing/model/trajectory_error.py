@@ -33,7 +33,7 @@ def alignment(name: str) -> Alignment:
     for known in ALIGNMENTS:
         if known == name:
             return known
-    raise ConfigError(f"{name!r}", where="align", expected=", ".join(ALIGNMENTS))
+    raise ConfigError(f"unknown alignment {name!r}", where="align", expected=", ".join(ALIGNMENTS))
 
 
 @dataclass(frozen=True, eq=False)

@@ -108,9 +108,9 @@ def full_url(url: str) -> str:
         parts = urlsplit(complete)
         port = parts.port  # refuses other than a number
     except ValueError as error:
-        raise ConfigError(f"{url!r} ({error})", where="connect", expected=expected) from error
+        raise ConfigError(f"{url!r} is no address ({error})", where="connect", expected=expected) from error
     if parts.scheme not in (PLAIN, *SECURE) or not parts.hostname or parts.path.rstrip("/") not in ("", PATH) or parts.query:
-        raise ConfigError(f"{url!r}", where="connect", expected=expected)
+        raise ConfigError(f"{url!r} is no address", where="connect", expected=expected)
     netloc = parts.netloc if port else f"{parts.netloc}:{DEFAULT_PORT}"
     return parts._replace(netloc=netloc, path=PATH).geturl()
 
